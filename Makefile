@@ -1,0 +1,38 @@
+# Each target sets up .venv by itself; nothing else needs to be installed but Python 3.11 or newer and make.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: run check types test wheel clean
+
+run: $(READY)  ## the service with a simulated flight; then it says what to type in a second terminal
+	$(BIN)/nedbus serve --source sim:
+
+check: $(READY)  ## lint and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: check  ## everything that CI runs: lint, types, tests with branch coverage
+	$(BIN)/coverage erase
+	$(BIN)/coverage run -m pytest
+	$(BIN)/coverage combine -q
+	$(BIN)/coverage report
+
+wheel: $(READY)  ## build the wheel, install it where nothing else is, and use it
+	rm -rf dist build/wheel-venv
+	$(BIN)/python -m build --wheel
+	$(PYTHON) -m venv build/wheel-venv
+	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
+	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
+	$(BIN)/pip install -q --group dev --editable .
+	touch $(READY)
+
+clean:
+	rm -rf $(VENV) dist build .coverage* .mypy_cache .ruff_cache .pytest_cache .hypothesis

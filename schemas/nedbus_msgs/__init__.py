@@ -1,0 +1,62 @@
+"""The contract of nedbus: the message, its layouts, its topics and its wire format; no I/O, no Zenoh."""
+
+from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
+from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
+from .position import FIELD_TYPES, VehicleLocalPosition
+from .schema import json_schema, layout_table
+from .topics import (
+    ANY,
+    DEFAULT_PREFIX,
+    ENCODING,
+    TOPICS,
+    Address,
+    Topic,
+    address_of_alive_key,
+    alive_selection,
+    check_prefix,
+    check_vehicle,
+    get_topic,
+    schema_key,
+    selection,
+    status_key,
+)
+from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, describe, encode
+
+__all__ = [
+    "ANY",
+    "CURRENT",
+    "DEFAULT_PREFIX",
+    "ENCODING",
+    "FIELD_TYPES",
+    "LAYOUTS",
+    "PAYLOAD_LIMIT",
+    "PAYLOAD_SIZE",
+    "TOPICS",
+    "WIRE_LAYOUTS",
+    "Address",
+    "AddressError",
+    "DecodeError",
+    "EncodeError",
+    "Layout",
+    "LayoutError",
+    "NedbusError",
+    "Topic",
+    "UnknownLayoutError",
+    "VehicleLocalPosition",
+    "address_of_alive_key",
+    "alive_selection",
+    "check_prefix",
+    "check_vehicle",
+    "decode",
+    "describe",
+    "downgrade",
+    "encode",
+    "find_layout",
+    "get_topic",
+    "json_schema",
+    "layout_table",
+    "schema_key",
+    "selection",
+    "status_key",
+    "upgrade",
+]

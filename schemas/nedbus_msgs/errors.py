@@ -1,0 +1,52 @@
+"""The root of the error tree, and the errors of the contract; `nedbus.errors` draws the whole tree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class NedbusError(Exception):
+    """Base of every error that nedbus raises on purpose."""
+
+
+class AddressError(NedbusError, ValueError):
+    """Raise when a vehicle, topic, instance or key expression cannot name a stream."""
+
+    def __init__(self, what: str, given: object, expected: str) -> None:
+        super().__init__(f"{what} {given!r} is not valid: expected {expected}")
+        self.given = given
+
+
+class LayoutError(NedbusError, ValueError):
+    """Raise when a set of field names fits no layout of VehicleLocalPosition that is known."""
+
+
+class DecodeError(NedbusError, ValueError):
+    """Raise when a payload is not a VehicleLocalPosition; `reason` says why in one line."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"not a VehicleLocalPosition: {reason}")
+        self.reason = reason
+
+
+class UnknownLayoutError(DecodeError):
+    """Raise when a payload has a layout number whose field list is not known here.
+
+    `layout` is that number, `count` how many fields follow it, `known` the numbers that can be read.
+    """
+
+    def __init__(self, layout: int, count: int, known: Sequence[int]) -> None:
+        readable = ", ".join(map(str, known))
+        super().__init__(
+            f"layout {layout} with {count} fields; this reader knows layouts {readable}: update nedbus_msgs"
+        )
+        self.layout = layout
+        self.count = count
+        self.known = tuple(known)
+
+
+class EncodeError(NedbusError, ValueError):
+    """Raise when a message holds what its fields cannot, because validation was bypassed."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"this message cannot be encoded ({reason}): build it with VehicleLocalPosition(...)")

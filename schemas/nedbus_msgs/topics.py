@@ -1,0 +1,163 @@
+"""The one table of the four topics, and the pair address <-> key expression."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from .errors import AddressError
+
+ANY: Final = "*"
+DEFAULT_PREFIX: Final = "nedbus"
+ENCODING: Final = "application/msgpack;px4_msgs/VehicleLocalPosition"
+"""Zenoh encoding of a payload; the payload alone is sufficient."""
+
+_CHUNK = re.compile(r"[A-Za-z0-9_-]+")
+_VEHICLE_LENGTH: Final = 64
+_INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One uORB topic.
+
+    `instances`: it has uORB instances, one per EKF.
+    `rate`: messages a second that PX4 sends or logs, nominal.
+    `priority`: Zenoh's name of the priority on a congested link.
+    `cache`: how many messages a publisher keeps for readers that missed some, about 10 s at full rate.
+    `doc`: who publishes it.
+    """
+
+    name: str
+    instances: bool
+    rate: float
+    priority: str
+    cache: int
+    doc: str
+
+
+TOPICS: Final[Mapping[str, Topic]] = {
+    topic.name: topic
+    for topic in (
+        Topic("vehicle_local_position", False, 100.0, "DATA_HIGH", 1000, "EKF2, or the EKF2 selector of several"),
+        Topic("vehicle_local_position_groundtruth", False, 50.0, "DATA", 500, "simulators (SITL, HITL)"),
+        Topic("external_ins_local_position", False, 50.0, "DATA", 1000, "an external INS driver (VectorNav, ...)"),
+        Topic("estimator_local_position", True, 2.0, "DATA", 200, "each EKF instance, when several run"),
+    )
+}
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Address:
+    """Where a message belongs: vehicle, topic and, for estimator_local_position, the uORB instance.
+
+    Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, an unknown topic, a missing instance
+    where the topic has instances, or an instance where it has none.
+    """
+
+    vehicle: str
+    topic: str
+    instance: int | None = None
+
+    def __post_init__(self) -> None:
+        check_vehicle(self.vehicle)
+        if get_topic(self.topic).instances:
+            if self.instance is None or not 0 <= self.instance < _INSTANCES:
+                raise AddressError("instance", self.instance, f"0 to {_INSTANCES - 1} for {self.topic}")
+        elif self.instance is not None:
+            raise AddressError("instance", self.instance, f"none: {self.topic} has no instances")
+
+    @classmethod
+    def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
+        """Return the address that a key names; raise AddressError for any other key, wildcards included."""
+        chunks = key.removeprefix(prefix + "/").split("/")
+        if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
+            raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
+        instance = None
+        if len(chunks) == 3:
+            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", chunks[2]):
+                raise AddressError("instance", chunks[2], f"0 to {_INSTANCES - 1}")
+            instance = int(chunks[2])
+        return cls(chunks[0], chunks[1], instance)
+
+    def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the Zenoh key expression of this address."""
+        return f"{prefix}/{self.vehicle}/{self.stream}"
+
+    def alive_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key expression of this address's liveliness token."""
+        return f"{prefix}/{self.vehicle}/@alive/{self.stream}"
+
+    def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key expression where messages of this address that failed validation are reported."""
+        return f"{prefix}/@rejected/{self.vehicle}/{self.stream}"
+
+    @property
+    def stream(self) -> str:
+        """The topic, with its instance where it has one: the part of the key after the vehicle."""
+        return self.topic if self.instance is None else f"{self.topic}/{self.instance}"
+
+    def __str__(self) -> str:
+        return f"{self.vehicle}/{self.stream}"
+
+
+def selection(
+    topic: str = ANY, *, vehicle: str = ANY, instance: int | None = None, prefix: str = DEFAULT_PREFIX
+) -> str:
+    """Return the key expression for the addresses with this topic, vehicle and instance; "*" and None mean any.
+
+    Raises AddressError for what no address can have.
+    """
+    if vehicle != ANY:
+        check_vehicle(vehicle)
+    if topic == ANY:
+        if instance is not None:
+            raise AddressError("instance", instance, "none: name the topic as well")
+        return f"{prefix}/{vehicle}/**"
+    if get_topic(topic).instances:
+        return f"{prefix}/{vehicle}/{topic}/{ANY if instance is None else instance}"
+    if instance is not None:
+        raise AddressError("instance", instance, f"none: {topic} has no instances")
+    return f"{prefix}/{vehicle}/{topic}"
+
+
+def alive_selection(*, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key expression for the liveliness tokens of all addresses."""
+    return f"{prefix}/*/@alive/**"
+
+
+def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
+    """Return the address that a liveliness token names; raise AddressError for any other key."""
+    return Address.from_key(key.replace("/@alive/", "/", 1), prefix=prefix)
+
+
+def schema_key(*, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key that answers with the JSON Schema and the layouts that a publisher knows."""
+    return f"{prefix}/@schema/VehicleLocalPosition"
+
+
+def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key that answers with the status of one service; "*" stands for all of them."""
+    return f"{prefix}/@service/{service}/status"
+
+
+def get_topic(name: str) -> Topic:
+    """Return a row of TOPICS; raise AddressError for a name that has none."""
+    try:
+        return TOPICS[name]
+    except KeyError:
+        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}") from None
+
+
+def check_vehicle(vehicle: str) -> None:
+    """Raise AddressError unless this can name a vehicle."""
+    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
+        raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
+
+
+def check_prefix(prefix: str) -> None:
+    """Raise AddressError unless this can stand before every key: plain chunks between slashes."""
+    if not all(_CHUNK.fullmatch(chunk) for chunk in prefix.split("/")):
+        raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - with / between them")

@@ -1,0 +1,118 @@
+"""The msgpack codec: one array `[layout, field 1 ... field 53]` of exactly 244 bytes.
+
+Our encoder writes every field at its full width, so every payload is at once plain msgpack and a fixed record.
+Any other valid msgpack of the array is read as well.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from operator import itemgetter
+from typing import Final, cast
+
+import msgpack
+from pydantic import ValidationError
+
+from .errors import DecodeError, EncodeError, UnknownLayoutError
+from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
+from .position import FIELD_TYPES, TypeName, VehicleLocalPosition
+
+PAYLOAD_SIZE: Final = 244
+"""Bytes of every payload that `encode` writes."""
+
+PAYLOAD_LIMIT: Final = 4096
+"""Bytes of the largest payload that `decode` looks at; no encoding of the array comes near."""
+
+# Per type: its tag, the struct format of tag and value, and which bits of them are value.
+# A bool is its tag: 0xc2 or 0xc3, so its last bit is the value.
+_FULL_WIDTH: Final[Mapping[TypeName, tuple[bytes, str, bytes]]] = {
+    "uint64": (b"\xcf" + bytes(8), "xQ", b"\x00" + b"\xff" * 8),
+    "uint8": (b"\xcc" + bytes(1), "xB", b"\x00\xff"),
+    "bool": (b"\xc2", "?", b"\x01"),
+    "float32": (b"\xca" + bytes(4), "xf", b"\x00" + b"\xff" * 4),
+    "float32[2]": (b"\x92" + (b"\xca" + bytes(4)) * 2, "xxfxf", b"\x00" + (b"\x00" + b"\xff" * 4) * 2),
+    "float64": (b"\xcb" + bytes(8), "xd", b"\x00" + b"\xff" * 8),
+}
+_HEAD = struct.pack(">BHB", 0xDC, 1 + len(FIELD_TYPES), cast("int", CURRENT.wire))
+_TYPES = [_FULL_WIDTH[kind] for kind in FIELD_TYPES.values()]
+_TAGS = int.from_bytes(_HEAD + b"".join(tags for tags, _, _ in _TYPES), "big")
+_VALUES = int.from_bytes(bytes(len(_HEAD)) + b"".join(values for _, _, values in _TYPES), "big")
+_RECORD = struct.Struct(f">{len(_HEAD)}x" + "".join(form for _, form, _ in _TYPES))
+
+_PAIRS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
+_FIRST, _SECOND = (tuple(FIELD_TYPES).index(name) for name in _PAIRS)  # delta_xy, delta_vxy
+_get_values = cast("Callable[[dict[str, object]], tuple[object, ...]]", itemgetter(*FIELD_TYPES))
+
+
+def encode(message: VehicleLocalPosition) -> bytes:
+    """Return the 244 bytes of a message; ref_lat and ref_lon are float64, all other floats float32.
+
+    Raises EncodeError for a message whose validation was bypassed and that holds what its fields cannot.
+    """
+    values = list(_get_values(message.__dict__))
+    try:
+        values[_SECOND : _SECOND + 1] = cast("tuple[float, float]", values[_SECOND])
+        values[_FIRST : _FIRST + 1] = cast("tuple[float, float]", values[_FIRST])
+        record = _RECORD.pack(*values)
+    except (struct.error, OverflowError, TypeError) as exc:
+        raise EncodeError(str(exc)) from exc
+    # The record has zeros where the tags belong, and the tags have zeros where the values are.
+    return (int.from_bytes(record, "big") | _TAGS).to_bytes(PAYLOAD_SIZE, "big")
+
+
+def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> VehicleLocalPosition:
+    """Return the message of a payload, checked by the model.
+
+    `newer` gives the field names of layouts that this version does not know, by their number on the wire: the fields
+    known by name are read, the others ignored.
+
+    Raises UnknownLayoutError for a layout that is neither known nor given, DecodeError for anything else that is not
+    one message: other types, other lengths, trailing, missing or too many bytes, values that the model refuses.
+    """
+    fields = _read_full_width(payload)
+    try:
+        if fields is not None:
+            return VehicleLocalPosition.model_validate(fields)
+        return upgrade(_read_any(payload, newer or {}))
+    except ValidationError as exc:
+        raise DecodeError(describe(exc)) from exc
+
+
+def describe(error: ValidationError) -> str:
+    """Return what a validation error says, in one line: each field, what is wrong with it, and its value."""
+    return "; ".join(
+        f"{'.'.join(map(str, detail['loc']))}: {detail['msg']} (is {detail['input']!r:.40})"
+        for detail in error.errors()
+    )
+
+
+def _read_full_width(payload: bytes) -> dict[str, object] | None:
+    """Read what `encode` writes, None for anything else."""
+    if len(payload) != PAYLOAD_SIZE:
+        return None
+    number = int.from_bytes(payload, "big")
+    if number & ~_VALUES != _TAGS:
+        return None
+    values: list[object] = list(_RECORD.unpack((number & _VALUES).to_bytes(PAYLOAD_SIZE, "big")))
+    values[_FIRST : _FIRST + 2] = [(values[_FIRST], values[_FIRST + 1])]
+    values[_SECOND : _SECOND + 2] = [(values[_SECOND], values[_SECOND + 1])]
+    return dict(zip(FIELD_TYPES, values, strict=True))
+
+
+def _read_any(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, object]:
+    if len(payload) > PAYLOAD_LIMIT:
+        raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+    try:
+        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
+    except (ValueError, msgpack.UnpackException) as exc:
+        raise DecodeError(f"{len(payload)} bytes that are not one msgpack value ({exc or type(exc).__name__})") from exc
+    if not isinstance(array, tuple) or not array or type(array[0]) is not int:
+        raise DecodeError("not an array that starts with the number of its layout")
+    layout, *values = array
+    names = WIRE_LAYOUTS[layout].fields if layout in WIRE_LAYOUTS else newer.get(layout)
+    if names is None:
+        raise UnknownLayoutError(layout, len(values), (*WIRE_LAYOUTS, *newer))
+    if len(values) != len(names):
+        raise DecodeError(f"{len(values)} fields where layout {layout} has {len(names)}")
+    return dict(zip(names, values, strict=True))

@@ -1,0 +1,127 @@
+"""Commands that look once: list, get, info, schema."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Annotated
+
+import typer
+
+from nedbus.errors import NoDataError
+from nedbus_msgs import ANY, json_schema, layout_table
+
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    InstanceOption,
+    JsonOption,
+    PrefixOption,
+    TopicArgument,
+    TopicOption,
+    VehicleOption,
+    WaitOption,
+    command,
+    open_bus,
+    pick_topic,
+    tell,
+    write,
+)
+from .text import doubts, to_age, to_fields, to_json, to_table
+
+
+@command
+def list_(
+    *,
+    json_output: JsonOption = False,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
+) -> None:
+    """List the vehicles and topics that are published now, and how old their last message is."""
+    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
+        addresses = [address for addresses in bus.vehicles().values() for address in addresses]
+        newest = {sample.address: sample for sample in bus.latest()}
+    rows = []
+    for address in addresses:
+        sample = newest.get(address)
+        age = None if sample is None or sample.sent is None else (time.time_ns() - sample.sent) / 1e9
+        if json_output:
+            write(json.dumps({**_address(address.vehicle, address.topic, address.instance), "age": age}))
+        state = doubts(sample.message) if sample else "no message yet"
+        rows.append([str(address), "-" if age is None else to_age(age), state])
+    if not json_output and rows:
+        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
+    if not rows:
+        tell(f"no vehicle is published at {' or '.join(bus.routers)}: start a source with 'nedbus serve'")
+
+
+@command
+def get(
+    topic: TopicArgument = None,
+    *,
+    topic_option: TopicOption = ANY,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    json_output: JsonOption = False,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
+) -> None:
+    """Show the last message of each vehicle and topic, all fields; exit 1 when there is none."""
+    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
+        samples = bus.latest(pick_topic(topic, topic_option), vehicle=vehicle, instance=instance)
+    for sample in samples:
+        write(to_json(sample) if json_output else to_fields(sample))
+    if not samples:
+        raise NoDataError(f"{pick_topic(topic, topic_option)} of vehicle {vehicle}", 2.0)
+
+
+@command
+def info(
+    *,
+    json_output: JsonOption = False,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
+) -> None:
+    """Show the services on this network: their sources, what these do, and what was rejected."""
+    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
+        services = bus.services()
+        vehicles = bus.vehicles()
+    if json_output:
+        for service in services:
+            write(json.dumps(service))
+        return
+    write(f"router    {' or '.join(bus.routers)}")
+    write(f"vehicles  {', '.join(vehicles) or 'none'}")
+    for service in services:
+        write(f"\nservice {service.get('service')}, nedbus {service.get('version')}, as {service.get('role')}")
+        sources = service.get("sources")
+        rows = (
+            [_source_row(source) for source in sources if isinstance(source, dict)] if isinstance(sources, list) else []
+        )
+        if rows:
+            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "RESTARTS", "ERROR"], rows))
+    if not services:
+        tell("no nedbus service answers here")
+
+
+@command
+def schema(
+    *, layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False
+) -> None:
+    """Print the JSON Schema of a message, or the layouts that can be read."""
+    write(json.dumps(layout_table() if layouts else json_schema(), indent=2))
+
+
+def _address(vehicle: str, topic: str, instance: int | None) -> dict[str, object]:
+    return {"vehicle": vehicle, "topic": topic, "instance": instance}
+
+
+def _source_row(source: dict[str, object]) -> list[str]:
+    keys = ("source", "state", "published", "rejected", "restarts")
+    return [*(str(source.get(key)) for key in keys), str(source.get("error") or "-")]

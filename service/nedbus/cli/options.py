@@ -1,0 +1,94 @@
+"""What holds for all commands: options, exit codes, one line for an error."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, ParamSpec
+
+import typer
+
+from nedbus.bus import Bus, connect
+from nedbus.errors import AddressError, ConfigError, ConnectError, NedbusError
+from nedbus_msgs import ANY
+
+P = ParamSpec("P")
+
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file [default: nedbus.toml if there]")]
+ConnectOption = Annotated[
+    list[str] | None,
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join [default: tcp/127.0.0.1:7447]"),
+]
+PrefixOption = Annotated[str | None, typer.Option("--prefix", help="First chunks of every key [default: nedbus]")]
+TopicArgument = Annotated[str | None, typer.Argument(metavar="[TOPIC]", help="The same as --topic", show_default=False)]
+TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
+VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
+InstanceOption = Annotated[
+    int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position [default: all]")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
+WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait for a router that is not there yet")]
+CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many samples")]
+DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="End after this many seconds")]
+
+
+def command(function: Callable[P, None]) -> Callable[P, None]:
+    """Turn errors into one line and an exit code: 1 failure, 2 usage, 130 interrupt."""
+
+    @functools.wraps(function)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        try:
+            function(*args, **kwargs)
+        except (ConfigError, AddressError) as exc:
+            raise _fail(exc, 2) from exc
+        except NedbusError as exc:
+            raise _fail(exc, 1) from exc
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+        except BrokenPipeError:
+            # The reader of a pipe is gone (`| head`): say nothing, and nothing more at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+
+    return run
+
+
+def open_bus(
+    endpoints: list[str] | None, *, prefix: str | None = None, config: Path | None = None, wait: bool = False
+) -> Bus:
+    """Connect as the options say; with `wait` for as long as it takes."""
+    try:
+        return connect(endpoints, timeout=1.0, prefix=prefix, config=config)
+    except ConnectError as exc:
+        if not wait:
+            raise
+        tell(f"{exc}; waiting")
+    return connect(endpoints, timeout=float("inf"), prefix=prefix, config=config)
+
+
+def tell(text: str) -> None:
+    """Say something to a person, beside the output."""
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
+
+
+def write(line: str) -> None:
+    """Write a line of output, at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def pick_topic(argument: str | None, option: str) -> str:
+    """Return the topic that was asked for, as an argument or as an option."""
+    return argument.strip("/") if argument else option or ANY
+
+
+def _fail(error: NedbusError, code: int) -> typer.Exit:
+    if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
+        raise error
+    tell(f"nedbus: {error}")
+    return typer.Exit(code)

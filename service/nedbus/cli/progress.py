@@ -1,0 +1,103 @@
+"""What `nedbus serve` shows while it runs: a live display on a terminal, plain log lines elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from typing import TYPE_CHECKING, Final, Self
+
+from nedbus.daemon import Daemon
+from nedbus.worker import WorkerStatus
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+_log = logging.getLogger("nedbus")
+_EVERY: Final = 10.0  # s between plain log lines of a replay
+
+HINT: Final = """In a second terminal:
+  nedbus list                       what is published
+  nedbus echo                       every message, a line each
+  nedbus hz                         rate, jitter, latency, loss
+  nedbus get vehicle_local_position all fields of the last message"""
+
+
+class Display:
+    """Show what a daemon does; `update` is called several times a second."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self._daemon = daemon
+        self._greeted = False
+        self._last = time.monotonic()
+        self._progress: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._rates: dict[str, tuple[float, int]] = {}
+
+    def __enter__(self) -> Self:
+        if sys.stderr.isatty():
+            self._start_progress()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+    def update(self) -> None:
+        """Bring what is shown up to date."""
+        if not self._daemon.ready.is_set():
+            return
+        if not self._greeted:
+            self._greeted = True
+            place = "router on" if self._daemon.role == "router" else "client of"
+            _log.info("%s %s", place, ", ".join(self._daemon.endpoints))
+            if self._progress is not None:
+                self._progress.console.print(HINT, highlight=False)
+        if self._progress is not None:
+            for worker in self._daemon.workers:
+                self._show(self._progress, worker)
+        elif time.monotonic() - self._last >= _EVERY:
+            self._last = time.monotonic()
+            for worker in self._daemon.workers:
+                if worker.state == "running" and worker.total:
+                    _log.info("%s: %d of %d", worker.source, worker.done, worker.total)
+
+    def _start_progress(self) -> None:
+        from rich.console import Console
+        from rich.logging import RichHandler
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        console = Console(stderr=True)
+        handler = RichHandler(console=console, show_path=False, log_time_format="%H:%M:%S")
+        logging.basicConfig(handlers=[handler], format="%(message)s", force=True)
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=24),
+            TextColumn("{task.fields[state]}  {task.fields[numbers]}", markup=False),
+        )
+        self._progress = Progress(*columns, console=console, refresh_per_second=4)
+        self._progress.start()
+
+    def _show(self, progress: Progress, worker: WorkerStatus) -> None:
+        if worker.source not in self._tasks:
+            self._tasks[worker.source] = progress.add_task(worker.source, total=None, state="", numbers="")
+        count = f"{worker.done} of {worker.total}" if worker.total else f"{worker.published}"
+        numbers = f"{count} messages, {self._rate(worker):.0f}/s"
+        if worker.rejected:
+            numbers += f", {worker.rejected} rejected"
+        if worker.error:
+            numbers += f", {worker.error}"
+        total = worker.total or (1 if worker.ended else None)
+        done = worker.done if worker.total else int(worker.ended)
+        progress.update(self._tasks[worker.source], completed=done, total=total, state=worker.state, numbers=numbers)
+
+    def _rate(self, worker: WorkerStatus) -> float:
+        """Return messages a second, as an average that follows within about a second."""
+        now = time.monotonic()
+        then, published = self._rates.setdefault(worker.source, (now, worker.published))
+        if now - then > 2.0:
+            self._rates[worker.source] = (
+                now - 1.0,
+                worker.published - round((worker.published - published) / (now - then)),
+            )
+        return (worker.published - published) / (now - then) if now > then else 0.0

@@ -1,0 +1,76 @@
+"""Samples as a person reads them, and as a program does."""
+
+from __future__ import annotations
+
+import json
+import math
+
+from nedbus.subscriber import Sample
+from nedbus_msgs import VehicleLocalPosition
+
+
+def to_line(sample: Sample) -> str:
+    """Return one line with what people look at first; NED, metres, degrees."""
+    message = sample.message
+    position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
+    velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
+    lost = f"  [{sample.lost} lost]" if sample.lost else ""
+    return (
+        f"{sample.address!s:<38} {message.timestamp / 1e6:12.3f} s  ned {position} m  v {velocity} m/s"
+        f"  hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}  {doubts(message)}{lost}"
+    )
+
+
+def to_fields(sample: Sample) -> str:
+    """Return every field on a line of its own, as `ros2 topic echo` does."""
+    age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
+    lines = [f"{sample.address}{age}"]
+    for name, value in sample.message.model_dump().items():
+        lines.append(f"  {name}: {value:.9g}" if isinstance(value, float) else f"  {name}: {value}")
+    return "\n".join([*lines, "---"])
+
+
+def to_json(sample: Sample) -> str:
+    """Return one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
+    address = sample.address
+    head = {
+        "vehicle": address.vehicle,
+        "topic": address.topic,
+        "instance": address.instance,
+        "received": sample.received,
+        "sent": sample.sent,
+        "lost": sample.lost,
+    }
+    return f'{json.dumps(head)[:-1]}, "message": {sample.message.model_dump_json()}}}'
+
+
+def doubts(message: VehicleLocalPosition) -> str:
+    """Return why a position should be doubted, "ok" if nothing says so."""
+    flags = {
+        "xy": message.xy_valid,
+        "z": message.z_valid,
+        "vxy": message.v_xy_valid,
+        "vz": message.v_z_valid,
+    }
+    invalid = [name for name, valid in flags.items() if not valid]
+    words = [f"{' '.join(invalid)} invalid"] if invalid else []
+    if message.dead_reckoning:
+        words.append("dead reckoning")
+    return ", ".join(words) or "ok"
+
+
+def to_age(seconds: float) -> str:
+    """Return a span of time as a person says it."""
+    if seconds < 1:
+        return f"{max(0.0, seconds) * 1e3:.0f} ms"
+    return f"{seconds:.1f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+def to_table(head: list[str], rows: list[list[str]]) -> str:
+    """Return rows in columns, the first to the left, the others to the right."""
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
+    lines = [
+        "  ".join(cell.ljust(width) if column == 0 else cell.rjust(width) for column, (cell, width) in enumerate(pairs))
+        for pairs in (list(zip(row, widths, strict=True)) for row in [head, *rows])
+    ]
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,0 +1,163 @@
+"""Commands that watch: echo, hz."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+from nedbus.errors import NoDataError
+from nedbus.rates import Rates
+from nedbus.subscriber import Sample, Subscription
+from nedbus_msgs import ANY
+
+from .options import (
+    ConfigOption,
+    ConnectOption,
+    CountOption,
+    DurationOption,
+    InstanceOption,
+    JsonOption,
+    PrefixOption,
+    TopicArgument,
+    TopicOption,
+    VehicleOption,
+    WaitOption,
+    command,
+    open_bus,
+    pick_topic,
+    tell,
+    write,
+)
+from .text import to_age, to_fields, to_json, to_line, to_table
+
+_PATIENCE = 2.0  # s of silence after which a person is told that nothing comes
+
+
+@command
+def echo(
+    topic: TopicArgument = None,
+    *,
+    topic_option: TopicOption = ANY,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
+    latest: Annotated[bool, typer.Option("--latest", help="Skip to the newest when this terminal is slow")] = False,
+    json_output: JsonOption = False,
+    count: CountOption = None,
+    duration: DurationOption = None,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
+) -> None:
+    """Print every message as it arrives, a line each."""
+    show = to_json if json_output else to_fields if full else to_line
+    with (
+        open_bus(connect, prefix=prefix, config=config, wait=wait) as bus,
+        bus.subscribe(
+            pick_topic(topic, topic_option),
+            vehicle=vehicle,
+            instance=instance,
+            mode="latest" if latest else "every",
+        ) as subscription,
+    ):
+        try:
+            _watch(subscription, lambda sample: write(show(sample)), count=count, duration=duration)
+        finally:
+            _tell_counts(subscription)
+
+
+@command
+def hz(
+    topic: TopicArgument = None,
+    *,
+    topic_option: TopicOption = ANY,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    json_output: JsonOption = False,
+    count: CountOption = None,
+    duration: DurationOption = None,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
+) -> None:
+    """Measure rate, jitter, latency and loss of each vehicle and topic, every second."""
+    rates = Rates(since=time.time_ns())
+    with (
+        open_bus(connect, prefix=prefix, config=config, wait=wait) as bus,
+        bus.subscribe(
+            pick_topic(topic, topic_option), vehicle=vehicle, instance=instance, mode="every"
+        ) as subscription,
+    ):
+        _watch(
+            subscription,
+            rates.add,
+            count=count,
+            duration=duration,
+            each_second=lambda: _show_rates(rates, json_output=json_output),
+        )
+
+
+def _watch(
+    subscription: Subscription,
+    show: Callable[[Sample], object],
+    *,
+    count: int | None,
+    duration: float | None,
+    each_second: Callable[[], object] | None = None,
+) -> None:
+    """Show samples until there were enough, or for long enough; raise NoDataError if there were none in that time."""
+    start = time.monotonic()
+    end = float("inf") if duration is None else start + duration
+    tick, told, seen = start + 1.0, False, 0
+    while (now := time.monotonic()) < end and (count is None or seen < count):
+        if each_second is not None and now >= tick:
+            each_second()
+            tick += 1.0
+        if not seen and not told and now > start + _PATIENCE:
+            told = True
+            tell(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what there is")
+        try:
+            sample = subscription.receive(max(0.0, min(end, tick if each_second else now + 0.5) - now))
+        except NoDataError:
+            continue
+        seen += 1
+        show(sample)
+    if each_second is not None and seen:
+        each_second()
+    if not seen:
+        raise NoDataError(subscription.name, duration or 0.0)
+
+
+def _show_rates(rates: Rates, *, json_output: bool) -> None:
+    rows = []
+    for address, rate in rates.take():
+        if json_output:
+            write(
+                json.dumps({"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance, **rate})
+            )
+            continue
+        hertz, jitter, latency, worst = (rate[key] for key in ("rate", "jitter", "latency", "latency_max"))
+        rows.append(
+            [
+                str(address),
+                f"{hertz:.1f}" if hertz is not None else "-",
+                f"{jitter * 1e3:.1f} ms" if jitter is not None else "-",
+                to_age(latency) if latency is not None else "-",
+                to_age(worst) if worst is not None else "-",
+                f"{rate['lost']:.0f}",
+            ]
+        )
+    if rows:
+        write(to_table(["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST"], rows))
+
+
+def _tell_counts(subscription: Subscription) -> None:
+    counts = subscription.counts
+    if counts.lost or counts.dropped or counts.invalid:
+        tell(f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid")

@@ -1,0 +1,140 @@
+"""The service: sources in, validated messages out, status on demand, a clean end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from dataclasses import asdict, dataclass
+from typing import Final, Literal
+
+from nedbus_msgs import status_key
+
+from .errors import ConfigError, ConnectError
+from .publisher import HEARTBEAT, Outbox
+from .session import DEFAULT_ENDPOINT, Session, open_client, open_router
+from .settings import Settings
+from .sources import parse_source
+from .worker import Worker, WorkerStatus
+
+_log = logging.getLogger(__name__)
+
+_GRACE: Final = 1.0  # s that a source has to end
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceStatus:
+    """What a service tells of itself on `nedbus/@service/<id>/status`; times are seconds since the epoch."""
+
+    service: str
+    version: str
+    started: float
+    now: float
+    role: Literal["router", "client"]
+    endpoints: tuple[str, ...]
+    sources: tuple[WorkerStatus, ...]
+
+
+class Daemon:
+    """Publish the sources of the settings until they are done or `stop` is called.
+
+    `run` blocks and is meant for a thread of its own, so that signals always reach the main thread.
+
+    Raises ConfigError at once for a source that cannot be.
+    """
+
+    def __init__(self, settings: Settings, *, version: str) -> None:
+        if not settings.source:
+            raise ConfigError("source", "nothing to publish: give --source sim: or --source ulog:FILE, or several")
+        self._settings = settings
+        self._version = version
+        self._sources = {text: parse_source(text).open_source(vehicle=settings.vehicle) for text in settings.source}
+        if settings.until_done and not any(source.finite for source in self._sources.values()):
+            raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
+        self._started = time.time()
+        self._stop = threading.Event()
+        self._changed = threading.Event()
+        self._workers: list[Worker] = []
+        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")
+        self.ready = threading.Event()
+        self.role: Literal["router", "client"] = "client" if settings.connect and not settings.listen else "router"
+        self.endpoints = settings.connect if self.role == "client" else settings.listen or (DEFAULT_ENDPOINT,)
+        if settings.router_config is not None and self.role == "router":
+            self.endpoints = (str(settings.router_config),)
+
+    @property
+    def status(self) -> ServiceStatus:
+        """What the service is doing now."""
+        return ServiceStatus(
+            self.id, self._version, self._started, time.time(), self.role, self.endpoints, self.workers
+        )
+
+    @property
+    def workers(self) -> tuple[WorkerStatus, ...]:
+        """What each source is doing now."""
+        return tuple(worker.status for worker in self._workers)
+
+    def stop(self) -> None:
+        """Ask it to end; callable from anywhere, a signal handler included."""
+        self._stop.set()
+        self._changed.set()
+
+    def run(self) -> bool:
+        """Publish until done or stopped; return whether no source failed for good.
+
+        Raises ListenError when the embedded router cannot listen.
+        """
+        session = self._open()
+        if session is None:
+            return True
+        outbox = Outbox(session, prefix=self._settings.prefix)
+        threads: list[threading.Thread] = []
+        try:
+            outbox.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
+            retry = not self._settings.until_done
+            self._workers = [
+                Worker(text, source, outbox, stop=self._stop, retry=retry, on_end=self._changed.set)
+                for text, source in self._sources.items()
+            ]
+            threads = [threading.Thread(target=worker.run, name=worker.text, daemon=True) for worker in self._workers]
+            for thread in threads:
+                thread.start()
+            self.ready.set()
+            self._wait()
+        finally:
+            self._stop.set()
+            deadline = time.monotonic() + _GRACE
+            for thread in threads:
+                thread.join(max(0.0, deadline - time.monotonic()))
+            outbox.close()
+            session.close()
+        return not any(worker.state == "failed" for worker in self.workers)
+
+    def _open(self) -> Session | None:
+        """Open the session; a client waits for its router for as long as it takes."""
+        if self.role == "router":
+            config_file = self._settings.router_config
+            return open_router(listen=self.endpoints, connect=self._settings.connect, config_file=config_file)
+        told = False
+        while not self._stop.is_set():
+            try:
+                return open_client(self.endpoints, timeout=1.0)
+            except ConnectError as exc:
+                if not told:
+                    _log.warning("%s; still trying", exc)
+                told = True
+        return None
+
+    def _wait(self) -> None:
+        """Wait for `stop`, or for the end of all finite sources and for their readers to have had a second look."""
+        while not self._stop.is_set():
+            if self._settings.until_done:
+                finite = [worker for worker in self._workers if worker.source.finite]
+                if all(worker.status.ended for worker in finite):
+                    self._stop.wait(2 * HEARTBEAT if any(worker.source.speed for worker in finite) else 0.0)
+                    return
+            self._changed.wait()
+            self._changed.clear()

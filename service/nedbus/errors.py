@@ -1,0 +1,120 @@
+"""Every error that nedbus raises on purpose.
+
+    NedbusError
+    ├── the caller's words
+    │   ├── AddressError (ValueError)        a vehicle, topic, instance, key or prefix that cannot be
+    │   ├── LayoutError (ValueError)         field names that fit no layout
+    │   ├── EncodeError (ValueError)         a message whose validation was bypassed
+    │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
+    │   └── ConfigError (ValueError)         a setting, a flag or a line of a file
+    ├── the network
+    │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
+    │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
+    │   ├── NoDataError (TimeoutError)       nothing arrived in time
+    │   └── ClosedError (RuntimeError)       the bus was closed
+    └── the data
+        ├── DecodeError (ValueError)         a payload that is no VehicleLocalPosition
+        │   └── UnknownLayoutError           ... because its layout is newer than this reader
+        └── SourceError                      a source that cannot be opened or read
+
+A message that breaks the model's rules raises pydantic.ValidationError where it is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nedbus_msgs import (
+    Address,
+    AddressError,
+    DecodeError,
+    EncodeError,
+    LayoutError,
+    NedbusError,
+    UnknownLayoutError,
+)
+
+__all__ = [
+    "AddressError",
+    "AddressInUseError",
+    "ClosedError",
+    "ConfigError",
+    "ConnectError",
+    "DecodeError",
+    "EncodeError",
+    "LayoutError",
+    "ListenError",
+    "NedbusError",
+    "NoDataError",
+    "SourceError",
+    "UnknownLayoutError",
+]
+
+
+class AddressInUseError(NedbusError, ValueError):
+    """Raise when a second publisher of an address is asked for in one process."""
+
+    def __init__(self, address: Address) -> None:
+        super().__init__(f"{address} is published here already: give one of the two another vehicle")
+        self.address = address
+
+
+class ConfigError(NedbusError, ValueError):
+    """Raise for a setting that cannot be; `where` names the flag, the environment variable or the place in a file."""
+
+    def __init__(self, where: str, reason: str) -> None:
+        super().__init__(f"{where}: {reason}")
+        self.where = where
+        self.reason = reason
+
+    @classmethod
+    def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:
+        """Build the error for a place in a file."""
+        place = f", line {line}, column {column}" if line else ""
+        return cls(f"{path}{place}", reason)
+
+
+class ConnectError(NedbusError, ConnectionError):
+    """Raise when no endpoint answered in time."""
+
+    def __init__(self, endpoints: Sequence[str], seconds: float) -> None:
+        super().__init__(
+            f"nothing answers at {' or '.join(endpoints)} (tried for {seconds:.3g} s): start 'nedbus serve' or a Zenoh"
+            " router there, or name another endpoint with --connect or NEDBUS_CONNECT"
+        )
+        self.endpoints = tuple(endpoints)
+
+
+class ListenError(NedbusError, OSError):
+    """Raise when an endpoint cannot be listened on."""
+
+    def __init__(self, endpoints: Sequence[str], reason: str) -> None:
+        super().__init__(
+            f"cannot listen on {' and '.join(endpoints)} ({reason}): choose another endpoint with --listen, or join the"
+            " router that runs there with --connect"
+        )
+        self.endpoints = tuple(endpoints)
+
+
+class NoDataError(NedbusError, TimeoutError):
+    """Raise when nothing arrived in time."""
+
+    def __init__(self, what: str, seconds: float) -> None:
+        super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows what there is")
+
+
+class ClosedError(NedbusError, RuntimeError):
+    """Raise when something is asked of a bus that was closed."""
+
+    def __init__(self) -> None:
+        super().__init__("this bus is closed: connect again")
+
+
+class SourceError(NedbusError):
+    """Raise when a source cannot be opened or read."""
+
+    def __init__(self, source: str, reason: str) -> None:
+        super().__init__(f"{source}: {reason}")
+        self.source = source
+        self.reason = reason

@@ -1,0 +1,1 @@
+"""Tests of nedbus_msgs: no network, no processes."""

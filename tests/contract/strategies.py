@@ -1,0 +1,70 @@
+"""Hypothesis strategies for messages: every valid one, and every way to write one in msgpack."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+
+from hypothesis import strategies as st
+
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
+
+FLAGGED: Mapping[str, tuple[str, ...]] = {
+    "xy_valid": ("x", "y"),
+    "z_valid": ("z",),
+    "v_xy_valid": ("vx", "vy"),
+    "v_z_valid": ("vz",),
+    "heading_good_for_control": ("heading",),
+    "xy_global": ("ref_lat", "ref_lon"),
+    "z_global": ("ref_alt",),
+    "dist_bottom_valid": ("dist_bottom",),
+}
+NOT_NEGATIVE = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv")
+WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_lat": 90.0, "ref_lon": 180.0}
+
+float32s = st.floats(width=32)
+TYPES: Mapping[str, st.SearchStrategy[object]] = {
+    "uint64": st.integers(0, 2**64 - 1),
+    "uint8": st.integers(0, 255),
+    "bool": st.booleans(),
+    "float32": float32s,
+    "float32[2]": st.tuples(float32s, float32s),
+    "float64": st.floats(),
+}
+
+
+def make_valid(fields: dict[str, object]) -> dict[str, object]:
+    """Bend any fields of the right types so that they keep every rule between fields."""
+    for name in NOT_NEGATIVE:
+        value = fields[name]
+        assert isinstance(value, float)
+        fields[name] = abs(value)
+    for name, bound in WITHIN.items():
+        value = fields[name]
+        assert isinstance(value, float)
+        if abs(value) > bound:
+            fields[name] = math.copysign(bound, value)
+    for flag, names in FLAGGED.items():
+        if not all(math.isfinite(value) for name in names if isinstance(value := fields[name], float)):
+            fields[flag] = False
+    first, second = fields["timestamp_sample"], fields["timestamp"]
+    assert isinstance(first, int)
+    assert isinstance(second, int)
+    fields["timestamp_sample"], fields["timestamp"] = min(first, second), max(first, second)
+    return fields
+
+
+def fields() -> st.SearchStrategy[dict[str, object]]:
+    """Return every valid message by its fields."""
+    return st.fixed_dictionaries({name: TYPES[kind] for name, kind in FIELD_TYPES.items()}).map(make_valid)
+
+
+def messages() -> st.SearchStrategy[VehicleLocalPosition]:
+    """Return every valid message."""
+    return fields().map(VehicleLocalPosition.model_validate)
+
+
+def bits(message: VehicleLocalPosition) -> dict[str, str]:
+    """Return a message so that any NaN equals any NaN, and -0.0 does not equal 0.0."""
+    return {name: repr(value) for name, value in message.model_dump().items()}

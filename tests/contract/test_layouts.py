@@ -1,0 +1,125 @@
+"""The layout table, compared with the documents that the project started from, and the way between layouts."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from pydantic import ValidationError
+
+from nedbus_msgs import (
+    CURRENT,
+    FIELD_TYPES,
+    LAYOUTS,
+    WIRE_LAYOUTS,
+    LayoutError,
+    VehicleLocalPosition,
+    downgrade,
+    find_layout,
+    layout_table,
+    upgrade,
+)
+
+from .strategies import bits, messages
+
+SEEDS = json.loads((Path(__file__).parents[1] / "data" / "seeds.json").read_text())
+SHARED = Path(__file__).parents[3] / "shared" / "seeds"
+COUNTS = {"1.13": 45, "1.14": 46, "1.15": 49, "V0": 52, "1.16": 53}
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_layout_is_the_documents(name: str) -> None:
+    """Names, order and types of each document's message definition are those of the table."""
+    layout = LAYOUTS[name]
+    assert [[field, layout.type_of(field)] for field in layout.fields] == SEEDS[name]["fields"]
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_fixture_is_the_documents(name: str) -> None:
+    """The facts in tests/data/seeds.json are what the documents say."""
+    path = SHARED / SEEDS[name]["seed"]
+    if not path.exists():
+        pytest.skip(f"the document is not here: {path.name}")
+    rows = re.findall(
+        r"^(uint64|uint8|bool|float32(?:\[2\])?|float64)\s+(\w+)\s*(?=#|$)", path.read_text(), re.MULTILINE
+    )
+    assert [[field, kind] for kind, field in rows] == SEEDS[name]["fields"]
+
+
+def test_table_has_px4s_layouts() -> None:
+    """Five layouts, with PX4's numbers of fields; two of them may stand on the wire."""
+    assert {name: len(layout.fields) for name, layout in LAYOUTS.items()} == COUNTS
+    assert {number: layout.name for number, layout in WIRE_LAYOUTS.items()} == {0: "V0", 1: "1.16"}
+    assert CURRENT.fields == tuple(FIELD_TYPES)
+    assert all(len(set(layout.fields)) == len(layout.fields) for layout in LAYOUTS.values())
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layout_is_found_from_names_in_any_order(name: str) -> None:
+    """A ULog sorts fields by size; the names alone tell the layout."""
+    assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
+    assert find_layout(LAYOUTS[name].fields[1:]) is None
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+@given(message=messages())
+def test_downgrade_then_upgrade_keeps_what_the_layout_has(name: str, message: VehicleLocalPosition) -> None:
+    """Every field that both layouts have survives to the bit; hagl_max follows PX4's translation."""
+    older = downgrade(message, name)
+    assert tuple(older) == LAYOUTS[name].fields
+    back = upgrade(older, name)
+    lost = {field: getattr(back, field) for field in FIELD_TYPES if field not in older}
+    if "hagl_max" in older:
+        assert repr(older["hagl_max"]) == repr(message.hagl_max_z)
+        assert repr(lost.pop("hagl_max_z")) == repr(lost.pop("hagl_max_xy")) == repr(message.hagl_max_z)
+        assert {"hagl_max_z", "hagl_max_xy"} <= back.model_fields_set
+    assert not set(lost) & back.model_fields_set
+    provided = message.model_copy(update={field: getattr(back, field) for field in FIELD_TYPES if field not in older})
+    assert bits(back) == bits(provided)
+
+
+def test_not_provided_fields_of_an_old_layout() -> None:
+    """What 1.13 lacks is NaN, false or 0 and not in model_fields_set."""
+    older = downgrade(VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13")
+    message = upgrade(older, "1.13")
+    assert (message.dead_reckoning, message.dist_bottom_reset_counter) == (False, 0)
+    assert math.isnan(message.tilt_var)
+    assert (message.hagl_max_z, message.hagl_max_xy) == (5.0, 5.0)
+
+
+def test_yaw_of_1_11_is_heading() -> None:
+    """1.11 and before say yaw; 2016 logs have 24 fields: what is there is taken, the rest is not provided."""
+    message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
+    assert (message.heading, message.x) == (0.5, 1.0)
+    assert message.model_fields_set == {"timestamp", "x", "heading"}
+
+
+def test_upgrade_with_a_name_wants_exactly_its_fields() -> None:
+    """The error names what is missing or unknown, and the layout that would fit."""
+    fields = downgrade(VehicleLocalPosition(timestamp=1), "1.14")
+    with pytest.raises(LayoutError, match=r"missing.*tilt_var.*layout 1\.14"):
+        upgrade(fields, "1.15")
+    with pytest.raises(LayoutError, match="unknown bogus"):
+        upgrade({**fields, "bogus": 1}, "1.14")
+    with pytest.raises(LayoutError, match=r"no layout '1\.12'"):
+        upgrade(fields, "1.12")
+    with pytest.raises(LayoutError, match="no layout 'v9'"):
+        downgrade(VehicleLocalPosition(timestamp=1), "v9")
+
+
+def test_upgrade_keeps_the_rules() -> None:
+    """Old layouts are validated like the current one."""
+    with pytest.raises(ValidationError, match="xy_valid"):
+        upgrade({"timestamp": 1, "xy_valid": True})
+
+
+def test_layout_table_is_json() -> None:
+    """Publishers answer with it, so it must be JSON and complete."""
+    table = json.loads(json.dumps(layout_table()))
+    assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
+        ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
+    ]  # fmt: skip

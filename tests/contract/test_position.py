@@ -1,0 +1,186 @@
+"""The model: types, ranges, rules between fields, what it says when it refuses."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, describe, json_schema
+
+from .strategies import FLAGGED, NOT_NEGATIVE, WITHIN, bits, messages
+
+FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]
+
+
+def refuse(**fields: object) -> str:
+    with pytest.raises(ValidationError) as info:
+        VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
+    return describe(info.value)
+
+
+def test_not_provided_is_nan_false_or_zero() -> None:
+    """A field that is not given holds NaN, false or 0, and is not in model_fields_set."""
+    message = VehicleLocalPosition(timestamp=1)
+    assert math.isnan(message.x)
+    assert all(map(math.isnan, message.delta_xy))
+    assert (message.xy_valid, message.xy_reset_counter, message.timestamp_sample) == (False, 0, 0)
+    assert message.model_fields_set == {"timestamp"}
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_float32_field_holds_the_nearest_float32(name: str) -> None:
+    """A double is rounded as a C float would be, so that what is held is what arrives."""
+    message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 0.1})
+    assert getattr(message, name) == struct.unpack("<f", struct.pack("<f", 0.1))[0] != 0.1
+
+
+@pytest.mark.parametrize("name", [name for name in FLOATS if name not in WITHIN])
+@pytest.mark.parametrize("value", [3.5e38, 1e39, 1e308])
+def test_float32_field_refuses_what_float32_cannot_hold(name: str, value: float) -> None:
+    """1e39 is refused with the name of the field, never turned into infinity."""
+    assert refuse(**{name: value}).startswith(f"{name}: ")
+
+
+def test_float32_pair_refuses_what_float32_cannot_hold() -> None:
+    """Arrays are checked like scalars."""
+    assert refuse(delta_xy=(0.0, -1e39)).startswith("delta_xy: ")
+
+
+@pytest.mark.parametrize("name", ["ref_lat", "ref_lon"])
+def test_origin_is_never_rounded(name: str) -> None:
+    """ref_lat and ref_lon are doubles: float32 steps would be 0.4 m."""
+    message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 47.397742123456789})
+    assert getattr(message, name) == 47.397742123456789
+
+
+@pytest.mark.parametrize("name", [name for name in FLOATS if name not in WITHIN])
+def test_nan_and_infinity_pass_where_no_rule_forbids_them(name: str) -> None:
+    """PX4 says "no limit" and "unknown" with them."""
+    for value in (math.nan, math.inf):
+        message = VehicleLocalPosition.model_validate({"timestamp": 1, name: value})
+        assert str(getattr(message, name)) == str(value)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("x", "1"), ("x", True), ("x", None), ("x", 10**400), ("x", 1 + 0j),
+        ("timestamp", 1.0), ("timestamp", -1), ("timestamp", 2**64), ("timestamp", True), ("timestamp", "1"),
+        ("xy_reset_counter", 256), ("xy_reset_counter", -1), ("xy_reset_counter", 1.0), ("xy_reset_counter", False),
+        ("xy_valid", 1), ("xy_valid", "true"), ("xy_valid", None),
+        ("delta_xy", 0.0), ("delta_xy", (0.0,)), ("delta_xy", (0.0, 0.0, 0.0)), ("delta_xy", (0.0, "0")),
+    ],
+)  # fmt: skip
+def test_wrong_type_is_refused(field: str, value: object) -> None:
+    """Nothing is converted silently: what ROS 2's Python lets through does not pass here."""
+    assert field in refuse(**{field: value})
+
+
+def test_int_is_a_float_where_a_float_is_meant() -> None:
+    """0 and 1 are numbers that people write for 0.0 and 1.0."""
+    message = VehicleLocalPosition(timestamp=1, x=3)
+    assert (message.x, type(message.x)) == (3.0, float)
+
+
+def test_unknown_field_is_refused() -> None:
+    """A misspelled field is an error, not a field that is not provided."""
+    assert "xy_vaild" in refuse(xy_vaild=True)
+
+
+def test_timestamp_is_required() -> None:
+    """A message without a time is no message."""
+    with pytest.raises(ValidationError, match="timestamp"):
+        VehicleLocalPosition.model_validate({})
+
+
+@pytest.mark.parametrize(("flag", "names"), FLAGGED.items())
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_flag_promises_finite_fields(flag: str, names: tuple[str, ...], bad: float) -> None:
+    """A flag that is set needs its fields finite, each of them; one that is not set needs nothing."""
+    good = dict.fromkeys(names, 1.0)
+    VehicleLocalPosition.model_validate({"timestamp": 1, flag: True, **good})
+    for name in names:
+        assert name in refuse(**{flag: True, **good, name: bad})
+    VehicleLocalPosition.model_validate({"timestamp": 1, flag: False, **dict.fromkeys(names, math.nan)})
+
+
+@pytest.mark.parametrize("name", NOT_NEGATIVE)
+def test_variances_and_sigmas_are_not_negative(name: str) -> None:
+    """-0.0 is 0."""
+    assert name in refuse(**{name: -1e-6})
+    VehicleLocalPosition.model_validate({"timestamp": 1, name: -0.0})
+
+
+@pytest.mark.parametrize(("name", "bound"), WITHIN.items())
+def test_angles_have_bounds(name: str, bound: float) -> None:
+    """float32(pi), 90 and 180 pass; the next number after them does not, nor does infinity."""
+    for value in (bound, -bound, math.nan):
+        VehicleLocalPosition.model_validate({"timestamp": 1, name: value})
+    beyond = bound + (3e-7 if name == "heading" else 1e-12)
+    for value in (math.nextafter(beyond, math.inf), -beyond, math.inf):
+        assert name in refuse(**{name: value})
+
+
+def test_sample_is_not_later_than_message() -> None:
+    """timestamp_sample <= timestamp."""
+    assert "timestamp_sample" in refuse(timestamp_sample=2)
+    VehicleLocalPosition(timestamp=2, timestamp_sample=2)
+
+
+def test_all_broken_rules_are_told_at_once() -> None:
+    """Who mends one thing should not have to come back for the next."""
+    text = refuse(xy_valid=True, eph=-1.0, heading=7.0)
+    assert all(name in text for name in ("x:", "y:", "eph:", "heading:"))
+    assert "-1.0" in text
+
+
+def test_message_is_immutable() -> None:
+    """A message can be shared between threads."""
+    with pytest.raises(ValidationError, match="frozen"):
+        VehicleLocalPosition(timestamp=1).x = 1.0  # type: ignore[misc] # that it cannot be assigned is the test
+
+
+def test_copy_with_updates_is_validated() -> None:
+    """model_copy is no way around the rules, and keeps what was provided."""
+    message = VehicleLocalPosition(timestamp=1, y=2.0)
+    copy = message.model_copy(update={"x": 0.1})
+    assert copy.x == struct.unpack("<f", struct.pack("<f", 0.1))[0]
+    assert copy.model_fields_set == {"timestamp", "x", "y"}
+    assert message.model_copy().y == 2.0
+    with pytest.raises(ValidationError):
+        message.model_copy(update={"x": 1e39})
+
+
+@given(messages())
+def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
+    """JSON has NaN and infinities as strings, and reading it gives the same message to the bit."""
+    text = message.model_dump_json()
+    assert "nan" not in text
+    assert "inf" not in text
+    assert bits(VehicleLocalPosition.model_validate_json(text)) == bits(message)
+
+
+@given(messages(), st.sampled_from(sorted(FIELD_TYPES)))
+def test_copy_of_a_valid_message_is_the_same(message: VehicleLocalPosition, name: str) -> None:
+    """Validation changes nothing that is valid already."""
+    copy = message.model_copy(update={name: getattr(message, name)})
+    assert bits(copy) == bits(message)
+
+
+def test_json_schema_describes_the_json() -> None:
+    """Every field has a type and a description; floats may be the three strings; there is no NaN in it."""
+    schema = json_schema()
+    properties = schema["properties"]
+    assert isinstance(properties, dict)
+    assert list(properties) == list(FIELD_TYPES)
+    assert all(field["description"] and "default" not in field for field in properties.values())
+    assert properties["x"]["anyOf"] == [
+        {"type": "number"},
+        {"enum": ["NaN", "Infinity", "-Infinity"], "type": "string"},
+    ]
+    assert schema["additionalProperties"] is False

@@ -1,0 +1,207 @@
+"""The msgpack codec: the golden bytes, round trips, foreign encodings, hostile input."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import msgpack
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from nedbus_msgs import (
+    FIELD_TYPES,
+    PAYLOAD_LIMIT,
+    PAYLOAD_SIZE,
+    DecodeError,
+    EncodeError,
+    UnknownLayoutError,
+    VehicleLocalPosition,
+    decode,
+    downgrade,
+    encode,
+)
+
+from .strategies import bits, fields, messages
+
+GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "golden.json").read_text())
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_bytes(name: str) -> None:
+    """These bytes are the wire format; to change them is a breaking release."""
+    message = VehicleLocalPosition.model_validate_json(json.dumps(GOLDEN[name]["message"]))
+    payload = bytes.fromhex(GOLDEN[name]["payload"])
+    assert encode(message) == payload
+    assert bits(decode(payload)) == bits(message)
+
+
+@given(messages())
+def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) -> None:
+    """Any msgpack reader gets an array of the layout number and the 53 fields, with PX4's types."""
+    payload = encode(message)
+    assert len(payload) == PAYLOAD_SIZE
+    array = msgpack.unpackb(payload, use_list=False)
+    assert array[0] == 1
+    assert [repr(value) for value in array[1:]] == [repr(getattr(message, name)) for name in FIELD_TYPES]
+
+
+@given(messages())
+def test_round_trip_is_exact(message: VehicleLocalPosition) -> None:
+    """Decode gives back what encode was given, to the bit."""
+    assert bits(decode(encode(message))) == bits(message)
+
+
+@given(messages(), st.booleans(), st.booleans())
+def test_other_encoders_are_read(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
+    """Short ints, doubles for floats, and ints where a float is meant make the same message."""
+    values = [value for name, value in message.model_dump().items()]
+    if whole:
+        values = [
+            int(value) if isinstance(value, float) and value.is_integer() and value else value for value in values
+        ]
+        values = [
+            value if not isinstance(value, int) or -(2**63) <= value < 2**64 else float(value) for value in values
+        ]
+    payload = msgpack.packb([1, *values], use_single_float=single and not (message.ref_lat or message.ref_lon))
+    assert bits(decode(payload)) == bits(message)
+
+
+@given(messages())
+def test_layout_0_is_read(message: VehicleLocalPosition) -> None:
+    """V0 has 52 fields and one hagl_max."""
+    older = downgrade(message, "V0")
+    read = decode(msgpack.packb([0, *older.values()]))
+    assert bits(read) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
+
+
+def test_newer_layout_is_read_by_names() -> None:
+    """With the field names of an unknown layout, what is known is read and the rest is left."""
+    names = ["timestamp", "x", "y", "brand_new"]
+    payload = msgpack.packb([2, 5, 1.0, 2.0, True])
+    with pytest.raises(UnknownLayoutError, match="layout 2 with 4 fields; this reader knows layouts 0, 1") as info:
+        decode(payload)
+    assert (info.value.layout, info.value.count, info.value.known) == (2, 4, (0, 1))
+    message = decode(payload, newer={2: names})
+    assert (message.timestamp, message.x, message.y) == (5, 1.0, 2.0)
+    with pytest.raises(DecodeError, match="3 fields where layout 2 has 4"):
+        decode(msgpack.packb([2, 5, 1.0, 2.0]), newer={2: names})
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", "0 bytes that are not one msgpack value"),
+        (b"\xc1", "1 bytes"),
+        (b"hello", "5 bytes"),
+        (msgpack.packb({"x": 1}), "not one msgpack value"),
+        (msgpack.packb([]), "does not start|not an array that starts"),
+        (msgpack.packb(["1"]), "not an array that starts"),
+        (msgpack.packb([True, 1]), "not an array that starts"),
+        (msgpack.packb([1, 2, 3]), "2 fields where layout 1 has 53"),
+        (msgpack.packb(7), "not an array"),
+        (b"\x00" * (PAYLOAD_LIMIT + 1), "4097 bytes, more than the 4096"),
+        (b"\xdd\xff\xff\xff\xff", "not one msgpack value"),
+        (b"\x91" * 4000, "not one msgpack value"),
+    ],
+)
+def test_bad_payload_is_named(payload: bytes, reason: str) -> None:
+    """Each way to be wrong has a reason that a person understands."""
+    with pytest.raises(DecodeError, match=reason):
+        decode(payload)
+
+
+def test_trailing_and_missing_bytes_are_refused() -> None:
+    """One payload is one message."""
+    payload = encode(VehicleLocalPosition(timestamp=1))
+    for bad in (payload + b"\x00", payload[:-1], payload[1:]):
+        with pytest.raises(DecodeError):
+            decode(bad)
+
+
+def test_broken_rule_in_a_payload_is_refused() -> None:
+    """The model judges what arrives as it judges what is sent, in both paths of the decoder."""
+    values = [1, *VehicleLocalPosition(timestamp=1).model_dump().values()]
+    values[3] = True  # xy_valid, while x is NaN
+    with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
+        decode(msgpack.packb(values))
+    payload = bytearray(encode(VehicleLocalPosition(timestamp=1)))
+    assert payload[22] == 0xC2
+    payload[22] = 0xC3
+    with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
+        decode(bytes(payload))
+
+
+def test_flipped_tag_in_a_full_width_payload_is_read_or_refused() -> None:
+    """A payload of 244 bytes with other tags is no fixed record: it goes the way of any msgpack."""
+    payload = encode(VehicleLocalPosition(timestamp=1, x=1.0))
+    for index in range(PAYLOAD_SIZE):
+        for bit in range(8):
+            bad = bytearray(payload)
+            bad[index] ^= 1 << bit
+            try:
+                again = encode(decode(bytes(bad)))
+            except DecodeError:
+                continue
+            assert len(again) == PAYLOAD_SIZE
+
+
+@given(st.binary(max_size=600))
+@example(b"\xdc\x00\x36")
+@example(b"\xc7\x0c\xff" + bytes(12))
+@settings(max_examples=2000)
+def test_any_bytes_decode_or_raise_the_one_error(payload: bytes) -> None:
+    """No byte string does anything but decode or raise DecodeError."""
+    try:
+        decode(payload)
+    except DecodeError as exc:
+        assert exc.reason
+
+
+msgpack_values = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=5)
+    | st.binary(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(fields(), st.integers(0, 53), msgpack_values)
+@settings(max_examples=1000)
+def test_any_value_in_any_place_is_the_models_decision(given: dict[str, object], place: int, value: object) -> None:
+    """A payload with one strange value decodes exactly if the model takes that value."""
+    array: list[object] = [1, *given.values()]
+    array[place] = value
+    try:
+        message = decode(msgpack.packb(array))
+    except DecodeError:
+        return
+    assert place == 0 or repr(message.model_dump()[list(FIELD_TYPES)[place - 1]]) in {
+        repr(value),
+        repr(float(value)) if isinstance(value, int | float) else "",
+        repr(struct.unpack("<f", struct.pack("<f", value))[0]) if isinstance(value, int | float) else "",
+        repr(tuple(map(float, value))) if isinstance(value, list) else "",
+        repr(struct.unpack("<2f", struct.pack("<2f", *value))) if isinstance(value, list) and len(value) == 2 else "",
+    }
+
+
+def test_bypassed_validation_is_caught_at_encode() -> None:
+    """A message made with model_construct that holds what its fields cannot is an error, not other bytes."""
+    for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
+        message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
+        with pytest.raises(EncodeError, match="VehicleLocalPosition"):
+            encode(message)
+
+
+def test_doubles_of_the_origin_survive() -> None:
+    """ref_lat and ref_lon never pass through float32."""
+    message = VehicleLocalPosition(timestamp=1, ref_lat=math.nextafter(47.0, 48.0), ref_lon=-math.nextafter(8.0, 9.0))
+    read = decode(encode(message))
+    assert (read.ref_lat, read.ref_lon) == (message.ref_lat, message.ref_lon)
