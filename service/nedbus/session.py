@@ -84,6 +84,7 @@ def open_router(
             {
                 **_COMMON,
                 "mode": "router",
+                "scouting/delay": 0,  # nobody is scouted, so there is nobody to wait 0.5 s for
                 "listen/endpoints": list(listen),
                 "connect/endpoints": list(connect),
                 "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},

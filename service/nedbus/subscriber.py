@@ -291,13 +291,20 @@ class Feed:
             if self._closed:
                 return
             self._closed = self.ended = True
+        # A full channel holds Zenoh's thread, which holds the lock that undeclaring needs: somebody must go on reading.
+        reader = threading.Thread(target=self._discard, name="nedbus-discard", daemon=True)
+        reader.start()
         self._misses.undeclare()
         self._subscriber.undeclare()
-        drain(self._handler)  # a full channel would hold Zenoh's thread, and with it the session's close
         if self._session is not None:
             self._session.close()
-        if self._pump is not None and self._pump is not threading.current_thread():
-            self._pump.join(1.0)
+        for thread in (reader, self._pump):
+            if thread is not None and thread is not threading.current_thread():
+                thread.join(1.0)
+
+    def _discard(self) -> None:
+        while receive(self._handler):
+            pass
 
     def _run_pump(self, wake: Callable[[], object]) -> None:
         while self.wait():

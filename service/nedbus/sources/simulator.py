@@ -16,7 +16,7 @@ from itertools import count
 from random import Random
 from typing import Final
 
-from nedbus_msgs import TOPICS, Address, VehicleLocalPosition
+from nedbus_msgs import FIELD_TYPES, TOPICS, Address, VehicleLocalPosition
 
 from .record import Flight, Record
 from .spec import SimulatorOptions
@@ -250,6 +250,8 @@ def true_fields(time: float, truth: Truth) -> dict[str, object]:
               vxy_max vz_max hagl_min hagl_max_z hagl_max_xy"""
     return {
         **dict.fromkeys(zero.split(), 0.0),
+        **dict.fromkeys((name for name, kind in FIELD_TYPES.items() if kind == "uint8"), 0),
+        "dead_reckoning": False,
         **_stamps(time),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
         **dict(zip(("x", "y", "z"), truth.position, strict=True)),

@@ -104,7 +104,8 @@ def _read(path: Path) -> tuple[ULog, list[str]]:
     """Return the log, and what its reader says is wrong with it."""
     with _stdout_lock, contextlib.redirect_stdout(io.StringIO()) as said:
         try:
-            log = ULog(str(path), list(TOPICS))
+            with path.open("rb") as file:
+                log = ULog(file, list(TOPICS))
         except OSError as exc:
             raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
         except ULogException as exc:

@@ -1,0 +1,5 @@
+"""`python -m nedbus` is `nedbus`."""
+
+from nedbus.cli import main
+
+main()

@@ -1,0 +1,292 @@
+"""Fixtures: a real router for each test, both clients behind one face, processes with a deadline."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal, Protocol
+
+import pytest
+
+import nedbus
+from nedbus.session import Session, open_router
+from nedbus_msgs import Address, VehicleLocalPosition
+
+DEADLINE = 30.0  # s that a test waits for a condition before it fails
+LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
+
+Mode = Literal["latest", "every"]
+
+
+def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEADLINE) -> None:
+    """Wait until a condition holds, and fail with words when it never does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"waited {seconds} s in vain for {what}"
+        time.sleep(0.01)
+
+
+def free_endpoint() -> str:
+    """Return a Zenoh endpoint on a port of loopback that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    """Run a router of its own for this test."""
+    where = free_endpoint()
+    session = open_router(listen=(where,))
+    yield where
+    session.close()
+
+
+@pytest.fixture(autouse=True)
+def _no_settings(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Keep the settings of whoever runs the tests out of them."""
+    for name in [name for name in os.environ if name.startswith("NEDBUS_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(tmp_path)
+
+
+class SubscriptionFace(Protocol):
+    """What a subscription of either client can do, as a test sees it."""
+
+    @property
+    def counts(self) -> nedbus.Counts: ...
+    def receive(self, timeout: float | None = None) -> nedbus.Sample: ...
+    def take(self, count: int) -> list[nedbus.Sample]: ...
+    def close(self) -> None: ...
+
+
+class Client(Protocol):
+    """What a bus of either client can do, as a test sees it."""
+
+    @property
+    def connected(self) -> bool: ...
+    def subscribe(
+        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+    ) -> SubscriptionFace: ...
+    def latest(self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None) -> list[nedbus.Sample]: ...
+    def vehicles(self) -> dict[str, list[Address]]: ...
+    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> nedbus.Publisher: ...
+    def services(self) -> list[dict[str, object]]: ...
+    def close(self) -> None: ...
+
+
+class SyncSubscription:
+    """A Subscription that can take several at once."""
+
+    def __init__(self, subscription: nedbus.Subscription) -> None:
+        self._subscription = subscription
+        self.receive = subscription.receive
+        self.close = subscription.close
+
+    @property
+    def counts(self) -> nedbus.Counts:
+        return self._subscription.counts
+
+    def take(self, count: int) -> list[nedbus.Sample]:
+        """Iterate, as a script does, over this many."""
+        taken: list[nedbus.Sample] = []
+        for sample in self._subscription:
+            taken.append(sample)
+            if len(taken) == count:
+                break
+        return taken
+
+
+class SyncClient:
+    """The Bus, as a test sees it."""
+
+    def __init__(self, bus: nedbus.Bus) -> None:
+        self._bus = bus
+        self.latest = bus.latest
+        self.vehicles = bus.vehicles
+        self.publisher = bus.publisher
+        self.services = bus.services
+        self.close = bus.close
+
+    @property
+    def connected(self) -> bool:
+        return self._bus.connected
+
+    def subscribe(
+        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+    ) -> SubscriptionFace:
+        return SyncSubscription(self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode))
+
+
+class BlockingSubscription:
+    """An AsyncSubscription, driven from a test."""
+
+    def __init__(self, runner: asyncio.Runner, subscription: nedbus.AsyncSubscription) -> None:
+        self._run = runner.run
+        self._subscription = subscription
+        self._run(subscription.__aenter__())
+
+    @property
+    def counts(self) -> nedbus.Counts:
+        return self._subscription.counts
+
+    def receive(self, timeout: float | None = None) -> nedbus.Sample:
+        return self._run(self._subscription.receive(timeout))
+
+    def take(self, count: int) -> list[nedbus.Sample]:
+        async def iterate() -> list[nedbus.Sample]:
+            taken: list[nedbus.Sample] = []
+            async for sample in self._subscription:
+                taken.append(sample)
+                if len(taken) == count:
+                    break
+            return taken
+
+        return self._run(iterate())
+
+    def close(self) -> None:
+        self._run(self._subscription.close())
+
+
+class BlockingClient:
+    """The AsyncBus, driven from a test."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._runner = asyncio.Runner()
+        self._bus = nedbus.connect_async(endpoint)
+        self._run = self._runner.run
+        self._run(self._bus.__aenter__())
+
+    @property
+    def connected(self) -> bool:
+        return self._bus.connected
+
+    def subscribe(
+        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+    ) -> SubscriptionFace:
+        async def subscribe() -> nedbus.AsyncSubscription:
+            return self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode)
+
+        return BlockingSubscription(self._runner, self._run(subscribe()))
+
+    def latest(self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None) -> list[nedbus.Sample]:
+        return self._run(self._bus.latest(topic, vehicle=vehicle, instance=instance))
+
+    def vehicles(self) -> dict[str, list[Address]]:
+        return self._run(self._bus.vehicles())
+
+    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> nedbus.Publisher:
+        return self._run(self._bus.publisher(topic, vehicle=vehicle, instance=instance))
+
+    def services(self) -> list[dict[str, object]]:
+        return self._run(self._bus.services())
+
+    def close(self) -> None:
+        self._run(self._bus.close())
+
+    def end(self) -> None:
+        self.close()
+        self._runner.close()
+
+
+@pytest.fixture(params=["sync", "async"])
+def client(request: pytest.FixtureRequest, endpoint: str) -> Iterator[Client]:
+    """Connect with either client."""
+    if request.param == "sync":
+        with nedbus.connect(endpoint) as bus:
+            yield SyncClient(bus)
+    else:
+        driven = BlockingClient(endpoint)
+        yield driven
+        driven.end()
+
+
+@pytest.fixture
+def bus(endpoint: str) -> Iterator[nedbus.Bus]:
+    """Connect another bus, as another script would."""
+    with nedbus.connect(endpoint) as other:
+        yield other
+
+
+@pytest.fixture
+def raw(endpoint: str) -> Iterator[Session]:
+    """Connect a plain Zenoh session, as a client in another language would."""
+    with nedbus.connect(endpoint) as other:
+        yield other._session
+
+
+def message(timestamp: int = 1, **fields: object) -> VehicleLocalPosition:
+    """Return a message with these fields."""
+    return VehicleLocalPosition.model_validate({"timestamp": timestamp, **fields})
+
+
+class Process:
+    """A process that a test starts: its output in files, gone at the end of the test at the latest."""
+
+    def __init__(self, arguments: list[str], where: Path, environment: dict[str, str]) -> None:
+        self._out = where / "stdout"
+        self._err = where / "stderr"
+        with self._out.open("wb") as out, self._err.open("wb") as err:
+            self.popen = subprocess.Popen(
+                arguments, stdout=out, stderr=err, stdin=subprocess.DEVNULL, cwd=where, env=environment
+            )
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def wait(self, seconds: float = DEADLINE) -> int:
+        """Wait for its end and return its exit code; fail with what it said when it does not end."""
+        try:
+            return self.popen.wait(seconds)
+        except subprocess.TimeoutExpired:
+            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{self.out}{self.err}")
+
+    def signal(self, number: signal.Signals) -> None:
+        self.popen.send_signal(number)
+
+    def kill(self) -> None:
+        self.popen.kill()
+        self.popen.wait(DEADLINE)
+
+
+Start = Callable[..., Process]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start Python processes; each is killed at the end of the test if it is still there."""
+    processes: list[Process] = []
+
+    def start_process(*arguments: str, **environment: str) -> Process:
+        where = tmp_path / f"process-{len(processes)}"
+        where.mkdir()
+        inherited = {name: value for name, value in os.environ.items() if not name.startswith("NEDBUS_")}
+        process = Process([sys.executable, *arguments], where, inherited | environment)
+        processes.append(process)
+        return process
+
+    yield start_process
+    for process in processes:
+        process.kill()
+
+
+@pytest.fixture
+def run_nedbus(start: Start) -> Start:
+    """Start `nedbus` with these arguments."""
+
+    def run(*arguments: str, **environment: str) -> Process:
+        return start("-m", "nedbus", *arguments, **environment)
+
+    return run

@@ -1,0 +1,1 @@
+"""Tests of nedbus: real sessions, real processes."""

@@ -1,0 +1,398 @@
+"""Publish, subscribe, ask: the same rules for the sync and the async client, over a real router."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import math
+import threading
+import time
+from typing import cast
+
+import msgpack
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.session import Session
+from nedbus_msgs import TOPICS, Address, encode
+from tests.conftest import DEADLINE, Client, Mode, free_endpoint, message, wait_for
+
+VLP = "vehicle_local_position"
+BOTH: list[Mode] = ["latest", "every"]
+
+
+def wait_for_reader(raw: Session, key: str) -> None:
+    """Wait until a subscriber of this key is known to the publisher's side."""
+    probe = raw.declare_publisher(key)
+    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
+    probe.undeclare()
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_message_arrives_as_it_was(client: Client, bus: nedbus.Bus, mode: Mode) -> None:
+    """What is published arrives typed, equal to the bit, with its address and times."""
+    publisher = bus.publisher("estimator_local_position", vehicle="7", instance=1)
+    sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
+    subscription = client.subscribe(mode=mode)
+    publisher.publish(sent)
+    sample = subscription.receive(DEADLINE)
+    assert encode(sample.message) == encode(sent)
+    assert sample.address == Address("7", "estimator_local_position", 1)
+    assert (sample.vehicle, sample.topic, sample.instance, sample.lost) == ("7", "estimator_local_position", 1, 0)
+    assert sample.sent is not None
+    assert abs(sample.received - time.time_ns()) < 60e9
+    assert sample.latency is not None
+
+
+def test_every_sample_arrives_in_order(client: Client, bus: nedbus.Bus) -> None:
+    """Mode "every" gives each sample once, in order, with counts to prove it."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = client.subscribe(VLP, mode="every")
+    first = subscription.receive(DEADLINE)
+    for timestamp in range(2, 1002):
+        publisher.publish(message(timestamp))
+    taken = [first, *subscription.take(1000)]
+    assert [sample.message.timestamp for sample in taken] == list(range(1, 1002))
+    assert subscription.counts == nedbus.Counts(received=1001)
+
+
+def test_latest_gives_the_newest_of_each_key(client: Client, bus: nedbus.Bus) -> None:
+    """A reader that is slower than the data sees the newest of each vehicle; what it did not see is counted."""
+    publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("a", "b")]
+    for publisher in publishers:
+        publisher.publish(message(1))
+    subscription = client.subscribe(VLP)
+    assert {subscription.receive(DEADLINE).vehicle for _ in publishers} == {"a", "b"}
+    for timestamp in range(2, 102):
+        for publisher in publishers:
+            publisher.publish(message(timestamp))
+    seen: dict[str, int] = {}
+    while set(seen.values()) != {101} or len(seen) < 2:
+        sample = subscription.receive(DEADLINE)
+        assert sample.message.timestamp > seen.get(sample.vehicle, 0)
+        seen[sample.vehicle] = sample.message.timestamp
+    counts = subscription.counts
+    assert counts.received + counts.dropped == 202
+    assert (counts.lost, counts.invalid) == (0, 0)
+
+
+def test_ring_overflow_is_counted_as_dropped(bus: nedbus.Bus, endpoint: str) -> None:
+    """What a "latest" reader's own queue dropped is counted from the publisher's sequence, exactly."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP) as subscription:
+        assert subscription.receive().message.timestamp == 1
+        for timestamp in range(2, 5001):
+            publisher.publish(message(timestamp))
+        while subscription.receive().message.timestamp != 5000:
+            pass
+        counts = subscription.counts
+        assert counts.received + counts.dropped + counts.lost == 5000
+        assert counts.dropped > 3000
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_late_joiner_gets_the_last_value(client: Client, bus: nedbus.Bus, mode: Mode) -> None:
+    """A subscription starts with the last value of each key, even if nothing is published any more."""
+    for vehicle in ("a", "b"):
+        publisher = bus.publisher(VLP, vehicle=vehicle)
+        for timestamp in (1, 2, 3):
+            publisher.publish(message(timestamp))
+    subscription = client.subscribe(mode=mode)
+    taken = [subscription.receive(DEADLINE) for _ in range(2)]
+    assert {(sample.vehicle, sample.message.timestamp) for sample in taken} == {("a", 3), ("b", 3)}
+
+
+def test_subscription_is_a_choice(client: Client, bus: nedbus.Bus) -> None:
+    """Topic, vehicle and instance choose what arrives."""
+    for vehicle in ("1", "2"):
+        for topic in TOPICS.values():
+            for instance in (0, 1) if topic.instances else (None,):
+                bus.publisher(topic.name, vehicle=vehicle, instance=instance).publish(message(1))
+    assert len(client.latest()) == 10
+    assert {sample.vehicle for sample in client.latest(VLP)} == {"1", "2"}
+    assert [str(sample.address) for sample in client.latest("estimator_local_position", vehicle="2")] == [
+        "2/estimator_local_position/0",
+        "2/estimator_local_position/1",
+    ]
+    subscription = client.subscribe("estimator_local_position", instance=1)
+    assert {str(subscription.receive(DEADLINE).address) for _ in range(2)} == {
+        "1/estimator_local_position/1",
+        "2/estimator_local_position/1",
+    }
+    with pytest.raises(nedbus.NoDataError):
+        subscription.receive(0.1)
+
+
+def test_latest_is_empty_where_nothing_is(client: Client) -> None:
+    """No publisher, no answer, no error."""
+    assert client.latest() == []
+    assert client.vehicles() == {}
+    assert client.services() == []
+
+
+def test_vehicles_come_and_go(client: Client, endpoint: str) -> None:
+    """Liveliness shows what is published now, and forgets what is closed."""
+    with nedbus.connect(endpoint) as other:
+        other.publisher(VLP, vehicle="7")
+        other.publisher("estimator_local_position", vehicle="7", instance=2)
+        wait_for(lambda: len(client.vehicles().get("7", [])) == 2, what="vehicle 7")
+        assert client.vehicles() == {"7": [Address("7", "estimator_local_position", 2), Address("7", VLP)]}
+    wait_for(lambda: not client.vehicles(), what="vehicle 7 to go")
+
+
+def test_receive_times_out_with_words(client: Client) -> None:
+    """NoDataError is a TimeoutError, and says what did not come and what to do."""
+    subscription = client.subscribe(VLP, vehicle="9")
+    with pytest.raises(
+        nedbus.NoDataError, match=r"nedbus/9/vehicle_local_position within 0\.05 s.*nedbus list"
+    ) as info:
+        subscription.receive(0.05)
+    assert isinstance(info.value, TimeoutError)
+
+
+def test_closed_subscription_ends_iteration(client: Client) -> None:
+    """Iteration ends without an error; receive says that it is closed; closing twice is fine."""
+    subscription = client.subscribe(VLP)
+    subscription.close()
+    subscription.close()
+    assert subscription.take(1) == []
+    with pytest.raises(nedbus.ClosedError):
+        subscription.receive(1.0)
+
+
+def test_closed_bus_ends_everything(client: Client) -> None:
+    """Everything that is asked of a closed bus raises ClosedError, and its subscriptions end."""
+    subscription = client.subscribe(VLP)
+    publisher = client.publisher(VLP, vehicle="1")
+    client.close()
+    client.close()
+    assert subscription.take(1) == []
+    with pytest.raises(nedbus.ClosedError):
+        publisher.publish(message())
+    for ask in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
+        with pytest.raises(nedbus.ClosedError):
+            ask()
+
+
+def test_close_from_another_thread_ends_a_waiting_reader(bus: nedbus.Bus) -> None:
+    """A thread that waits for a sample is let go when the subscription is closed."""
+    for mode in BOTH:
+        subscription = bus.subscribe(VLP, mode=mode)
+        reader = threading.Thread(target=list, args=(subscription,), daemon=True)
+        reader.start()
+        subscription.close()
+        reader.join(DEADLINE)
+        assert not reader.is_alive()
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_unread_subscription_can_be_closed(endpoint: str, bus: nedbus.Bus, mode: Mode) -> None:
+    """A full queue holds neither close nor the process."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode=mode):
+        for timestamp in range(1, 20_000):
+            publisher.publish(message(timestamp))
+        start = time.monotonic()
+    assert time.monotonic() - start < 5.0, "Zenoh's own limit for a stuck close is 10 s"
+
+
+def test_stuck_every_reader_does_not_hold_its_bus(client: Client, bus: nedbus.Bus) -> None:
+    """While an unread "every" subscription is full, the same bus still asks and reads elsewhere."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    stuck = client.subscribe(VLP, mode="every")
+    for timestamp in range(1, 20_001):
+        publisher.publish(message(timestamp))
+    wait_for(lambda: [s.message.timestamp for s in client.latest(VLP)] == [20_000], what="the last value")
+    assert client.subscribe(VLP).receive(DEADLINE).message.timestamp > 0
+    stuck.close()
+
+
+def test_lost_is_counted_exactly(endpoint: str, bus: nedbus.Bus) -> None:
+    """With a flood that no network buffer holds, received and lost together are what was published."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        first = subscription.receive(DEADLINE)
+        total = 60_000
+        for timestamp in range(2, total + 1):
+            publisher.publish(message(timestamp))
+        lost, received, last = first.lost, 1, first.message.timestamp
+        while last != total:
+            sample = subscription.receive(DEADLINE)
+            assert sample.message.timestamp == last + 1 + sample.lost
+            lost, received, last = lost + sample.lost, received + 1, sample.message.timestamp
+        assert subscription.counts == nedbus.Counts(received=received, lost=lost)
+        assert received + lost == total
+        assert lost > 0
+
+
+def test_invalid_payload_never_ends_an_iteration(
+    client: Client, raw: Session, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Garbage, foreign keys, deletes and wildcard puts are counted and named once; good samples come through."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = client.subscribe(mode="every")
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    good = encode(message(2, x=1.0))
+    for key, payload in (
+        ("nedbus/1/vehicle_local_position", b"garbage"),
+        ("nedbus/1/vehicle_local_position", msgpack.packb([1, 2, 3])),
+        ("nedbus/*/vehicle_local_position", good),
+        ("nedbus/1/vehicle_attitude", good),
+        ("nedbus/1/estimator_local_position", good),
+        ("nedbus/1", good),
+    ):
+        raw.put(key, payload)
+    raw.delete("nedbus/1/vehicle_local_position")
+    raw.put("nedbus/2/vehicle_local_position", good)
+    sample = subscription.receive(DEADLINE)
+    assert (sample.vehicle, sample.message.x, sample.sent) == ("2", 1.0, None)
+    assert subscription.counts == nedbus.Counts(received=2, invalid=7)
+    warned = [record.message for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warned) == len({text.split(":")[0] for text in warned}), "each key is named once"
+    assert any("garbage" in text or "one msgpack value" in text for text in warned)
+
+
+def test_newer_layout_is_read_with_its_publishers_schema(
+    client: Client, raw: Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    """An unknown layout is looked up once; what is known by name is read, what is not is said once."""
+    fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
+    answer = json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]})
+    asked = []
+
+    def reply(query: zenoh.Query) -> None:
+        asked.append(query)
+        with query:
+            query.reply("nedbus/@schema/VehicleLocalPosition", answer)
+
+    queryable = raw.declare_queryable(
+        "nedbus/@schema/VehicleLocalPosition", zenoh.handlers.Callback(reply, indirect=False)
+    )
+    subscription = client.subscribe(VLP, mode="every")
+    wait_for_reader(raw, "nedbus/1/vehicle_local_position")
+    for timestamp in (1, 2):
+        raw.put("nedbus/1/vehicle_local_position", msgpack.packb([9, timestamp, True, 2.5]))
+    taken = subscription.take(2)
+    assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(1, 2.5), (2, 2.5)]
+    assert len(asked) == 1
+    assert [text for text in caplog.messages if "layout 9" in text] == [
+        "layout 9 is newer than this reader; not read: brand_new"
+    ]
+    queryable.undeclare()
+
+
+@pytest.mark.parametrize(
+    "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
+)
+def test_layout_that_nobody_explains_is_invalid(client: Client, raw: Session, answer: bytes) -> None:
+    """A hostile or broken answer about a layout is as good as none: the payload is counted as invalid."""
+    key = "nedbus/@schema/VehicleLocalPosition"
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, answer)
+
+    queryable = raw.declare_queryable(key, zenoh.handlers.Callback(reply, indirect=False))
+    subscription = client.subscribe(VLP, mode="every")
+    wait_for_reader(raw, "nedbus/1/vehicle_local_position")
+    raw.put("nedbus/1/vehicle_local_position", msgpack.packb([9, 1, 2]))
+    raw.put("nedbus/1/vehicle_local_position", encode(message(2)))
+    assert subscription.receive(DEADLINE).message.timestamp == 2
+    assert subscription.counts.invalid == 1
+    queryable.undeclare()
+
+
+def test_publish_takes_messages_and_fields(client: Client, bus: nedbus.Bus) -> None:
+    """Fields by name are validated; what is no message is refused before it is sent."""
+    publisher = client.publisher(VLP, vehicle="1")
+    publisher.publish({"timestamp": 4, "x": 1.0})
+    assert bus.latest(VLP)[0].message.x == 1.0
+    with pytest.raises(ValueError, match="xy_valid"):
+        publisher.publish({"timestamp": 5, "xy_valid": True})
+    assert bus.latest(VLP)[0].message.timestamp == 4
+    assert publisher.published == 1
+
+
+def test_two_publishers_of_one_address_are_refused(client: Client) -> None:
+    """Two sources of one key would mix two flights into one."""
+    publisher = client.publisher(VLP, vehicle="1")
+    with pytest.raises(nedbus.AddressInUseError, match="1/vehicle_local_position is published here already"):
+        client.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+
+
+def test_wrong_names_are_refused_before_anything_is_sent(client: Client) -> None:
+    """A typo in a topic or vehicle is an AddressError at once, not a silent subscription."""
+    with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
+        client.subscribe("vehicle_local_positon")
+    with pytest.raises(nedbus.AddressError, match="vehicle"):
+        client.latest(vehicle="a/b")
+    with pytest.raises(nedbus.AddressError, match="instance"):
+        client.publisher("estimator_local_position", vehicle="1")
+
+
+def test_nothing_listening_is_a_clear_error() -> None:
+    """The error is a ConnectionError, and says where, for how long, and what to do."""
+    where = free_endpoint()
+    with pytest.raises(
+        nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"
+    ) as info:
+        nedbus.connect(where, timeout=0.1)
+    assert isinstance(info.value, ConnectionError)
+
+
+def test_second_endpoint_is_taken_when_the_first_is_dead(endpoint: str) -> None:
+    """Several endpoints are several chances."""
+    with nedbus.connect([free_endpoint(), endpoint]) as bus:
+        assert bus.connected
+
+
+def test_bus_finds_its_router_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NEDBUS_CONNECT is for scripts that should not name a router."""
+    monkeypatch.setenv("NEDBUS_CONNECT", endpoint)
+    with nedbus.connect() as bus:
+        assert bus.connected
+
+
+def test_prefix_separates(endpoint: str) -> None:
+    """Two fleets on one router do not see each other."""
+    with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
+        one.publisher(VLP, vehicle="1").publish(message(1))
+        assert [sample.vehicle for sample in one.latest()] == ["1"]
+        assert list(one.vehicles()) == ["1"]
+        assert two.latest() == []
+        assert two.vehicles() == {}
+
+
+def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
+    """A reader that always finds a sample still gives way to the loop."""
+    publisher = bus.publisher(VLP, vehicle="1")
+
+    async def scenario() -> int:
+        turns = 0
+
+        async def count_turns() -> None:
+            nonlocal turns
+            while True:
+                turns += 1
+                await asyncio.sleep(0)
+
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            for timestamp in range(1, 1001):
+                publisher.publish(message(timestamp))
+            counter = asyncio.create_task(count_turns())
+            taken = 0
+            async for _ in subscription:
+                taken += 1
+                if taken == 900:
+                    break
+            counter.cancel()
+        return turns
+
+    assert asyncio.run(scenario()) > 5

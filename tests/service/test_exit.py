@@ -1,0 +1,142 @@
+"""Scripts that end badly: a process that uses nedbus is gone within 2 s, whatever it forgot."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+import nedbus
+from tests.conftest import Start, message, wait_for
+
+LIMIT = 2.0  # s: the promise; measured from the end of the script, when it said so
+
+PREAMBLE = """
+import sys, threading, time
+import nedbus
+bus = nedbus.connect()
+publisher = bus.publisher("vehicle_local_position", vehicle="mine")
+publisher.publish({"timestamp": 1})
+subscription = bus.subscribe("vehicle_local_position", vehicle="1", mode=MODE)
+subscription.receive()
+"""
+
+ENDS = {
+    "forgets": 'print("end", flush=True)',
+    "raises": 'print("end", flush=True); raise RuntimeError("on purpose")',
+    "exits": 'print("end", flush=True); sys.exit(3)',
+    "never reads": 'time.sleep(1.0); print("end", flush=True)',
+    "reads in a thread": """
+threading.Thread(target=lambda: [None for _ in subscription], daemon=True).start()
+print("end", flush=True)""",
+    "has a pump": 'subscription.receive(5.0); print("end", flush=True)',
+    "asks and forgets": 'bus.latest(); bus.vehicles(); print("end", flush=True)',
+}
+CODES = {"raises": 1, "exits": 3}
+
+ASYNC = """
+import asyncio, sys
+import nedbus
+async def main():
+    bus = nedbus.connect_async()
+    await bus.__aenter__()
+    subscription = bus.subscribe(vehicle="1", mode=MODE)
+    await subscription.receive()
+    print("end", flush=True)
+    RAISE
+asyncio.run(main())
+"""
+
+
+@pytest.fixture
+def flood(endpoint: str) -> Iterator[str]:
+    """Publish all the time, so that every queue of a script that does not read is full."""
+    stop = threading.Event()
+    with nedbus.connect(endpoint) as bus:
+        publisher = bus.publisher("vehicle_local_position", vehicle="1")
+
+        def publish() -> None:
+            sent = message(1)
+            while not stop.wait(0.001):
+                for _ in range(20):
+                    publisher.publish(sent)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        yield endpoint
+        stop.set()
+        thread.join()
+
+
+def assert_gone(process_start: Start, code: str, endpoint: str, expected: int) -> None:
+    process = process_start("-c", code, NEDBUS_CONNECT=endpoint)
+    wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
+    ended = time.monotonic()
+    assert process.wait(10 * LIMIT) == expected, process.err
+    assert time.monotonic() - ended < LIMIT
+    assert "Traceback" not in process.err or "on purpose" in process.err
+    assert "panicked" not in process.err
+    assert "FATAL" not in process.err
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+@pytest.mark.parametrize("end", ENDS)
+def test_script_without_close_is_gone(start: Start, flood: str, end: str, mode: str) -> None:
+    """A bus that is never closed does not keep the process, whatever its queues hold."""
+    assert_gone(start, PREAMBLE.replace("MODE", repr(mode)) + ENDS[end], flood, CODES.get(end, 0))
+
+
+@pytest.mark.parametrize("mode", ["latest", "every"])
+@pytest.mark.parametrize("raises", ["pass", 'raise RuntimeError("on purpose")'])
+def test_async_script_without_close_is_gone(start: Start, flood: str, raises: str, mode: str) -> None:
+    """The same for asyncio."""
+    assert_gone(start, ASYNC.replace("MODE", repr(mode)).replace("RAISE", raises), flood, int(raises != "pass"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("vehicle", ["1", "silent"])
+@pytest.mark.parametrize("mode", ["latest", "every"])
+def test_signal_ends_a_reading_script(
+    start: Start, flood: str, number: signal.Signals, vehicle: str, mode: str
+) -> None:
+    """Ctrl-C and SIGTERM end a loop over samples, while they come and while none comes."""
+    code = f"""
+import nedbus
+bus = nedbus.connect()
+subscription = bus.subscribe(vehicle={vehicle!r}, mode={mode!r})
+print("ready", flush=True)
+for sample in subscription:
+    pass
+"""
+    process = start("-c", code, NEDBUS_CONNECT=flood)
+    wait_for(lambda: "ready" in process.out, what=f"the script: {process.err}")
+    process.signal(number)
+    signalled = time.monotonic()
+    assert process.wait(10 * LIMIT) == -number
+    assert time.monotonic() - signalled < LIMIT
+
+
+def test_signal_ends_a_script_that_waits_for_a_router(start: Start) -> None:
+    """Ctrl-C ends the wait for a router that is not there."""
+    code = 'print("ready", flush=True); import nedbus; nedbus.connect("tcp/127.0.0.1:1", timeout=600)'
+    process = start("-c", code)
+    wait_for(lambda: "ready" in process.out, what="the script")
+    process.signal(signal.SIGINT)
+    assert process.wait(10 * LIMIT) in {-signal.SIGINT, 1}
+
+
+def test_vehicle_of_a_killed_script_is_gone(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """SIGKILL closes nothing, and still the vehicle disappears from the list."""
+    code = """
+import nedbus, time
+bus = nedbus.connect()
+bus.publisher("vehicle_local_position", vehicle="mine").publish({"timestamp": 1})
+time.sleep(600)
+"""
+    process = start("-c", code, NEDBUS_CONNECT=endpoint)
+    wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
+    process.kill()
+    wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")

@@ -1,0 +1,235 @@
+"""Flight logs: all topics and instances, old layouts, damage of every kind."""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyulog import ULog
+
+from nedbus.errors import SourceError
+from nedbus.sources import Flight, parse_source
+from nedbus_msgs import FIELD_TYPES, LAYOUTS, TOPICS, VehicleLocalPosition, upgrade
+from tests.conftest import LOGS, message
+from tests.ulogs import UlogWriter, write_log
+
+VLP = "vehicle_local_position"
+
+# Counted with pyulog: messages of all local position topics, layout, addresses.
+REAL = {
+    "cuav_1.16_gps_interference.ulg": (872, "1.16", 3),
+    "cubeorange_1.12_small.ulg": (636, "1.12 or older", 1),
+    "fmuv6c_1.17_selector_whipsaw.ulg": (4968, "1.16", 1),
+    "nxp_v0_ekf_failure.ulg": (797, "V0", 1),
+    "sitl_1.13_three_topics.ulg": (1871, "1.13", 5),
+    "sitl_1.15_events.ulg": (313, "1.15", 1),
+}
+
+
+def open_log(path: Path, options: str = "") -> Flight:
+    return parse_source(f"ulog:{path}{options}").open_source(vehicle="1").open()
+
+
+def read_all(flight: Flight) -> list[tuple[str, VehicleLocalPosition]]:
+    return [(str(record.address), upgrade(record.fields)) for record in flight.records]
+
+
+@pytest.mark.logs
+@pytest.mark.parametrize("name", REAL)
+def test_real_log_is_read_whole_and_exact(name: str) -> None:
+    """Every message of a real log is valid, and every field is what pyulog reads, to the bit."""
+    path = LOGS / name
+    if not path.exists():
+        pytest.skip(f"the real log is not here: {path}")
+    total, layout, streams = REAL[name]
+    flight = open_log(path)
+    assert (flight.total, len(flight.addresses), flight.warnings) == (total, streams, ())
+    assert f"layout {layout}," in flight.summary
+    oracle = {(data.name, data.multi_id): data.data for data in ULog(str(path), list(TOPICS)).data_list}
+    rows = dict.fromkeys(oracle, 0)
+    last_due, fields = 0.0, 0
+    for record in flight.records:
+        assert record.due >= last_due
+        last_due = record.due
+        read = upgrade(record.fields)
+        where = (record.address.topic, record.address.instance or 0)
+        for column, values in oracle[where].items():
+            base, _, index = column.partition("[")
+            for field in ("hagl_max_z", "hagl_max_xy") if base == "hagl_max" else (base,):
+                held = getattr(read, field)
+                value = held[int(index[0])] if index else held
+                assert np.array(value, dtype=values.dtype).tobytes() == values[rows[where]].tobytes(), (column, value)
+                fields += 1
+        rows[where] += 1
+    assert sum(rows.values()) == total
+    assert fields >= 42 * total
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_is_read(tmp_path: Path, layout: str) -> None:
+    """A log of any layout gives messages; fields that it lacks are not provided."""
+    writer = UlogWriter(layout=layout)
+    writer.define([VLP])
+    writer.add(VLP, message(5, x=1.5, delta_xy=(1.0, 2.0), hagl_max_z=9.0, xy_reset_counter=3))
+    flight = open_log(writer.write(tmp_path / "a.ulg"))
+    [(_, read)] = read_all(flight)
+    assert (read.timestamp, read.x, read.delta_xy, read.xy_reset_counter) == (5, 1.5, (1.0, 2.0), 3)
+    assert (read.hagl_max_z, math.isnan(read.hagl_max_xy)) == (9.0, layout == "1.16")
+    assert f"layout {layout}," in flight.summary
+    assert flight.warnings == ()
+
+
+def test_all_topics_and_instances_are_read_in_time_order(tmp_path: Path) -> None:
+    """All four topics and every estimator instance, merged by their timestamps."""
+    writer = UlogWriter(system_id=7)
+    writer.define(TOPICS)
+    expected = []
+    for step in range(20):
+        for number, topic in enumerate(TOPICS.values()):
+            for instance in range(3 if topic.instances else 1):
+                time = 1000 * step + 100 * number + instance
+                writer.add(topic.name, message(time), instance=instance)
+                expected.append(time)
+    flight = open_log(writer.write(tmp_path / "a.ulg"))
+    read = read_all(flight)
+    assert [got.timestamp for _, got in read] == sorted(expected)
+    assert sorted({address for address, _ in read}) == [
+        "7/estimator_local_position/0",
+        "7/estimator_local_position/1",
+        "7/estimator_local_position/2",
+        "7/external_ins_local_position",
+        "7/vehicle_local_position",
+        "7/vehicle_local_position_groundtruth",
+    ]
+    assert flight.total == len(expected)
+
+
+def test_vehicle_is_the_options_else_the_logs_else_the_default(tmp_path: Path) -> None:
+    """`vehicle=` wins over MAV_SYS_ID, which wins over the service's default."""
+    for system_id, options, expected in ((7, "?vehicle=x", "x"), (7, "", "7"), (None, "", "1")):
+        writer = UlogWriter(system_id=system_id)
+        writer.define([VLP])
+        writer.add(VLP, message())
+        [address] = open_log(writer.write(tmp_path / "a.ulg"), options).addresses
+        assert address.vehicle == expected
+
+
+def test_many_rows_are_read_in_order(tmp_path: Path) -> None:
+    """Rows are turned into Python values in pieces; none is lost between two."""
+    flight = open_log(write_log(tmp_path / "a.ulg", range(0, 2_500_000, 1000)))
+    assert [read.x for _, read in read_all(flight)] == list(range(2500))
+
+
+@pytest.mark.parametrize(
+    ("timestamps", "due"),
+    [
+        ([10, 20, 15, 30, 40], [10, 20, 20, 30, 40]),  # one comes late
+        ([10, 20, 10**15, 30, 40], [10, 20, 30, 30, 40]),  # one is from the future: it must not hold up the others
+        ([10, 20, 30, 40, 10**15], [10, 20, 30, 40, 40]),  # the last one is
+        ([10, 20, 30 + 61_000_000, 40 + 61_000_000], [10, 20, 20, 30]),  # a silence of a minute
+    ],
+)
+def test_disorder_is_published_in_the_logs_order(tmp_path: Path, timestamps: list[int], due: list[int]) -> None:
+    """Out-of-order timestamps and impossible gaps lose no message and never stall the replay; a warning says so."""
+    flight = open_log(write_log(tmp_path / "a.ulg", timestamps))
+    records = list(flight.records)
+    assert [record.fields["timestamp"] for record in records] == timestamps
+    assert [round(record.due * 1e6) + 10 for record in records] == due
+    assert len(flight.warnings) == 1
+
+
+def test_bool_that_is_neither_0_nor_1_is_left_for_the_model(tmp_path: Path) -> None:
+    """A damaged flag is refused, not read as true."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    writer.add(VLP, message(1), z_valid=2)
+    writer.add(VLP, message(2))
+    first, second = open_log(writer.write(tmp_path / "a.ulg")).records
+    with pytest.raises(ValueError, match="z_valid"):
+        upgrade(first.fields)
+    assert upgrade(second.fields).timestamp == 2
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
+def test_truncated_log_gives_what_is_readable(tmp_path: Path, part: float) -> None:
+    """A log that was cut gives all whole messages before the cut."""
+    path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * part)])
+    read = read_all(open_log(path))
+    assert [got.x for _, got in read] == list(range(len(read)))
+    assert len(read) > 1000 * (part - 0.05)
+
+
+def test_damaged_log_gives_what_is_readable_and_a_warning(tmp_path: Path) -> None:
+    """A hole of garbage costs the messages in it, not the others."""
+    path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000), xy_valid=False)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 300] = b"\xff" * 300
+    path.write_bytes(data)
+    flight = open_log(path)
+    assert flight.total is not None
+    assert flight.total > 450
+    assert any("damaged" in warning for warning in flight.warnings)
+
+
+def test_random_damage_never_crashes(tmp_path: Path) -> None:
+    """Whatever is wrong with a file, it is a flight or a SourceError."""
+    data = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000)).read_bytes()
+    rng = random.Random(1)
+    path = tmp_path / "b.ulg"
+    flights = 0
+    for _ in range(150):
+        damaged = bytearray(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
+        for _ in range(rng.choice([1, 5, 50])):
+            if damaged:
+                damaged[rng.randrange(min(len(damaged), rng.choice([3000, 30_000])))] = rng.randrange(256)
+        path.write_bytes(damaged)
+        try:
+            flight = open_log(path)
+        except SourceError:
+            continue
+        flights += 1
+        for record in flight.records:
+            assert set(FIELD_TYPES) & set(record.fields)
+    assert flights > 20
+
+
+def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    """A topic without instances has one stream per vehicle."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    writer.add(VLP, message(1, x=1.0))
+    writer.add(VLP, message(2, x=2.0), instance=1)
+    flight = open_log(writer.write(tmp_path / "a.ulg"))
+    assert [read.x for _, read in read_all(flight)] == [1.0]
+    assert "vehicle_local_position [1] is left out" in flight.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (None, "no such file"),
+        (b"", "no ULog file"),
+        (b"hello", "no ULog file"),
+        (b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8), "no message of the local position topics"),
+    ],
+)
+def test_unreadable_file_is_a_clear_error(tmp_path: Path, content: bytes | None, reason: str) -> None:
+    """The error names the file and what is wrong with it."""
+    path = tmp_path / "a.ulg"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SourceError, match=reason) as info:
+        open_log(path)
+    assert str(path) in str(info.value)
+
+
+def test_log_without_the_topics_is_a_clear_error(tmp_path: Path) -> None:
+    """A log of something else says so."""
+    with pytest.raises(SourceError, match="no message of the local position topics is in this log"):
+        open_log(write_log(tmp_path / "a.ulg", [1], topic="something_else"))

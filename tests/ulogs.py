@@ -1,0 +1,79 @@
+"""Write small ULog files, so that the suite needs no real ones; the format is PX4's documented one."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from nedbus_msgs import FIELD_TYPES, LAYOUTS, VehicleLocalPosition, downgrade
+
+_NAMES = {"uint64": "uint64_t", "uint8": "uint8_t", "bool": "bool", "float32": "float", "float64": "double"}
+_CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": "d"}
+
+
+def _type(name: str, field_types: Mapping[str, str]) -> str:
+    return field_types.get(name, "float32").removesuffix("[2]")
+
+
+class UlogWriter:
+    """Write one log, message by message; fields are sorted by size, as PX4 does it."""
+
+    def __init__(self, *, layout: str = "1.16", system_id: int | None = 1) -> None:
+        fields = LAYOUTS[layout].fields
+        self._fields = sorted(fields, key=lambda name: -struct.calcsize(_CODES[_NAMES[_type(name, FIELD_TYPES)]]))
+        self._layout = layout
+        self._ids: dict[tuple[str, int], int] = {}
+        self.data = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
+        self._message("B", bytes(40))
+        if system_id is not None:
+            key = b"int32_t MAV_SYS_ID"
+            self._message("P", bytes([len(key)]) + key + struct.pack("<i", system_id))
+        self._defined: set[str] = set()
+
+    def define(self, topics: Iterable[str], *, without: Sequence[str] = ()) -> None:
+        """Write the format of these topics, perhaps without some fields."""
+        self._fields = [name for name in self._fields if name not in without]
+        for topic in topics:
+            text = "".join(f"{self._field_type(name)} {name};" for name in self._fields) + "uint8_t[3] _padding0;"
+            self._message("F", f"{topic}:{text}".encode())
+            self._defined.add(topic)
+
+    def add(self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object) -> None:
+        """Write one message; `raw` overrides fields with what the model would refuse."""
+        if (topic, instance) not in self._ids:
+            self._ids[topic, instance] = len(self._ids)
+            self._message("A", struct.pack("<BH", instance, self._ids[topic, instance]) + topic.encode())
+        values = downgrade(message, self._layout) | raw
+        body = b"".join(self._pack(name, values[name]) for name in self._fields)
+        self._message("D", struct.pack("<H", self._ids[topic, instance]) + body)
+
+    def write(self, path: Path) -> Path:
+        """Write the file."""
+        path.write_bytes(self.data)
+        return path
+
+    def _field_type(self, name: str) -> str:
+        array = "[2]" if FIELD_TYPES.get(name) == "float32[2]" else ""
+        return _NAMES[_type(name, FIELD_TYPES)] + array
+
+    def _pack(self, name: str, value: object) -> bytes:
+        code = _CODES[_NAMES[_type(name, FIELD_TYPES)]]
+        if isinstance(value, tuple):
+            return struct.pack(f"<2{code}", *value)
+        return struct.pack(f"<{'B' if code == '?' else code}", value)
+
+    def _message(self, kind: str, body: bytes) -> None:
+        self.data += struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def write_log(
+    path: Path, timestamps: Sequence[int], *, topic: str = "vehicle_local_position", **fields: object
+) -> Path:
+    """Write a log of one topic with messages at these times [us]; x counts them from 0."""
+    writer = UlogWriter()
+    writer.define([topic])
+    for number, timestamp in enumerate(timestamps):
+        message = VehicleLocalPosition.model_validate({"timestamp": timestamp, "x": float(number), **fields})
+        writer.add(topic, message)
+    return writer.write(path)
