@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Final, cast
 
 import zenoh
+from pydantic_core import to_json
 
 from nedbus_msgs import (
     ENCODING,
@@ -130,9 +131,10 @@ class Outbox:
             publisher.close()
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
-        """Publish why a message of this address was not published."""
+        """Publish why a message of this address was not published; what JSON cannot hold is written as text."""
+        payload = to_json(report, inf_nan_mode="strings", fallback=repr)
         with while_open():
-            self._session.put(address.rejected_key(prefix=self.prefix), json.dumps(report), encoding=_JSON)
+            self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=_JSON)
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether a subscriber is there for any of these addresses."""

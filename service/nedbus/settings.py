@@ -7,7 +7,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
 from pydantic_settings import (
@@ -99,9 +99,9 @@ def load_settings(file: Path | None = None, **given: object) -> Settings:
     if path is not None and not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     path = path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
-    flags = {name: value for name, value in given.items() if value is not None}
+    flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     try:
-        return _with_file(path).model_validate(flags)
+        return _with_file(path)(**flags)
     except tomllib.TOMLDecodeError as exc:
         raise _toml_error(path or DEFAULT_FILE, exc) from exc
     except ValidationError as exc:

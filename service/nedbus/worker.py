@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from pydantic import ValidationError
-from pydantic_core import to_jsonable_python
 
 from nedbus_msgs import Address, describe, upgrade
 
@@ -178,5 +177,4 @@ class Worker:
         if self._rejected <= _REJECTS_LOGGED:
             last = "; further ones are only counted" if self._rejected == _REJECTS_LOGGED else ""
             _log.warning("%s: %s rejected: %s%s", self.text, record.address, reason, last)
-        fields = to_jsonable_python(dict(record.fields), inf_nan_mode="strings", fallback=repr)
-        self._outbox.reject(record.address, {"source": self.text, "reason": reason, "fields": fields})
+        self._outbox.reject(record.address, {"source": self.text, "reason": reason, "fields": dict(record.fields)})

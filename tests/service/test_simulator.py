@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
 
 import pytest
@@ -38,7 +39,7 @@ def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
         "estimator_local_position/1",
     }
     for stream, messages in streams.items():
-        steps = {after.timestamp - before.timestamp for before, after in zip(messages, messages[1:], strict=False)}
+        steps = {after.timestamp - before.timestamp for before, after in itertools.pairwise(messages)}
         assert steps == {round(1e6 / TOPICS[stream.split("/")[0]].rate)}
 
 
@@ -74,7 +75,7 @@ def test_reset_delta_explains_the_jump(streams: dict[str, list[VehicleLocalPosit
     delta, fields, motion = QUANTITIES[counter]
     messages = streams["vehicle_local_position"]
     resets = 0
-    for before, after in zip(messages, messages[1:], strict=False):
+    for before, after in itertools.pairwise(messages):
         jump = [getattr(after, name) - getattr(before, name) for name in fields]
         if counter == "heading_reset_counter" and abs(jump[0]) > 3:
             continue  # the heading went through pi
@@ -101,7 +102,7 @@ def test_estimate_is_near_the_truth(streams: dict[str, list[VehicleLocalPosition
             assert abs(message.x - true.x) < 3
             assert abs(message.z - true.z) < 3
     positions = streams["vehicle_local_position_groundtruth"]
-    for before, after in zip(positions, positions[1:], strict=False):
+    for before, after in itertools.pairwise(positions):
         mean = (before.vx + after.vx) / 2
         assert (after.x - before.x) / 0.02 == pytest.approx(mean, abs=0.01)
 

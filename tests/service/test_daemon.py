@@ -1,0 +1,468 @@
+"""The service as its users run it: in a process of its own, with subscribers in others."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import time
+from pathlib import Path
+
+import msgpack
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.session import Session
+from nedbus.sources import parse_source
+from nedbus_msgs import Address, VehicleLocalPosition, upgrade
+from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, message, wait_for
+from tests.ulogs import UlogWriter, write_log
+
+VLP = "vehicle_local_position"
+
+# A reader that knows nothing of nedbus, as it could be in any language: zenoh, msgpack, and the documented keys.
+PLAIN_READER = """
+import json, sys, time
+import msgpack, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+while True:
+    try:
+        session = zenoh.open(config)
+        break
+    except zenoh.ZError:
+        time.sleep(0.05)
+with session:
+    subscriber = session.declare_subscriber("nedbus/**", zenoh.handlers.FifoChannel(1000))
+    print("ready", flush=True)
+    for number in range(int(sys.argv[2])):
+        sample = subscriber.recv()
+        values = [repr(value) for value in msgpack.unpackb(sample.payload.to_bytes())]
+        print(json.dumps([str(sample.key_expr), str(sample.encoding), values]), flush=number % 100 == 99)
+    subscriber.undeclare()
+"""
+
+# A reader that is a script of a user.
+NEDBUS_READER = """
+import json, sys
+import nedbus
+with nedbus.connect(sys.argv[1], timeout=30) as bus, bus.subscribe(mode="every") as subscription:
+    print("ready", flush=True)
+    for number in range(int(sys.argv[2])):
+        sample = subscription.receive(30)
+        values = [repr(value) for value in sample.message.__dict__.values()]
+        print(json.dumps([str(sample.address), sample.lost, values]), flush=number % 100 == 99)
+    print(json.dumps([subscription.counts.lost, subscription.counts.invalid]))
+"""
+
+
+def until_connected(endpoint: str) -> nedbus.Bus:
+    return nedbus.connect(endpoint, timeout=DEADLINE)
+
+
+def rows(text: str) -> list[list[object]]:
+    return [json.loads(line) for line in text.splitlines() if line.startswith("[")]
+
+
+def expected_rows(path: Path) -> dict[str, list[list[str]]]:
+    """Return what a log holds, by address, read here by the source itself (test_ulog.py proves that against pyulog)."""
+    found: dict[str, list[list[str]]] = {}
+    for record in parse_source(f"ulog:{path}").open_source(vehicle="1").open().records:
+        values = [repr(value) for value in upgrade(record.fields).__dict__.values()]
+        found.setdefault(str(record.address), []).append(values)
+    return found
+
+
+def by_address(received: list[list[object]]) -> dict[str, list[object]]:
+    found: dict[str, list[object]] = {}
+    for address, _, values in received:
+        found.setdefault(str(address), []).append(values)
+    return found
+
+
+def real_logs() -> list[Path]:
+    logs = sorted(LOGS.glob("*.ulg"))
+    if not logs:
+        pytest.skip(f"the real logs are not here: {LOGS}")
+    return logs
+
+
+@pytest.mark.logs
+@pytest.mark.timeout(300)
+def test_all_real_logs_reach_another_process_whole(start: Start, run_nedbus: Start) -> None:
+    """Every message of every real log goes log -> daemon -> router -> subscriber: none lost, none rejected, bit for bit."""
+    logs = real_logs()
+    endpoint = free_endpoint()
+    router = run_nedbus("router", "--listen", endpoint)
+    reader = start("-c", NEDBUS_READER, endpoint, "9457")
+    wait_for(lambda: "ready" in reader.out, what=f"the reader: {reader.err}")
+    sources = [f"--source=ulog:{path}?speed=max&wait=1&vehicle={path.stem.replace('.', '_')}" for path in logs]
+    service = run_nedbus("serve", "--connect", endpoint, "--until-done", *sources)
+    assert service.wait(240) == 0, service.err
+    assert reader.wait(60) == 0, reader.err
+    *samples, counts = rows(reader.out)
+    assert counts == [0, 0]
+    assert len(samples) == 9457
+    assert not any(lost for _, lost, _ in samples)
+    received = by_address(samples)
+    for path in logs:
+        vehicle = path.stem.replace(".", "_")
+        for address, values in expected_rows(path).items():
+            assert received.pop(address.replace("1/", f"{vehicle}/", 1)) == values, (path, address)
+    assert not received
+    assert "rejected" not in service.err.replace("0 rejected", "")
+    router.signal(signal.SIGTERM)
+    assert router.wait() == 0
+
+
+@pytest.mark.logs
+def test_plain_zenoh_and_msgpack_see_every_sample(start: Start, run_nedbus: Start) -> None:
+    """A script that knows nothing of this project sees each sample of a log as a 54-element array of its values."""
+    path = next(log for log in real_logs() if "1.13" in log.name)
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "--listen", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
+    reader = start("-c", PLAIN_READER, endpoint, "1871")
+    assert reader.wait(60) == 0, reader.err
+    assert service.wait() == 0, service.err
+    received = rows(reader.out)
+    assert {encoding for _, encoding, _ in received} == {"application/msgpack;px4_msgs/VehicleLocalPosition"}
+    expected = {
+        f"nedbus/{address}": [["1", *(value.replace("(", "[").replace(")", "]") for value in row)] for row in values]
+        for address, values in expected_rows(path).items()
+    }
+    assert all(isinstance(values, list) and len(values) == 54 for _, _, values in received)
+    assert by_address(received) == expected
+
+
+def test_replay_at_full_speed_loses_nothing_to_a_slow_reader(tmp_path: Path, run_nedbus: Start) -> None:
+    """speed=max waits for whoever reads: a reader slower than the replay still gets every message."""
+    total = 30_000
+    path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
+    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        for number in range(total):
+            sample = subscription.receive(DEADLINE)
+            assert (sample.message.x, sample.lost) == (number, 0)
+    assert service.wait() == 0
+
+
+def test_replay_keeps_its_order_and_speed(tmp_path: Path, run_nedbus: Start) -> None:
+    """At speed=10 a flight of 10 s takes about 1 s, never less; wait=1 starts it when a subscriber is there."""
+    path = write_log(tmp_path / "a.ulg", range(0, 10_000_001, 100_000))
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=10&wait=1")
+    with until_connected(endpoint) as bus:
+        wait_for(bus.services, what="the service")
+        status = bus.services()[0]
+        assert source_of(status)["state"] == "waiting"
+        assert source_of(status)["published"] == 0
+        with bus.subscribe(VLP, mode="every") as subscription:
+            samples = [subscription.receive(DEADLINE) for _ in range(101)]
+    assert [sample.message.x for sample in samples] == list(range(101))
+    assert samples[0].sent is not None
+    assert samples[-1].sent is not None
+    assert samples[-1].sent - samples[0].sent > 0.9e9
+    assert service.wait() == 0
+
+
+def source_of(status: dict[str, object], number: int = 0) -> dict[str, object]:
+    sources = status["sources"]
+    assert isinstance(sources, list)
+    source = sources[number]
+    assert isinstance(source, dict)
+    return source
+
+
+def test_loop_starts_again(tmp_path: Path, run_nedbus: Start) -> None:
+    """loop=1 flies the log for ever."""
+    path = write_log(tmp_path / "a.ulg", range(0, 100_000, 10_000))
+    endpoint = free_endpoint()
+    run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}?loop=1&wait=1")
+    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        assert [subscription.receive(DEADLINE).message.x for _ in range(25)] == [*range(10), *range(10), *range(5)]
+
+
+def test_simulator_publishes_all_topics_and_several_vehicles(run_nedbus: Start) -> None:
+    """Two vehicles at once, each with its four topics and two estimators."""
+    endpoint = free_endpoint()
+    run_nedbus("serve", "-l", endpoint, "-s", "sim:", "-s", "sim:?vehicle=two&seed=2")
+    with until_connected(endpoint) as bus:
+        wait_for(lambda: len(bus.latest()) == 10, what="ten streams")
+        assert {vehicle: len(addresses) for vehicle, addresses in bus.vehicles().items()} == {"1": 5, "two": 5}
+
+
+def test_ended_replay_keeps_its_last_value(tmp_path: Path, run_nedbus: Start) -> None:
+    """A service that goes on after a replay still answers with its last message."""
+    path = write_log(tmp_path / "a.ulg", [0, 1000, 2000])
+    endpoint = free_endpoint()
+    run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}")
+    with until_connected(endpoint) as bus:
+        wait_for(lambda: [source_of(s)["state"] for s in bus.services()] == ["done"], what="the end of the replay")
+        assert [sample.message.x for sample in bus.latest()] == [2.0]
+        assert bus.subscribe().receive(DEADLINE).message.x == 2.0
+
+
+def test_invalid_message_is_rejected_counted_and_reported(tmp_path: Path, run_nedbus: Start) -> None:
+    """What fails validation is never published: it is on the rejected key with its reason, and counted in status."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for number in range(10):
+        broken = number in {3, 4}
+        writer.add(VLP, message(number), z_valid=int(broken), z=math.nan if broken else 1.0)
+    path = writer.write(tmp_path / "a.ulg")
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}?wait=1")
+    with until_connected(endpoint) as bus:
+        reports: list[dict[str, object]] = []
+
+        def note(raw: zenoh.Sample) -> None:
+            reports.append(json.loads(raw.payload.to_bytes()))
+
+        listener = bus._session.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.Callback(note, indirect=False))
+        with bus.subscribe(VLP, mode="every") as subscription:
+            taken = [subscription.receive(DEADLINE).message.timestamp for _ in range(8)]
+        wait_for(lambda: len(reports) == 2, what="two reports")
+        assert taken == [0, 1, 2, 5, 6, 7, 8, 9]
+        assert "z: must be finite while z_valid is true" in str(reports[0]["reason"])
+        fields = reports[0]["fields"]
+        assert isinstance(fields, dict)
+        assert (fields["timestamp"], fields["z"]) == (3, "NaN")
+        assert source_of(bus.services()[0])["rejected"] == 2
+        listener.undeclare()
+    assert "1/vehicle_local_position rejected: z: must be finite" in service.err
+
+
+def test_failing_source_stops_nobody(tmp_path: Path, run_nedbus: Start) -> None:
+    """One source that fails is retried with back-off and shown in status; once it can be read, it is."""
+    missing = tmp_path / "later.ulg"
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
+    with until_connected(endpoint) as bus:
+        wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the good source")
+        wait_for(lambda: source_of(bus.services()[0])["restarts"], what="a retry")
+        status = source_of(bus.services()[0])
+        assert status["state"] == "retrying"
+        assert "no such file" in str(status["error"])
+        write_log(missing, [0, 1000])
+        wait_for(lambda: bus.latest(VLP, vehicle="late"), what="the source that came later")
+        assert service.popen.poll() is None
+
+
+def test_two_sources_of_one_vehicle_are_not_mixed(run_nedbus: Start) -> None:
+    """The second source of an address fails with a hint; the first goes on."""
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "-s", "sim:", "-s", "sim:?seed=2")
+    with until_connected(endpoint) as bus:
+        wait_for(lambda: "published here already" in service.err, what="the refusal")
+        states = {str(source_of(bus.services()[0], number)["state"]) for number in (0, 1)}
+        assert states == {"running", "retrying"}
+
+
+def test_until_done_tells_failure(tmp_path: Path, run_nedbus: Start) -> None:
+    """With --until-done a source that cannot be read makes exit code 1, after the others have ended."""
+    good = write_log(tmp_path / "a.ulg", [0, 1000])
+    service = run_nedbus(
+        "serve", "-l", free_endpoint(), "--until-done", "-s", "ulog:/nowhere.ulg", "-s", f"ulog:{good}"
+    )
+    assert service.wait() == 1
+    assert "/nowhere.ulg: no such file or directory" in service.err
+    assert "2 published" in service.err
+
+
+def test_until_done_ignores_endless_sources(run_nedbus: Start) -> None:
+    """The finite ones decide."""
+    service = run_nedbus(
+        "serve", "-l", free_endpoint(), "--until-done", "-s", "sim:", "-s", "sim:?vehicle=2&duration=0.5"
+    )
+    assert service.wait() == 0, service.err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+@pytest.mark.parametrize("source", ["sim:", "ulog", "ulog max", "missing"])
+def test_signal_ends_the_service(
+    tmp_path: Path, run_nedbus: Start, number: signal.Signals, code: int, source: str
+) -> None:
+    """SIGTERM and SIGINT end the service within 2 s, whatever its sources do; vehicles are gone at once."""
+    path = write_log(tmp_path / "a.ulg", range(0, 100_000_000, 10_000))
+    texts = {
+        "sim:": "sim:",
+        "ulog": f"ulog:{path}",
+        "ulog max": f"ulog:{path}?speed=max&loop=1",
+        "missing": "ulog:/nowhere.ulg",
+    }
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "-s", texts[source])
+    with until_connected(endpoint) as bus:
+        wait_for(bus.services, what=f"the service: {service.err}")
+        service.signal(number)
+        signalled = time.monotonic()
+        assert service.wait() == code
+        assert time.monotonic() - signalled < 2.0
+        assert "Traceback" not in service.err
+
+
+def test_signal_ends_a_replay_that_a_stuck_reader_holds(tmp_path: Path, run_nedbus: Start) -> None:
+    """A reader that never reads holds a replay at full speed, but not the end of the service."""
+    path = write_log(tmp_path / "a.ulg", range(0, 1000 * 60_000, 1000))
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}?speed=max&loop=1&wait=1")
+    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every"):
+        stood: list[object] = [None]
+
+        def stands() -> bool:
+            before = stood[0]
+            services = bus.services()
+            stood[0] = source_of(services[0])["published"] if services else None
+            return bool(stood[0]) and stood[0] == before
+
+        wait_for(stands, what="the replay to be held")
+        service.signal(signal.SIGTERM)
+        signalled = time.monotonic()
+        service.wait()
+        assert time.monotonic() - signalled < 2.5
+
+
+def test_service_as_a_client_waits_for_its_router_and_comes_back(run_nedbus: Start) -> None:
+    """With --connect the service starts before its router, and survives the router's death."""
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    wait_for(lambda: "still trying" in service.err, what="the service to say that it waits")
+    router = run_nedbus("router", "--listen", endpoint)
+    with until_connected(endpoint) as bus:
+        subscription = bus.subscribe(VLP, mode="every")
+        first = subscription.receive(DEADLINE).message.timestamp
+        router.kill()
+        wait_for(lambda: not bus.connected, what="the link to break")
+        router = run_nedbus("router", "--listen", endpoint)
+        wait_for(lambda: bus.connected, what="the link to come back")
+        timestamps = [subscription.receive(DEADLINE).message.timestamp for _ in range(300)]
+        assert timestamps == [first + 10_000 * (step + 1) for step in range(300)]
+        assert subscription.counts.lost == 0
+    service.signal(signal.SIGTERM)
+    assert service.wait() == 0
+
+
+def test_signal_ends_a_service_that_waits_for_its_router(run_nedbus: Start) -> None:
+    """A service that never found its router ends cleanly too."""
+    service = run_nedbus("serve", "--connect", free_endpoint(), "-s", "sim:")
+    wait_for(lambda: "still trying" in service.err, what="the service to say that it waits")
+    service.signal(signal.SIGTERM)
+    assert service.wait() == 0
+
+
+def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
+    """The error names the endpoint, the reason, and both ways out."""
+    service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:")
+    assert service.wait() == 1
+    assert service.err.strip().splitlines()[-1] == (
+        f"nedbus: cannot listen on {endpoint} (address already in use): choose another endpoint with --listen,"
+        " or join the router that runs there with --connect"
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ([], "source: nothing to publish: give --source sim: or --source ulog:FILE, or several"),
+        (["-s", "foo:x"], "source 'foo:x': there is no kind 'foo': choose from sim, ulog"),
+        (["-s", "ulog:"], "source 'ulog:': write it as ulog:FILE"),
+        (["-s", "sim:x"], "source 'sim:x': write it as sim:?OPTION=VALUE"),
+        (["-s", "sim:?sed=1"], "source 'sim:?sed=1': there is no option 'sed'"),
+        (["-s", "sim:?speed=0"], "speed=0 cannot be: expected a factor above 0"),
+        (["-s", "sim:?vehicle=a/b"], "vehicle=a/b cannot be: expected 1 to 64 of A-Z"),
+        (["-s", "sim:?speed"], "'speed' is not OPTION=VALUE"),
+        (["-s", "sim:", "--until-done"], "until_done: no source ever ends"),
+        (["-s", "sim:", "--listen", "7447"], "--listen: '7447' is no endpoint: write PROTOCOL/HOST:PORT"),
+        (["-s", "sim:", "--config", "no.toml"], "no.toml: there is no such file"),
+        (["-s", "sim:", "--prefix", "a/*"], "--prefix: prefix 'a/*' is not valid"),
+    ],
+)
+def test_wrong_flag_is_a_usage_error(run_nedbus: Start, arguments: list[str], text: str) -> None:
+    """Exit code 2, and one line that says what to write instead."""
+    service = run_nedbus("serve", *arguments)
+    assert service.wait() == 2
+    assert text in service.err
+    assert len(service.err.splitlines()) == 1
+
+
+def test_service_reads_its_file(tmp_path: Path, run_nedbus: Start) -> None:
+    """Sources, endpoint and prefix from nedbus.toml; a flag wins over the environment, which wins over the file."""
+    endpoint = free_endpoint()
+    file = tmp_path / "nedbus.toml"
+    file.write_text('source = ["sim:"]\nlisten = ["tcp/127.0.0.1:1"]\nprefix = "fleet"\nvehicle = 7\n')
+    run_nedbus("serve", "--config", str(file), "--vehicle", "9", NEDBUS_LISTEN=endpoint, NEDBUS_VEHICLE="8")
+    with nedbus.connect(endpoint, timeout=DEADLINE, prefix="fleet") as bus:
+        wait_for(lambda: list(bus.vehicles()) == ["9"], what="vehicle 9")
+
+
+def test_embedded_router_from_a_zenoh_file(tmp_path: Path, run_nedbus: Start) -> None:
+    """The embedded router takes a file that zenohd reads too; a mistake in it is told with line and column."""
+    endpoint = free_endpoint()
+    file = tmp_path / "router.json5"
+    file.write_text(f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, // a comment\n}}')
+    run_nedbus("serve", "--router-config", str(file), "-s", "sim:")
+    with until_connected(endpoint) as bus:
+        wait_for(bus.latest, what="data")
+    file.write_text('{\n  mode: "router",\n  lisen: {},\n}')
+    service = run_nedbus("serve", "--router-config", str(file), "-s", "sim:")
+    assert service.wait() == 2
+    assert f"{file}, line 3, column 3: unknown field 'lisen', expected one of" in service.err
+
+
+def test_status_tells_everything(run_nedbus: Start, raw: Session, endpoint: str) -> None:
+    """Any Zenoh client can ask for the status: who, since when, where, and each source."""
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    found: list[dict[str, object]] = []
+
+    def ask() -> bool:
+        replies = raw.get("nedbus/@service/*/status")
+        found[:] = [json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok]
+        return bool(found) and source_of(found[0])["published"] != 0
+
+    wait_for(ask, what="a status with messages")
+    assert {"service", "version", "started", "now", "role", "endpoints", "sources"} == set(found[0])
+    assert (found[0]["role"], found[0]["endpoints"]) == ("client", [endpoint])
+    source = source_of(found[0])
+    assert (source["source"], source["state"], source["rejected"], source["total"]) == ("sim:", "running", 0, None)
+    assert source["addresses"] == [
+        "1/vehicle_local_position",
+        "1/vehicle_local_position_groundtruth",
+        "1/external_ins_local_position",
+        "1/estimator_local_position/0",
+        "1/estimator_local_position/1",
+    ]
+
+
+def test_any_client_gets_the_last_value(run_nedbus: Start, raw: Session, endpoint: str) -> None:
+    """A plain Zenoh get on a key or a wildcard is answered with the last payload of each key, stamped."""
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    wait_for(lambda: len(list(raw.get("nedbus/**"))) == 5, what="five answers")
+    [reply] = raw.get("nedbus/1/estimator_local_position/1")
+    assert reply.ok is not None
+    assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition"
+    assert reply.ok.timestamp is not None
+    assert msgpack.unpackb(reply.ok.payload.to_bytes())[0] == 1
+    assert Address.from_key(str(reply.ok.key_expr)).instance == 1
+
+
+def test_schema_is_on_the_network(run_nedbus: Start, raw: Session, endpoint: str) -> None:
+    """Whoever reads can ask what the fields are."""
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    found: list[dict[str, object]] = []
+
+    def ask() -> bool:
+        found[:] = [
+            json.loads(reply.ok.payload.to_bytes())
+            for reply in raw.get("nedbus/@schema/VehicleLocalPosition")
+            if reply.ok is not None
+        ]
+        return bool(found)
+
+    wait_for(ask, what="the schema")
+    layouts = found[0]["layouts"]
+    assert isinstance(layouts, list)
+    current = next(layout for layout in layouts if layout["wire"] == 1)
+    assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
