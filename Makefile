@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run check types test wheel clean
+.PHONY: run check test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight; then it says what to type in a second terminal
 	$(BIN)/nedbus serve --source sim:
@@ -17,7 +17,7 @@ check: $(READY)  ## lint and types
 
 test: check  ## everything that CI runs: lint, types, tests with branch coverage
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest
+	$(BIN)/coverage run -m pytest -q --junitxml=build/tests.xml
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
@@ -27,6 +27,10 @@ wheel: $(READY)  ## build the wheel, install it where nothing else is, and use i
 	$(PYTHON) -m venv build/wheel-venv
 	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
+
+bench: $(READY)  ## measure: pacing of a replay, cost of an idle service
+	$(BIN)/python -m benchmarks.pacing
+	$(BIN)/python -m benchmarks.idle
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)

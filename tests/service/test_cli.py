@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 
@@ -18,7 +17,7 @@ VLP = "vehicle_local_position"
 
 
 @pytest.fixture
-def flying(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
+def flying(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> str:
     """Run a service with a simulated vehicle on the test's router."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     wait_for(lambda: len(bus.latest()) == 5, what="five streams")

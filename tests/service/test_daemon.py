@@ -92,7 +92,7 @@ def real_logs() -> list[Path]:
 @pytest.mark.logs
 @pytest.mark.timeout(300)
 def test_all_real_logs_reach_another_process_whole(start: Start, run_nedbus: Start) -> None:
-    """Every message of every real log goes log -> daemon -> router -> subscriber: none lost, none rejected, bit for bit."""
+    """Every message of every real log goes log -> daemon -> router -> reader: none lost, none rejected, to the bit."""
     logs = real_logs()
     endpoint = free_endpoint()
     router = run_nedbus("router", "--listen", endpoint)

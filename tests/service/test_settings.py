@@ -70,8 +70,8 @@ def test_mistake_in_the_environment_is_named(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_missing_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file that was asked for must be there."""
-    with pytest.raises(ConfigError, match="no.toml: there is no such file"):
+    with pytest.raises(ConfigError, match=r"no\.toml: there is no such file"):
         load_settings(tmp_path / "no.toml")
     monkeypatch.setenv("NEDBUS_CONFIG", "gone.toml")
-    with pytest.raises(ConfigError, match="gone.toml: there is no such file"):
+    with pytest.raises(ConfigError, match=r"gone\.toml: there is no such file"):
         load_settings()

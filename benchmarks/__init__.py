@@ -1,0 +1,1 @@
+"""What is measured: run them with `make bench`."""

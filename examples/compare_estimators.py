@@ -1,0 +1,15 @@
+"""How far is each EKF instance from the truth? Every sample counts here, so every sample is asked for."""
+
+import math
+
+import nedbus
+
+truth: nedbus.VehicleLocalPosition | None = None
+with nedbus.connect() as bus, bus.subscribe(vehicle="1", mode="every") as subscription:
+    for sample in subscription:
+        message = sample.message
+        if sample.topic == "vehicle_local_position_groundtruth":
+            truth = message
+        elif sample.topic == "estimator_local_position" and truth is not None:
+            error = math.dist((message.x, message.y, message.z), (truth.x, truth.y, truth.z))
+            print(f"estimator {sample.instance}: {error:6.2f} m off, says eph {message.eph:5.2f} m")

@@ -1,0 +1,18 @@
+"""Read the bus without nedbus, as a client in any language can: a Zenoh key, and one msgpack array.
+
+array[0] is the number of the layout; array[1], array[2], ... are PX4's fields in PX4's order.
+"""
+
+import json
+
+import msgpack
+import zenoh
+
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
+with zenoh.open(config) as session, session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(100)) as samples:
+    while True:
+        sample = samples.recv()
+        array = msgpack.unpackb(sample.payload.to_bytes())
+        print(sample.key_expr, "timestamp", array[1], "x", array[7], "y", array[8], "z", array[9])

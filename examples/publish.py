@@ -1,0 +1,22 @@
+"""Publish an estimate of your own, at 50 Hz: a vehicle called "mine" that flies a circle."""
+
+import math
+import time
+
+import nedbus
+
+with nedbus.connect() as bus:
+    publisher = bus.publisher("external_ins_local_position", vehicle="mine")
+    while True:
+        now = time.monotonic()
+        publisher.publish(
+            nedbus.VehicleLocalPosition(
+                timestamp=int(now * 1e6),
+                xy_valid=True,
+                z_valid=True,
+                x=10 * math.cos(now),
+                y=10 * math.sin(now),
+                z=-5.0,
+            )
+        )
+        time.sleep(0.02)
