@@ -88,6 +88,15 @@ class Counts:
     invalid: int = 0
 
 
+@dataclass(slots=True)
+class _Track:
+    """Where the sequence of a key stands: its publisher, its last number, and what was lost since the last Sample."""
+
+    source: str
+    last: int
+    lost: int = 0
+
+
 class Intake:
     """Turn what arrives into Samples, and count; no I/O but the look-up of an unknown layout."""
 
@@ -103,8 +112,8 @@ class Intake:
         self._queue: deque[zenoh.Sample] = deque()
         self._newest: dict[str, zenoh.Sample] = {}
         self._misses: deque[zenoh.ext.Miss] = deque()
-        self._lost_before: dict[str, int] = {}  # by source: lost, and not yet told with a sample
-        self._gaps: dict[str, tuple[int, int]] = {}  # by source: last sequence number, gaps less losses
+        self._missed: dict[str, int] = {}  # by source: lost on the way, and not yet found as a gap
+        self._tracks: dict[str, _Track] = {}
         self._received = self._lost = self._dropped = self._invalid = 0
 
     @property
@@ -137,9 +146,9 @@ class Intake:
                     raw = self._queue.popleft()
                     if len(self._queue) == _QUEUE // 2:
                         self._room.notify_all()
+                    self._follow(str(raw.key_expr), raw)
                 else:
                     return None
-                self._settle_misses()
             sample = self.read(raw)
             if sample is not None:
                 self._received += 1
@@ -151,9 +160,8 @@ class Intake:
             return self._room.wait_for(lambda: len(self._queue) < _QUEUE, timeout)
 
     def _put_newest(self, raw: zenoh.Sample) -> None:
-        self._settle_misses()
-        self._notice_gap(raw)
         key = str(raw.key_expr)
+        self._follow(key, raw)
         if key in self._newest or len(self._newest) >= _KEYS:
             self._dropped += 1
         if key in self._newest or len(self._newest) < _KEYS:
@@ -172,8 +180,9 @@ class Intake:
             self._warn(key, str(exc))
             return None
         lost = 0
-        if self._lost_before and raw.source_info is not None:
-            lost = self._lost_before.pop(str(raw.source_info.source_id), 0)
+        track = self._tracks.get(key)
+        if track is not None:
+            lost, track.lost = track.lost, 0
         stamp = raw.timestamp
         sent = None if stamp is None else stamp.get_time_as_ntp64().as_nanos()
         return Sample(message, address, time.time_ns(), sent, lost)
@@ -210,25 +219,35 @@ class Intake:
             miss = self._misses.popleft()
             source = str(miss.source)
             self._lost += miss.nb
-            if len(self._lost_before) < _KEYS:
-                self._lost_before[source] = self._lost_before.get(source, 0) + miss.nb
-            if source in self._gaps:
-                last, unexplained = self._gaps[source]
-                self._gaps[source] = last, unexplained - miss.nb
+            if self.newest_only and (source in self._missed or len(self._missed) < _KEYS):
+                self._missed[source] = self._missed.get(source, 0) + miss.nb
 
-    def _notice_gap(self, raw: zenoh.Sample) -> None:
-        """Count what the ring dropped: the gaps in the publisher's sequence that are not losses on the way."""
+    def _follow(self, key: str, raw: zenoh.Sample) -> None:
+        """Follow the publisher's sequence; a gap is what was lost on the way, and what this reader's ring dropped."""
         info = raw.source_info
         if info is None:
             return
+        track = self._tracks.get(key)
+        number = info.source_sn
+        if track is not None and number == track.last + 1:
+            track.last = number
+            return
         source = str(info.source_id)
-        last, unexplained = self._gaps.get(source, (info.source_sn - 1, 0))
-        unexplained += max(0, info.source_sn - last - 1)
-        if unexplained > 0:
-            self._dropped += unexplained
-            unexplained = 0
-        if source in self._gaps or len(self._gaps) < _KEYS:
-            self._gaps[source] = max(last, info.source_sn), unexplained
+        if track is None or track.source != source:
+            if track is not None or len(self._tracks) < _KEYS:
+                self._tracks[key] = _Track(source, number)
+            return
+        gap = max(0, number - track.last - 1)
+        track.last = max(track.last, number)
+        if self.newest_only:
+            self._settle_misses()
+            missed = self._missed.pop(source, 0)
+            lost = min(gap, missed)
+            if missed > lost:
+                self._missed[source] = missed - lost
+            self._dropped += gap - lost
+            gap = lost
+        track.lost += gap
 
     def _warn(self, key: str, reason: str) -> None:
         if key not in self._warned and len(self._warned) < _KEYS:
