@@ -51,8 +51,8 @@ class Daemon:
             raise ConfigError("source", "nothing to publish: give --source sim: or --source ulog:FILE, or several")
         self._settings = settings
         self._version = version
-        self._sources = {text: parse_source(text).open_source(vehicle=settings.vehicle) for text in settings.source}
-        if settings.until_done and not any(source.finite for source in self._sources.values()):
+        self._sources = [(text, parse_source(text).open_source(vehicle=settings.vehicle)) for text in settings.source]
+        if settings.until_done and not any(source.finite for _, source in self._sources):
             raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
         self._started = time.time()
         self._stop = threading.Event()
@@ -90,6 +90,7 @@ class Daemon:
         session = self._open()
         if session is None:
             return True
+        _log.info("%s %s", "router on" if self.role == "router" else "client of", ", ".join(self.endpoints))
         outbox = Outbox(session, prefix=self._settings.prefix)
         threads: list[threading.Thread] = []
         try:
@@ -97,7 +98,7 @@ class Daemon:
             retry = not self._settings.until_done
             self._workers = [
                 Worker(text, source, outbox, stop=self._stop, retry=retry, on_end=self._changed.set)
-                for text, source in self._sources.items()
+                for text, source in self._sources
             ]
             threads = [threading.Thread(target=worker.run, name=worker.text, daemon=True) for worker in self._workers]
             for thread in threads:

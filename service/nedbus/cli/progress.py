@@ -49,8 +49,6 @@ class Display:
             return
         if not self._greeted:
             self._greeted = True
-            place = "router on" if self._daemon.role == "router" else "client of"
-            _log.info("%s %s", place, ", ".join(self._daemon.endpoints))
             if self._progress is not None:
                 self._progress.console.print(HINT, highlight=False)
         if self._progress is not None:
