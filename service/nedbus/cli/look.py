@@ -8,21 +8,18 @@ from typing import Annotated
 
 import typer
 
+from nedbus.bus import Bus
 from nedbus.errors import NoDataError
 from nedbus_msgs import ANY, json_schema, layout_table
 
 from .options import (
-    ConfigOption,
-    ConnectOption,
     InstanceOption,
     JsonOption,
-    PrefixOption,
     TopicArgument,
     TopicOption,
     VehicleOption,
-    WaitOption,
     command,
-    open_bus,
+    on_bus,
     pick_topic,
     tell,
     write,
@@ -30,19 +27,11 @@ from .options import (
 from .text import doubts, to_age, to_fields, to_json, to_table
 
 
-@command
-def list_(
-    *,
-    json_output: JsonOption = False,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    config: ConfigOption = None,
-    wait: WaitOption = False,
-) -> None:
+@on_bus
+def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
     """List the vehicles and topics that are published now, and how old their last message is."""
-    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
-        addresses = [address for addresses in bus.vehicles().values() for address in addresses]
-        newest = {sample.address: sample for sample in bus.latest()}
+    addresses = [address for addresses in bus.vehicles().values() for address in addresses]
+    newest = {sample.address: sample for sample in bus.latest()}
     rows = []
     for address in addresses:
         sample = newest.get(address)
@@ -57,41 +46,29 @@ def list_(
         tell(f"no vehicle is published at {' or '.join(bus.routers)}: start a source with 'nedbus serve'")
 
 
-@command
+@on_bus
 def get(
+    bus: Bus,
     topic: TopicArgument = None,
     *,
     topic_option: TopicOption = ANY,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
     json_output: JsonOption = False,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    config: ConfigOption = None,
-    wait: WaitOption = False,
 ) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when there is none."""
-    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
-        samples = bus.latest(pick_topic(topic, topic_option), vehicle=vehicle, instance=instance)
+    samples = bus.latest(pick_topic(topic, topic_option), vehicle=vehicle, instance=instance)
     for sample in samples:
         write(to_json(sample) if json_output else to_fields(sample))
     if not samples:
         raise NoDataError(f"{pick_topic(topic, topic_option)} of vehicle {vehicle}", 2.0)
 
 
-@command
-def info(
-    *,
-    json_output: JsonOption = False,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    config: ConfigOption = None,
-    wait: WaitOption = False,
-) -> None:
+@on_bus
+def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services on this network: their sources, what these do, and what was rejected."""
-    with open_bus(connect, prefix=prefix, config=config, wait=wait) as bus:
-        services = bus.services()
-        vehicles = bus.vehicles()
+    services = bus.services()
+    vehicles = bus.vehicles()
     if json_output:
         for service in services:
             write(json.dumps(service))

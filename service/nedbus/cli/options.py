@@ -3,32 +3,34 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import logging
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ParamSpec
+from typing import Annotated, Any, ParamSpec
 
 import typer
 
-from nedbus.bus import Bus, connect
+from nedbus.bus import Bus
+from nedbus.bus import connect as nedbus_connect
 from nedbus.errors import AddressError, ConfigError, ConnectError, NedbusError
 from nedbus_msgs import ANY
 
 P = ParamSpec("P")
 
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file [default: nedbus.toml if there]")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
 ConnectOption = Annotated[
     list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join [default: tcp/127.0.0.1:7447]"),
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join (default: tcp/127.0.0.1:7447)"),
 ]
-PrefixOption = Annotated[str | None, typer.Option("--prefix", help="First chunks of every key [default: nedbus]")]
-TopicArgument = Annotated[str | None, typer.Argument(metavar="[TOPIC]", help="The same as --topic", show_default=False)]
+PrefixOption = Annotated[str | None, typer.Option("--prefix", help="First chunks of every key (default: nedbus)")]
+TopicArgument = Annotated[str | None, typer.Argument(metavar="TOPIC", help="The same as --topic", show_default=False)]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
-    int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position [default: all]")
+    int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position (default: all)")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
 WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait for a router that is not there yet")]
@@ -57,17 +59,40 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
     return run
 
 
-def open_bus(
-    endpoints: list[str] | None, *, prefix: str | None = None, config: Path | None = None, wait: bool = False
+def on_bus(function: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function: give it an open bus first, and the options that say where that is."""
+
+    @command
+    def run(**options: Any) -> None:
+        with _open_bus(**{name: options.pop(name) for name in _BUS_OPTIONS}) as bus:
+            function(bus, **options)
+
+    _, *own = inspect.signature(function, eval_str=True).parameters.values()
+    parameters = [*own, *_BUS_OPTIONS.values()]
+    run.__doc__ = function.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # Typer reads both
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return run
+
+
+def _open_bus(
+    *,
+    connect: ConnectOption = None,
+    prefix: PrefixOption = None,
+    config: ConfigOption = None,
+    wait: WaitOption = False,
 ) -> Bus:
     """Connect as the options say; with `wait` for as long as it takes."""
     try:
-        return connect(endpoints, timeout=1.0, prefix=prefix, config=config)
+        return nedbus_connect(connect, timeout=1.0, prefix=prefix, config=config)
     except ConnectError as exc:
         if not wait:
             raise
         tell(f"{exc}; waiting")
-    return connect(endpoints, timeout=float("inf"), prefix=prefix, config=config)
+    return nedbus_connect(connect, timeout=float("inf"), prefix=prefix, config=config)
+
+
+_BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
 
 
 def tell(text: str) -> None:

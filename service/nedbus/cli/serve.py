@@ -28,7 +28,7 @@ _log = logging.getLogger("nedbus")
 _LIMIT: Final = 1.6  # s after a signal by which the process is gone
 ListenOption = Annotated[
     list[str] | None,
-    typer.Option("--listen", "-l", metavar="ENDPOINT", help=f"Where the router listens [default: {DEFAULT_ENDPOINT}]"),
+    typer.Option("--listen", "-l", metavar="ENDPOINT", help=f"Where the router listens (default: {DEFAULT_ENDPOINT})"),
 ]
 
 
@@ -71,7 +71,7 @@ def serve(
 @command
 def router(
     config_file: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.json5]", help="A file that zenohd reads too", show_default=False)
+        Path | None, typer.Argument(metavar="CONFIG.json5", help="A file that zenohd reads too", show_default=False)
     ] = None,
     *,
     listen: ListenOption = None,

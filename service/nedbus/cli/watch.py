@@ -9,25 +9,21 @@ from typing import Annotated
 
 import typer
 
+from nedbus.bus import Bus
 from nedbus.errors import NoDataError
 from nedbus.rates import Rates
-from nedbus.subscriber import Sample, Subscription
+from nedbus.subscriber import Mode, Sample, Subscription
 from nedbus_msgs import ANY
 
 from .options import (
-    ConfigOption,
-    ConnectOption,
     CountOption,
     DurationOption,
     InstanceOption,
     JsonOption,
-    PrefixOption,
     TopicArgument,
     TopicOption,
     VehicleOption,
-    WaitOption,
-    command,
-    open_bus,
+    on_bus,
     pick_topic,
     tell,
     write,
@@ -37,8 +33,9 @@ from .text import to_age, to_fields, to_json, to_line, to_table
 _PATIENCE = 2.0  # s of silence after which a person is told that nothing comes
 
 
-@command
+@on_bus
 def echo(
+    bus: Bus,
     topic: TopicArgument = None,
     *,
     topic_option: TopicOption = ANY,
@@ -49,30 +46,21 @@ def echo(
     json_output: JsonOption = False,
     count: CountOption = None,
     duration: DurationOption = None,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    config: ConfigOption = None,
-    wait: WaitOption = False,
 ) -> None:
     """Print every message as it arrives, a line each."""
     show = to_json if json_output else to_fields if full else to_line
-    with (
-        open_bus(connect, prefix=prefix, config=config, wait=wait) as bus,
-        bus.subscribe(
-            pick_topic(topic, topic_option),
-            vehicle=vehicle,
-            instance=instance,
-            mode="latest" if latest else "every",
-        ) as subscription,
-    ):
+    wanted = pick_topic(topic, topic_option)
+    mode: Mode = "latest" if latest else "every"
+    with bus.subscribe(wanted, vehicle=vehicle, instance=instance, mode=mode) as subscription:
         try:
             _watch(subscription, lambda sample: write(show(sample)), count=count, duration=duration)
         finally:
             _tell_counts(subscription)
 
 
-@command
+@on_bus
 def hz(
+    bus: Bus,
     topic: TopicArgument = None,
     *,
     topic_option: TopicOption = ANY,
@@ -81,19 +69,11 @@ def hz(
     json_output: JsonOption = False,
     count: CountOption = None,
     duration: DurationOption = None,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    config: ConfigOption = None,
-    wait: WaitOption = False,
 ) -> None:
     """Measure rate, jitter, latency and loss of each vehicle and topic, every second."""
     rates = Rates(since=time.time_ns())
-    with (
-        open_bus(connect, prefix=prefix, config=config, wait=wait) as bus,
-        bus.subscribe(
-            pick_topic(topic, topic_option), vehicle=vehicle, instance=instance, mode="every"
-        ) as subscription,
-    ):
+    wanted = pick_topic(topic, topic_option)
+    with bus.subscribe(wanted, vehicle=vehicle, instance=instance, mode="every") as subscription:
         _watch(
             subscription,
             rates.add,
