@@ -269,10 +269,13 @@ def start(tmp_path: Path) -> Iterator[Start]:
     """Start Python processes; each is killed at the end of the test if it is still there."""
     processes: list[Process] = []
 
-    def start_process(*arguments: str, **environment: str) -> Process:
+    def start_process(*arguments: str, measured: bool = True, **environment: str) -> Process:
         where = tmp_path / f"process-{len(processes)}"
         where.mkdir()
         inherited = {name: value for name, value in os.environ.items() if not name.startswith("NEDBUS_")}
+        if not measured:
+            # A signal can find coverage inside its own lock, where it stays.
+            inherited = {name: value for name, value in inherited.items() if not name.startswith("COVERAGE_")}
         process = Process([sys.executable, *arguments], where, inherited | environment)
         processes.append(process)
         return process

@@ -6,7 +6,18 @@ from collections.abc import Sequence
 
 
 class NedbusError(Exception):
-    """Base of every error that nedbus raises on purpose."""
+    """Base of every error that nedbus raises on purpose; it can be pickled, for process pools."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild, (type(self), self.args, self.__dict__)
+
+
+def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict[str, object]) -> NedbusError:
+    """Make an error from its finished text; its constructor would write the text again."""
+    error = kind.__new__(kind)
+    error.args = arguments
+    error.__dict__.update(facts)
+    return error
 
 
 class AddressError(NedbusError, ValueError):

@@ -165,12 +165,27 @@ class VehicleLocalPosition(BaseModel):
             raise _refuse(values, broken)
         return self
 
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields; what is not a number on both sides is the same."""
+        if not isinstance(other, VehicleLocalPosition):
+            return NotImplemented
+        return all(_is_same(value, other.__dict__[name]) for name, value in self.__dict__.items())
+
+    def __hash__(self) -> int:
+        return hash((self.timestamp, self.timestamp_sample))
+
     def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
         """Return a copy; unlike Pydantic's own, one with updates is validated like any other message."""
         if not update:
             return super().model_copy(deep=deep)
         given = {name: self.__dict__[name] for name in self.model_fields_set}
         return type(self).model_validate({**given, **update})
+
+
+def _is_same(one: object, other: object) -> bool:
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return all(map(_is_same, one, other))
+    return one == other or (repr(one) == repr(other) == "nan")
 
 
 def _px4_type(name: str) -> TypeName:

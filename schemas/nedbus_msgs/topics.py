@@ -63,11 +63,9 @@ class Address:
 
     def __post_init__(self) -> None:
         check_vehicle(self.vehicle)
-        if get_topic(self.topic).instances:
-            if self.instance is None or not 0 <= self.instance < _INSTANCES:
-                raise AddressError("instance", self.instance, f"0 to {_INSTANCES - 1} for {self.topic}")
-        elif self.instance is not None:
-            raise AddressError("instance", self.instance, f"none: {self.topic} has no instances")
+        if get_topic(self.topic).instances and self.instance is None:
+            raise AddressError("instance", None, f"0 to {_INSTANCES - 1} for {self.topic}")
+        _check_instance(self.topic, self.instance)
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -116,10 +114,9 @@ def selection(
         if instance is not None:
             raise AddressError("instance", instance, "none: name the topic as well")
         return f"{prefix}/{vehicle}/**"
+    _check_instance(topic, instance)
     if get_topic(topic).instances:
         return f"{prefix}/{vehicle}/{topic}/{ANY if instance is None else instance}"
-    if instance is not None:
-        raise AddressError("instance", instance, f"none: {topic} has no instances")
     return f"{prefix}/{vehicle}/{topic}"
 
 
@@ -130,7 +127,10 @@ def alive_selection(*, prefix: str = DEFAULT_PREFIX) -> str:
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     """Return the address that a liveliness token names; raise AddressError for any other key."""
-    return Address.from_key(key.replace("/@alive/", "/", 1), prefix=prefix)
+    vehicle, alive, stream = key.removeprefix(prefix + "/").partition("/@alive/")
+    if not alive:
+        raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<topic>[/<instance>]")
+    return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
 
 
 def schema_key(*, prefix: str = DEFAULT_PREFIX) -> str:
@@ -143,18 +143,26 @@ def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
     return f"{prefix}/@service/{service}/status"
 
 
-def get_topic(name: str) -> Topic:
+def get_topic(name: object) -> Topic:
     """Return a row of TOPICS; raise AddressError for a name that has none."""
-    try:
-        return TOPICS[name]
-    except KeyError:
-        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}") from None
+    if not isinstance(name, str) or name not in TOPICS:
+        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}")
+    return TOPICS[name]
 
 
-def check_vehicle(vehicle: str) -> None:
+def check_vehicle(vehicle: object) -> None:
     """Raise AddressError unless this can name a vehicle."""
-    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
+    if not isinstance(vehicle, str) or not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
+
+
+def _check_instance(topic: str, instance: int | None) -> None:
+    if instance is None:
+        return
+    if not get_topic(topic).instances:
+        raise AddressError("instance", instance, f"none: {topic} has no instances")
+    if type(instance) is not int or not 0 <= instance < _INSTANCES:
+        raise AddressError("instance", instance, f"0 to {_INSTANCES - 1} for {topic}")
 
 
 def check_prefix(prefix: str) -> None:

@@ -115,4 +115,8 @@ def _read_any(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, o
         raise UnknownLayoutError(layout, len(values), (*WIRE_LAYOUTS, *newer))
     if len(values) != len(names):
         raise DecodeError(f"{len(values)} fields where layout {layout} has {len(names)}")
+    for name, value in zip(names, values, strict=True):
+        # Deeper nesting is no field of ours, and would exhaust the stack of whoever prints it.
+        if isinstance(value, tuple) and any(isinstance(item, tuple) for item in value):
+            raise DecodeError(f"{name}: an array within an array")
     return dict(zip(names, values, strict=True))

@@ -7,6 +7,7 @@ import json
 import logging
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, Self
 
@@ -21,14 +22,15 @@ from nedbus_msgs import (
     status_key,
 )
 
-from .errors import ClosedError
+from .errors import ClosedError, NedbusError
 from .publisher import Outbox, Publisher
-from .session import RawSample, Session, alive_keys, open_client, query
+from .session import RawSample, Session, Tls, alive_keys, open_client, query
 from .settings import load_settings
 from .subscriber import AsyncSubscription, Feed, Intake, Mode, Sample, Subscription
 
 _log = logging.getLogger(__name__)
-_ANSWER_LIMIT: Final = 2**20  # bytes of an answer that is read: nobody on the network is trusted
+_FIELDS: Final = 256  # fields that a layout may have
+_ANSWER_LIMIT: Final = 2**18  # bytes of an answer that is read: nobody on the network is trusted
 
 
 def connect(
@@ -36,19 +38,26 @@ def connect(
     *,
     timeout: float = 3.0,
     prefix: str | None = None,
-    config: Path | None = None,
+    tls_ca: str | Path | None = None,
+    tls_certificate: str | Path | None = None,
+    tls_key: str | Path | None = None,
+    config: str | Path | None = None,
 ) -> Bus:
     """Connect to a router and return a bus; use it as a context manager, or forget it: it closes itself.
 
     `endpoint` is Zenoh's, such as tcp/192.168.1.5:7447, or several of which the first that answers is taken; the
     default is NEDBUS_CONNECT, `connect` in nedbus.toml, else tcp/127.0.0.1:7447, where `nedbus serve` listens.
     `timeout` is how long to try, in seconds; later breaks of the link heal by themselves.
+    The three `tls_` files are for tls/ endpoints: the authority to trust, and who this client is.
+    `config` names a file instead of nedbus.toml.
 
     Raises ConnectError when nothing answers, ConfigError for a setting that cannot be.
     """
-    settings = load_settings(config, connect=endpoint, prefix=prefix)
-    routers = settings.routers
-    return Bus(open_client(routers, timeout=timeout), routers=routers, prefix=settings.prefix)
+    settings = load_settings(
+        config, connect=endpoint, prefix=prefix, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key
+    )
+    routers, tls = settings.routers, settings.tls
+    return Bus(open_client(routers, timeout=timeout, tls=tls), routers=routers, prefix=settings.prefix, tls=tls)
 
 
 def connect_async(
@@ -56,10 +65,23 @@ def connect_async(
     *,
     timeout: float = 3.0,
     prefix: str | None = None,
-    config: Path | None = None,
+    tls_ca: str | Path | None = None,
+    tls_certificate: str | Path | None = None,
+    tls_key: str | Path | None = None,
+    config: str | Path | None = None,
 ) -> AsyncBus:
     """Return a bus for asyncio, to be opened with `async with`; arguments and errors are those of `connect`."""
-    return AsyncBus(lambda: connect(endpoint, timeout=timeout, prefix=prefix, config=config))
+    return AsyncBus(
+        lambda: connect(
+            endpoint,
+            timeout=timeout,
+            prefix=prefix,
+            tls_ca=tls_ca,
+            tls_certificate=tls_certificate,
+            tls_key=tls_key,
+            config=config,
+        )
+    )
 
 
 class Bus:
@@ -69,9 +91,10 @@ class Bus:
     All methods may be called from any thread; a wrong name raises AddressError, a closed bus ClosedError.
     """
 
-    def __init__(self, session: Session, *, routers: Sequence[str], prefix: str) -> None:
+    def __init__(self, session: Session, *, routers: Sequence[str], prefix: str, tls: Tls | None) -> None:
         self.prefix = prefix
         self.routers = tuple(routers)
+        self._tls = tls
         self._session = session
         self._outbox = Outbox(session, prefix=prefix)
         self._feeds: weakref.WeakSet[Feed] = weakref.WeakSet()
@@ -91,6 +114,8 @@ class Bus:
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 10 s.
         Either way `counts` tells what was lost, dropped or invalid.
+
+        Raises ConnectError when mode "every" cannot open its session, because the router is away at this moment.
         """
         self._require_open()
         key_expr = selection(topic, vehicle=vehicle, instance=instance, prefix=self.prefix)
@@ -127,7 +152,7 @@ class Bus:
     def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already."""
         self._require_open()
-        return self._outbox.publisher(Address(vehicle, topic, instance))
+        return self._outbox.publisher(Address(vehicle, topic, instance), owner=self)
 
     def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service on this network, as it tells it."""
@@ -150,14 +175,25 @@ class Bus:
             raise ClosedError
 
     def _open_feed(self, key_expr: str, intake: Intake) -> Feed:
-        session = self._session if intake.newest_only else open_client(self.routers, timeout=3.0)
-        feed = Feed(session, key_expr, intake)
+        self._require_open()
+        if intake.newest_only:
+            feed = Feed(self._session, key_expr, intake)
+        else:
+            own = open_client(self.routers, timeout=3.0, tls=self._tls)
+            try:
+                feed = Feed(own, key_expr, intake)
+            except NedbusError:
+                own.close()
+                raise
         self._feeds.add(feed)
+        if not self._finalizer.alive:  # closed meanwhile, by another thread
+            feed.close()
+            raise ClosedError
         return feed
 
     def _find_layout(self, number: int) -> Sequence[str] | None:
         """Ask the publishers for the field names of a layout; None if none knows it."""
-        for raw in query(self._session, schema_key(prefix=self.prefix), timeout=2.0):
+        for raw in query(self._session, schema_key(prefix=self.prefix), timeout=0.5, newest=False):
             content = _read_json(raw)
             layouts = content.get("layouts") if isinstance(content, dict) else None
             for layout in layouts if isinstance(layouts, list) else ():
@@ -184,6 +220,7 @@ class AsyncBus:
     ) -> AsyncSubscription:
         """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
         bus = self._opened()
+        bus._require_open()
         key_expr = selection(topic, vehicle=vehicle, instance=instance, prefix=bus.prefix)
         intake = Intake(mode, prefix=bus.prefix, find_layout=bus._find_layout)
         return AsyncSubscription(lambda: bus._open_feed(key_expr, intake), intake, name=key_expr)
@@ -226,10 +263,11 @@ class AsyncBus:
 
 
 def _close(session: Session, outbox: Outbox, feeds: weakref.WeakSet[Feed]) -> None:
-    for feed in list(feeds):
-        feed.close()
-    outbox.close()
-    session.close()
+    with ExitStack() as closing:  # whatever fails, the rest is closed as well
+        closing.callback(session.close)
+        closing.callback(outbox.close)
+        for feed in list(feeds):
+            closing.callback(feed.close)
 
 
 def _read_json(raw: RawSample) -> object:
@@ -237,8 +275,8 @@ def _read_json(raw: RawSample) -> object:
         return None
     try:
         return json.loads(raw.payload.to_bytes())
-    except ValueError as exc:
-        _log.warning("%s: an answer that is no JSON (%s)", raw.key_expr, exc)
+    except (ValueError, RecursionError):
+        _log.warning("%r: an answer that is no JSON", str(raw.key_expr))
         return None
 
 
@@ -246,7 +284,6 @@ def _field_names(layout: object, number: int) -> Sequence[str] | None:
     """Return the field names of this layout, if it is the one with that number and well formed."""
     if not isinstance(layout, dict) or layout.get("wire") != number or not isinstance(layout.get("fields"), list):
         return None
-    names = [field.get("name") for field in layout["fields"] if isinstance(field, dict)]
-    if len(names) > 256 or len(set(names)) != len(layout["fields"]):
-        return None
-    return [name for name in names if isinstance(name, str)]
+    named = [field.get("name") for field in layout["fields"] if isinstance(field, dict)]
+    names = [name for name in named if isinstance(name, str)]
+    return names if len(set(names)) == len(layout["fields"]) <= _FIELDS else None

@@ -58,11 +58,16 @@ class Daemon:
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: list[Worker] = []
-        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}")
+        # In containers every service may be process 1 of the same host name.
+        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.ready = threading.Event()
         self.role: Literal["router", "client"] = "client" if settings.connect and not settings.listen else "router"
         self.endpoints = settings.connect if self.role == "client" else settings.listen or (DEFAULT_ENDPOINT,)
-        if settings.router_config is not None and self.role == "router":
+        if settings.router_config is not None:
+            if settings.connect or settings.listen:
+                raise ConfigError(
+                    "router_config", "a file says all about the embedded router: drop it, or drop connect and listen"
+                )
             self.endpoints = (str(settings.router_config),)
 
     @property
@@ -85,12 +90,16 @@ class Daemon:
     def run(self) -> bool:
         """Publish until done or stopped; return whether no source failed for good.
 
-        Raises ListenError when the embedded router cannot listen.
+        Raises ListenError when the embedded router cannot listen, ConfigError for a mistake in its file.
         """
         session = self._open()
         if session is None:
             return True
-        _log.info("%s %s", "router on" if self.role == "router" else "client of", ", ".join(self.endpoints))
+        joined = f", joined to {', '.join(self._settings.connect)}" if self._settings.connect else ""
+        if self.role == "router":
+            _log.info("router on %s%s", ", ".join(self.endpoints), joined)
+        else:
+            _log.info("client of %s", ", ".join(self.endpoints))
         outbox = Outbox(session, prefix=self._settings.prefix)
         threads: list[threading.Thread] = []
         try:
@@ -122,7 +131,7 @@ class Daemon:
         told = False
         while not self._stop.is_set():
             try:
-                return open_client(self.endpoints, timeout=1.0)
+                return open_client(self.endpoints, timeout=1.0, tls=self._settings.tls, stop=self._stop)
             except ConnectError as exc:
                 if not told:
                     _log.warning("%s; still trying", exc)

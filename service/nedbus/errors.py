@@ -6,7 +6,8 @@
     │   ├── LayoutError (ValueError)         field names that fit no layout
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
-    │   └── ConfigError (ValueError)         a setting, a flag or a line of a file
+    │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
+    │   └── PkiError                         a key or certificate that cannot be made
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
@@ -47,6 +48,7 @@ __all__ = [
     "ListenError",
     "NedbusError",
     "NoDataError",
+    "PkiError",
     "SourceError",
     "UnknownLayoutError",
 ]
@@ -75,13 +77,21 @@ class ConfigError(NedbusError, ValueError):
         return cls(f"{path}{place}", reason)
 
 
+_TLS_HINT = (
+    " check that tls_ca is the router's authority, that it signed tls_certificate, that neither has expired, and that"
+    " the host in the endpoint is one of the router certificate's"
+)
+
+
 class ConnectError(NedbusError, ConnectionError):
     """Raise when no endpoint answered in time."""
 
     def __init__(self, endpoints: Sequence[str], seconds: float) -> None:
+        secure = any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints)
         super().__init__(
             f"nothing answers at {' or '.join(endpoints)} (tried for {seconds:.3g} s): start 'nedbus serve' or a Zenoh"
             " router there, or name another endpoint with --connect or NEDBUS_CONNECT"
+            + ("; a router that does answer refuses a certificate without a word:" + _TLS_HINT if secure else "")
         )
         self.endpoints = tuple(endpoints)
 
@@ -104,11 +114,15 @@ class NoDataError(NedbusError, TimeoutError):
         super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows what there is")
 
 
+class PkiError(NedbusError):
+    """Raise when a key or a certificate cannot be made, or would replace one."""
+
+
 class ClosedError(NedbusError, RuntimeError):
-    """Raise when something is asked of a bus that was closed."""
+    """Raise when something is asked of a bus, a subscription or a publisher that was closed."""
 
     def __init__(self) -> None:
-        super().__init__("this bus is closed: connect again")
+        super().__init__("this is closed, or the bus that it came from is: connect again")
 
 
 class SourceError(NedbusError):

@@ -7,7 +7,9 @@ import logging
 import queue
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from typing import Final, cast
+from contextlib import suppress
+from functools import partial
+from typing import Final, Self, cast
 
 import zenoh
 from pydantic_core import to_json
@@ -23,11 +25,12 @@ from nedbus_msgs import (
     schema_key,
 )
 
-from .errors import AddressInUseError
-from .session import while_open
+from .errors import AddressInUseError, ClosedError
+from .session import alive_keys, while_open
 
 _log = logging.getLogger(__name__)
 
+_QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
 _JSON: Final = "application/json"
 
@@ -39,21 +42,33 @@ class Publisher:
     """Publish the messages of one address; get one from `bus.publisher(...)`.
 
     Messages are kept for about 10 s for readers that missed some, and the last one for readers that ask.
-    `publish` never waits for a slow reader, unless the publisher was made with `lossless=True`.
-    Usable from one thread at a time, and from asyncio.
+    `publish` never waits for a slow reader, unless the publisher was made to lose nothing.
+    Usable from one thread at a time, and from asyncio; as a context manager it closes itself.
     """
 
-    def __init__(self, session: zenoh.Session, address: Address, *, prefix: str, lossless: bool) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        address: Address,
+        *,
+        prefix: str,
+        lossless: bool,
+        on_close: Callable[[], object],
+        owner: object,
+    ) -> None:
         self.address = address
         self.key = address.key(prefix=prefix)
         self.published = 0
         self.last: tuple[bytes, zenoh.Timestamp] | None = None
         self._session = session
+        self._on_close = on_close
+        self._owner = owner  # the bus stays open for as long as somebody may publish
+        self._closed = False
         topic = get_topic(address.topic)
         control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         # A heartbeat together with BLOCK and recovering readers can stall a saturated link for 5 s.
         misses = zenoh.ext.MissDetectionConfig(heartbeat=None if lossless else HEARTBEAT, sporadic_heartbeat=None)
-        with while_open():
+        with while_open(self._session):
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
@@ -71,20 +86,35 @@ class Publisher:
 
         A message that exists was validated when it was made; it is not validated again.
 
-        Raises pydantic.ValidationError for fields that are no message, ClosedError once the bus is closed.
+        Raises pydantic.ValidationError for fields that are no message, EncodeError for a message whose validation was
+        bypassed, ClosedError once the publisher or its bus is closed.
         """
-        payload = encode(VehicleLocalPosition.model_validate(message))
-        with while_open():
+        if not isinstance(message, VehicleLocalPosition):
+            message = VehicleLocalPosition.model_validate(message)
+        payload = encode(message)
+        if self._closed:
+            raise ClosedError
+        with while_open(self._session):
             stamp = self._session.new_timestamp()
             self._publisher.put(payload, timestamp=stamp)
         self.last = payload, stamp
         self.published += 1
 
     def close(self) -> None:
-        """Stop publishing this address; `bus.vehicles()` no longer shows it."""
-        with while_open():
+        """Stop publishing this address: it is no longer listed, and free for another publisher."""
+        if self._closed:
+            return
+        self._closed = True
+        self._on_close()
+        with suppress(zenoh.ZError):  # closed already with the session
             self._publisher.undeclare()
             self._token.undeclare()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
 
 
 class Outbox:
@@ -98,8 +128,8 @@ class Outbox:
         self._session = session
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()
-        self._questions: queue.SimpleQueue[tuple[zenoh.Query, Callable[[zenoh.Query], Iterable[Answer]]] | None]
-        self._questions = queue.SimpleQueue()
+        self._questions: queue.Queue[tuple[zenoh.Query, Callable[[zenoh.Query], Iterable[Answer]]] | None]
+        self._questions = queue.Queue(_QUESTIONS)
         self._queryables: list[zenoh.Queryable[None]] = []
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -109,32 +139,36 @@ class Outbox:
         """All publishers that are open."""
         return list(self._publishers.values())
 
-    def publisher(self, address: Address, *, lossless: bool = False) -> Publisher:
-        """Return a publisher for an address; raise AddressInUseError if there is one already."""
+    def publisher(self, address: Address, *, lossless: bool = False, owner: object = None) -> Publisher:
+        """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one."""
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
-            publisher = Publisher(self._session, address, prefix=self.prefix, lossless=lossless)
+            publisher = Publisher(
+                self._session,
+                address,
+                prefix=self.prefix,
+                lossless=lossless,
+                on_close=lambda: self._publishers.pop(address, None),
+                owner=owner,
+            )
             self._publishers[address] = publisher
             if not self._vehicles:
                 self.answer(schema_key(prefix=self.prefix), self._answer_schema)
             if address.vehicle not in self._vehicles:
                 self._vehicles.add(address.vehicle)
-                self.answer(f"{self.prefix}/{address.vehicle}/**", self._answer_last)
+                self.answer(f"{self.prefix}/{address.vehicle}/**", partial(self._answer_last, address.vehicle))
         return publisher
-
-    def release(self, address: Address) -> None:
-        """Close the publisher of an address, so that another can take its place."""
-        with self._lock:
-            publisher = self._publishers.pop(address, None)
-        if publisher is not None:
-            publisher.close()
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
         """Publish why a message of this address was not published; what JSON cannot hold is written as text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
-        with while_open():
+        with while_open(self._session):
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=_JSON)
+
+    def is_alive(self, address: Address) -> bool:
+        """Return whether somebody publishes this address already, here or elsewhere."""
+        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=0.5))
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether a subscriber is there for any of these addresses."""
@@ -155,20 +189,26 @@ class Outbox:
         if self._thread is None:
             self._thread = threading.Thread(target=self._serve, name="nedbus-answers", daemon=True)
             self._thread.start()
-        # The callback runs on Zenoh's own thread, where it must not linger: it only hands over.
-        # A Python thread of Zenoh's would keep the process from exiting.
-        hand_over: zenoh.handlers.Callback[zenoh.Query]
-        hand_over = zenoh.handlers.Callback(lambda query: self._questions.put((query, reply)), indirect=False)
-        with while_open():
-            self._queryables.append(self._session.declare_queryable(key_expr, hand_over, complete=True))
+
+        def hand_over(query: zenoh.Query) -> None:
+            # On Zenoh's own thread, where it must not linger; a flood of questions goes without answers.
+            with suppress(queue.Full):
+                self._questions.put_nowait((query, reply))
+
+        # A Python thread of Zenoh's would keep the process from exiting: the callback is a direct one.
+        callback = zenoh.handlers.Callback(hand_over, indirect=False)
+        with while_open(self._session):
+            self._queryables.append(self._session.declare_queryable(key_expr, callback))
 
     def close(self) -> None:
         """Stop answering; the publishers end with the session."""
         for queryable in self._queryables:
-            queryable.undeclare()
-        self._questions.put(None)
+            with suppress(zenoh.ZError):
+                queryable.undeclare()
         if self._thread is not None:
-            self._thread.join(1.0)
+            with suppress(queue.Full):
+                self._questions.put(None, timeout=0.5)
+            self._thread.join(0.5)
 
     def _serve(self) -> None:
         while (question := self._questions.get()) is not None:
@@ -180,9 +220,11 @@ class Outbox:
             except zenoh.ZError as exc:
                 _log.debug("a query on %s could not be answered: %s", query.key_expr, exc)
 
-    def _answer_last(self, query: zenoh.Query) -> Iterable[Answer]:
+    def _answer_last(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:
-            if publisher.last is not None and query.key_expr.intersects(publisher.key):
+            if publisher.last is None or publisher.address.vehicle != vehicle:
+                continue
+            if query.key_expr.intersects(publisher.key):
                 payload, stamp = publisher.last
                 yield publisher.key, payload, ENCODING, stamp
 

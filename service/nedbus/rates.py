@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from nedbus_msgs import Address
 
@@ -20,22 +21,23 @@ class _Window:
 class Rates:
     """Collect samples, and tell of those since the last time.
 
-    `since` [ns since the epoch]: what was sent before, a last value that a subscription starts with, does not count.
+    The first sample of each address does not count: it may be the last value that a subscription starts with.
     """
 
-    def __init__(self, *, since: int) -> None:
-        self._since = since
+    def __init__(self) -> None:
         self._windows: dict[Address, _Window] = {}
 
-    def add(self, sample: Sample) -> None:
-        """Take note of a sample."""
-        if sample.sent is not None and sample.sent < self._since:
-            return
-        window = self._windows.setdefault(sample.address, _Window())
+    def add(self, sample: Sample) -> bool:
+        """Take note of a sample; return whether it counts."""
+        window = self._windows.get(sample.address)
+        if window is None:
+            self._windows[sample.address] = _Window()
+            return False
         window.times.append(sample.received)
         if sample.latency is not None:
             window.latencies.append(sample.latency)
         window.lost += sample.lost
+        return True
 
     def take(self) -> list[tuple[Address, dict[str, float | None]]]:
         """Return what was measured for each address, and start anew.
@@ -45,7 +47,7 @@ class Rates:
         """
         told = []
         for address, window in sorted(self._windows.items()):
-            steps = [(after - before) / 1e9 for before, after in zip(window.times, window.times[1:], strict=False)]
+            steps = [(after - before) / 1e9 for before, after in pairwise(window.times)]
             rate = {
                 "rate": len(steps) / sum(steps) if steps and sum(steps) > 0 else None,
                 "jitter": statistics.pstdev(steps) if steps else None,

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import Final, TypeVar
 
 import zenoh
 
-from .errors import ClosedError, ConfigError, ConnectError, ListenError
+from .errors import ClosedError, ConfigError, ConnectError, ListenError, NedbusError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 
-_ENDPOINT = re.compile(r"(tcp|tls|udp|ws|quic|unixsock-stream)/(\S+)")
-_BACKOFF: Final = (0.05, 0.1, 0.2, 0.4, 0.8, 1.0)
+_ENDPOINT = re.compile(r"(?:tcp|tls|udp|ws|quic)/\S+:\d{1,5}(?:[?#]\S*)?|unixsock-stream/\S+")
+_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first tries to connect
+_RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_ANSWERS: Final = 10_000
 _T = TypeVar("_T")
 
 Session = zenoh.Session
@@ -35,36 +40,60 @@ _COMMON: Final = {
 }
 
 
-def open_client(endpoints: Sequence[str], *, timeout: float) -> Session:
-    """Open a session as a client of the first router that answers; Ctrl-C ends the wait.
+@dataclass(frozen=True, slots=True)
+class Tls:
+    """Files in PEM for `tls/` endpoints: the authority to trust, and who this client is, where a router asks for it."""
+
+    ca: Path
+    certificate: Path | None = None
+    key: Path | None = None
+
+    def settings(self) -> dict[str, object]:
+        """Return Zenoh's settings; raise ConfigError for a file that cannot be read or is half of a pair."""
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: give both or none")
+        for path in (self.ca, self.certificate, self.key):
+            if path is not None and not os.access(path, os.R_OK):
+                raise ConfigError("tls", f"{path} cannot be read: is it there, and may this user read it?")
+        own = {"connect_certificate": str(self.certificate), "connect_private_key": str(self.key), "enable_mtls": True}
+        return {"root_ca_certificate": str(self.ca), **(own if self.certificate else {})}
+
+
+def open_client(
+    endpoints: Sequence[str], *, timeout: float, tls: Tls | None = None, stop: threading.Event | None = None
+) -> Session:
+    """Open a session as a client of the first router that answers; Ctrl-C, or setting `stop`, ends the wait.
 
     It reconnects by itself whenever the link breaks.
 
-    Raises ConnectError when no endpoint answers within `timeout` seconds, ConfigError for a malformed endpoint.
+    Raises ConnectError when no endpoint answers within `timeout` seconds, ConfigError for a malformed endpoint or a
+    TLS file that cannot be read.
     """
     check_endpoints(endpoints, where="connect")
-    config = _config(
-        {
-            **_COMMON,
-            "mode": "client",
-            "connect/endpoints": list(endpoints),
-            "connect/timeout_ms": 0,
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-            "listen/endpoints": [],
-            "transport/unicast/open_timeout": 3000,
-        }
-    )
+    settings: dict[str, object] = {
+        **_COMMON,
+        **({"transport/link/tls": tls.settings()} if tls is not None else {}),
+        "mode": "client",
+        "connect/endpoints": list(endpoints),
+        "connect/timeout_ms": 0,
+        "connect/retry": _RETRY,
+        "listen/endpoints": [],
+        # Nobody on the network is trusted: the largest answer that is expected is a status of many sources.
+        "transport/link/rx/max_message_size": 2**18,
+    }
     start = time.monotonic()
-    pause = threading.Event()
-    for attempt in range(2**30):
+    stop = stop or threading.Event()
+    for pause in chain(_PAUSES, repeat(1.0)):
+        # An endpoint that accepts and then says nothing may not use up more than the time that there is.
+        left = start + timeout - time.monotonic()
+        settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
         try:
-            return zenoh.open(config)
+            return zenoh.open(_config(settings, where="connect"))
         except zenoh.ZError:
             left = start + timeout - time.monotonic()
-            if left <= 0:
-                raise ConnectError(endpoints, timeout) from None
-            pause.wait(min(left, _BACKOFF[min(attempt, len(_BACKOFF) - 1)]))
-    raise AssertionError
+            if left <= 0 or stop.wait(min(left, pause)):
+                break
+    raise ConnectError(endpoints, timeout)
 
 
 def open_router(
@@ -80,19 +109,18 @@ def open_router(
     else:
         check_endpoints(listen, where="listen")
         check_endpoints(connect, where="connect")
-        config = _config(
-            {
-                **_COMMON,
-                "mode": "router",
-                "scouting/delay": 0,  # nobody is scouted, so there is nobody to wait 0.5 s for
-                "listen/endpoints": list(listen),
-                "connect/endpoints": list(connect),
-                "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-                "adminspace/enabled": True,
-                "transport/unicast/accept_pending": 1000,
-                "transport/link/rx/max_message_size": 2**20,
-            }
-        )
+        settings = {
+            **_COMMON,
+            "mode": "router",
+            "scouting/delay": 0,  # nobody is scouted, so there is nobody to wait 0.5 s for
+            "listen/endpoints": list(listen),
+            "connect/endpoints": list(connect),
+            "connect/retry": _RETRY,
+            "adminspace/enabled": True,
+            "transport/unicast/accept_pending": 1000,
+            "transport/link/rx/max_message_size": 2**20,
+        }
+        config = _config(settings, where="listen")
     try:
         return zenoh.open(config)
     except zenoh.ZError as exc:
@@ -107,55 +135,56 @@ def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
 
 
 @contextmanager
-def while_open() -> Iterator[None]:
-    """Translate what Zenoh raises inside a session that was closed."""
+def while_open(session: Session) -> Iterator[None]:
+    """Translate what Zenoh raises: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
     try:
         yield
     except zenoh.ZError as exc:
-        raise ClosedError from exc
+        if session.is_closed():
+            raise ClosedError from exc
+        raise NedbusError(f"Zenoh refuses: {_first_sentence(exc)}") from exc
 
 
-def query(session: Session, key_expr: str, *, timeout: float) -> list[RawSample]:
-    """Return the newest answer for each key from all who answer within `timeout` seconds."""
-    target, newest = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.LATEST
-    with while_open():
-        replies = session.get(key_expr, target=target, consolidation=newest, timeout=timeout)
-        return [reply.ok for reply in replies if reply.ok is not None]
+def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
+    """Return what is answered within `timeout` seconds: the newest answer for each key, or all answers.
+
+    At most 10,000 answers are taken; more are nobody's honest work.
+    """
+    mode = zenoh.ConsolidationMode.LATEST if newest else zenoh.ConsolidationMode.NONE
+    with while_open(session):
+        replies = session.get(key_expr, target=zenoh.QueryTarget.ALL, consolidation=mode, timeout=_in_range(timeout))
+        return [reply.ok for reply in islice(replies, _ANSWERS) if reply.ok is not None]
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
-    """Return the keys of all liveliness tokens that match, sorted."""
-    with while_open():
-        replies = session.liveliness().get(key_expr, timeout=timeout)
-        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+    """Return the keys of all liveliness tokens that match, each once, sorted."""
+    with while_open(session):
+        replies = session.liveliness().get(key_expr, timeout=_in_range(timeout))
+        return sorted({str(reply.ok.key_expr) for reply in islice(replies, _ANSWERS) if reply.ok is not None})
 
 
 def receive(handler: zenoh.Handler[_T]) -> list[_T]:
     """Wait for something, and return all that is there, up to 256; empty once the subscriber is undeclared."""
-    try:
-        batch = [handler.recv()]
+    batch: list[_T] = []
+    with suppress(zenoh.ZError):
+        batch.append(handler.recv())
         while len(batch) < 256 and (item := handler.try_recv()) is not None:
             batch.append(item)
-    except zenoh.ZError:
-        return []
     return batch
 
 
-def drain(handler: zenoh.Handler[_T]) -> list[_T]:
-    """Return what is there without waiting; empty once the subscriber is undeclared."""
-    batch: list[_T] = []
-    try:
-        while (item := handler.try_recv()) is not None:
-            batch.append(item)
-    except zenoh.ZError:
-        pass
-    return batch
+def _in_range(timeout: float) -> float:
+    """Return a time that Zenoh takes: it knows neither 0 nor infinity."""
+    return min(max(timeout, 0.001), 86_400.0)
 
 
-def _config(settings: dict[str, object]) -> zenoh.Config:
+def _config(settings: Mapping[str, object], *, where: str) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as exc:
+            raise ConfigError(where, f"{value!r} is nothing that Zenoh takes as {key}") from exc
     return config
 
 
@@ -165,12 +194,15 @@ def _read_config(path: Path) -> zenoh.Config:
     if not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     try:
-        return zenoh.Config.from_file(path)
+        config = zenoh.Config.from_file(path)
+        if config.get_json("mode") == "null":
+            config.insert_json5("mode", '"router"')  # as zenohd does
     except zenoh.ZError as exc:
         text = str(exc)
         place = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
         line, column = map(int, place.groups()) if place else (None, None)
         raise ConfigError.in_file(path, _reason(text), line=line, column=column) from exc
+    return config
 
 
 def _reason(text: str) -> str:

@@ -21,7 +21,7 @@ from pydantic_settings import (
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
 
 from .errors import ConfigError
-from .session import DEFAULT_ENDPOINT, check_endpoints
+from .session import DEFAULT_ENDPOINT, Tls, check_endpoints
 
 DEFAULT_FILE = Path("nedbus.toml")
 
@@ -58,9 +58,12 @@ class Settings(BaseSettings):
     Make one with `load_settings`, which turns every mistake into a ConfigError that names its place.
     """
 
-    model_config = SettingsConfigDict(env_prefix="NEDBUS_", extra="forbid", frozen=True)
+    model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
 
     connect: Endpoints = Field((), description="Zenoh routers to join, the first that answers")
+    tls_ca: Path | None = Field(None, description="Authority that signed the routers of tls/ endpoints, PEM")
+    tls_certificate: Path | None = Field(None, description="Certificate that this client shows to a router, PEM")
+    tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
     prefix: Annotated[str, AfterValidator(_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
@@ -87,21 +90,32 @@ class Settings(BaseSettings):
         """The endpoints that a client joins."""
         return self.connect or (DEFAULT_ENDPOINT,)
 
+    @property
+    def tls(self) -> Tls | None:
+        """The files of a client of tls/ endpoints; raise ConfigError for a certificate without an authority."""
+        if self.tls_ca is None:
+            if self.tls_certificate or self.tls_key:
+                raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")
+            return None
+        return Tls(self.tls_ca, self.tls_certificate, self.tls_key)
 
-def load_settings(file: Path | None = None, **given: object) -> Settings:
+
+def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if there is one) and the environment.
 
     What is given here and not None wins.
 
     Raises ConfigError, with file, line and column or the name of the flag or variable.
     """
-    path = file or (Path(os.environ["NEDBUS_CONFIG"]) if os.environ.get("NEDBUS_CONFIG") else None)
+    path = Path(file) if file else (Path(os.environ["NEDBUS_CONFIG"]) if os.environ.get("NEDBUS_CONFIG") else None)
     if path is not None and not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     path = path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
     flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     try:
         return _with_file(path)(**flags)
+    except UnicodeDecodeError as exc:
+        raise ConfigError.in_file(path or DEFAULT_FILE, "this is no text in UTF-8") from exc
     except tomllib.TOMLDecodeError as exc:
         raise _toml_error(path or DEFAULT_FILE, exc) from exc
     except ValidationError as exc:
@@ -135,7 +149,7 @@ def _setting_error(path: Path | None, flags: Mapping[str, object], error: Valida
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
     if name in flags:
-        return ConfigError(f"--{name.replace('_', '-')}", reason)
+        return ConfigError(name, reason)
     variable = f"NEDBUS_{name.upper()}"
     if variable in os.environ:
         return ConfigError(variable, reason)

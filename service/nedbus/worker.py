@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -23,6 +23,7 @@ State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 
 _BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s between tries of a source that fails
 _BEHIND: Final = 1.0  # s: a replay that is later than this goes on from where it is, and does not hurry
+_LAP: Final = 0.1  # s that a lap takes at least: a log of one message must not be read thousands of times a second
 _REJECTS_LOGGED: Final = 5  # rejected messages that the log tells of, for each source
 
 
@@ -64,7 +65,7 @@ class Worker:
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
-        self.text = text
+        self.text = text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
         self.source = source
         self._outbox = outbox
         self._stop = stop
@@ -96,8 +97,10 @@ class Worker:
 
     def run(self) -> None:
         """Fly the source, again if it loops or fails, until it is done or stopped."""
+        failures = 0
         try:
             while not self._stop.is_set():
+                start = time.monotonic()
                 try:
                     self._fly()
                 except ClosedError:
@@ -109,38 +112,55 @@ class Worker:
                     self._fail(f"an unexpected {type(exc).__name__}: {exc}")
                 else:
                     if not self.source.loop:
-                        break
+                        self._end("done")
+                        return
+                    failures = 0
+                    self._stop.wait(max(0.0, start + _LAP - time.monotonic()))
                     continue
                 if not self._retry:
-                    self._state = "failed"
+                    self._end("failed")
                     return
-                self._stop.wait(_BACKOFF[min(self._restarts - 1, len(_BACKOFF) - 1)])
-            if not self._stop.is_set():
-                self._state = "done"
-                _log.info("%s: done, %d published, %d rejected", self.text, self._published, self._rejected)
+                self._stop.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
+                failures += 1
         finally:
             self._on_end()
 
+    def _end(self, state: State) -> None:
+        if not self._stop.is_set():
+            self._state = state
+            _log.info("%s: %s, %d published, %d rejected", self.text, state, self._published, self._rejected)
+
     def _fail(self, reason: str) -> None:
+        """Take note, and let go of all addresses: another source may have a use for them meanwhile."""
         self._error = reason
         self._state = "retrying"
         self._restarts += 1
         _log.error("%s", reason)
+        self._keep(())
 
     def _fly(self) -> None:
         flight = self.source.open()
+        first = self._flight is None
         if self._flight is None or self._flight.summary != flight.summary:
             _log.info("%s: %s", self.text, flight.summary)
             for warning in flight.warnings:
                 _log.warning("%s: %s", self.text, warning)
         self._flight, self._done = flight, 0
-        if self.source.wait:
+        if self.source.wait and first:
             self._wait_for_reader(flight)
+        self._keep(flight.addresses)
         for address in flight.addresses:
             if address not in self._publishers:
+                if self._outbox.is_alive(address):
+                    _log.warning("%s: %s is published by somebody else too: readers get both", self.text, address)
                 self._publishers[address] = self._outbox.publisher(address, lossless=self.source.speed is None)
         self._state, self._error = "running", None
         self._replay(flight, self.source.speed)
+
+    def _keep(self, addresses: Sequence[Address]) -> None:
+        """Close the publishers of all other addresses."""
+        for address in set(self._publishers) - set(addresses):
+            self._publishers.pop(address).close()
 
     def _wait_for_reader(self, flight: Flight) -> None:
         self._state = "waiting"

@@ -47,7 +47,7 @@ def test_list_shows_what_is_published(run_nedbus: Start, flying: str) -> None:
 
 def test_echo_prints_a_line_each(run_nedbus: Start, flying: str) -> None:
     """--topic, --vehicle and --count choose; the topic may also be an argument, as in ros2 topic echo."""
-    for arguments in (["--topic", VLP], [VLP], ["/" + VLP]):
+    for arguments in (["--topic", VLP], [VLP], ["/" + VLP], ["1/" + VLP]):
         echo = run_nedbus("echo", "-c", flying, "--count", "20", *arguments)
         assert echo.wait() == 0, echo.err
         lines = echo.out.splitlines()
@@ -103,7 +103,7 @@ def test_get_shows_the_last_message(run_nedbus: Start, flying: str) -> None:
     assert len(machine.out.splitlines()) == 5
     nobody = run_nedbus("get", "-c", flying, "--vehicle", "99")
     assert nobody.wait() == 1
-    assert "nothing arrived on * of vehicle 99" in nobody.err
+    assert "nothing like that is published here" in nobody.err
 
 
 def test_info_shows_the_services(run_nedbus: Start, flying: str) -> None:
@@ -175,7 +175,7 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["echo", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["echo", "vehicle_local_positon"], "topic 'vehicle_local_positon' is not valid: expected one of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
-        (["list", "--connect", "nonsense"], "--connect: 'nonsense' is no endpoint"),
+        (["list", "--connect", "nonsense"], "connect: 'nonsense' is no endpoint"),
     ],
 )
 def test_wrong_name_is_a_usage_error(run_nedbus: Start, endpoint: str, arguments: list[str], text: str) -> None:

@@ -155,10 +155,8 @@ def test_replay_keeps_its_order_and_speed(tmp_path: Path, run_nedbus: Start) -> 
     endpoint = free_endpoint()
     service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=10&wait=1")
     with until_connected(endpoint) as bus:
-        wait_for(bus.services, what="the service")
-        status = bus.services()[0]
-        assert source_of(status)["state"] == "waiting"
-        assert source_of(status)["published"] == 0
+        wait_for(lambda: [source_of(s)["state"] for s in bus.services()] == ["waiting"], what="the service")
+        assert source_of(bus.services()[0])["published"] == 0
         with bus.subscribe(VLP, mode="every") as subscription:
             samples = [subscription.receive(DEADLINE) for _ in range(101)]
     assert [sample.message.x for sample in samples] == list(range(101))
@@ -371,13 +369,13 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
         (["-s", "ulog:"], "source 'ulog:': write it as ulog:FILE"),
         (["-s", "sim:x"], "source 'sim:x': write it as sim:?OPTION=VALUE"),
         (["-s", "sim:?sed=1"], "source 'sim:?sed=1': there is no option 'sed'"),
-        (["-s", "sim:?speed=0"], "speed=0 cannot be: expected a factor above 0"),
+        (["-s", "sim:?speed=0"], "speed=0 cannot be: expected a factor from 0.001"),
         (["-s", "sim:?vehicle=a/b"], "vehicle=a/b cannot be: expected 1 to 64 of A-Z"),
         (["-s", "sim:?speed"], "'speed' is not OPTION=VALUE"),
         (["-s", "sim:", "--until-done"], "until_done: no source ever ends"),
-        (["-s", "sim:", "--listen", "7447"], "--listen: '7447' is no endpoint: write PROTOCOL/HOST:PORT"),
+        (["-s", "sim:", "--listen", "7447"], "listen: '7447' is no endpoint: write PROTOCOL/HOST:PORT"),
         (["-s", "sim:", "--config", "no.toml"], "no.toml: there is no such file"),
-        (["-s", "sim:", "--prefix", "a/*"], "--prefix: prefix 'a/*' is not valid"),
+        (["-s", "sim:", "--prefix", "a/*"], "prefix: prefix 'a/*' is not valid"),
     ],
 )
 def test_wrong_flag_is_a_usage_error(run_nedbus: Start, arguments: list[str], text: str) -> None:

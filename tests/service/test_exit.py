@@ -72,7 +72,7 @@ def flood(endpoint: str) -> Iterator[str]:
 
 
 def assert_gone(process_start: Start, code: str, endpoint: str, expected: int) -> None:
-    process = process_start("-c", code, NEDBUS_CONNECT=endpoint)
+    process = process_start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
     wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
     ended = time.monotonic()
     assert process.wait(10 * LIMIT) == expected, process.err
@@ -111,7 +111,7 @@ print("ready", flush=True)
 for sample in subscription:
     pass
 """
-    process = start("-c", code, NEDBUS_CONNECT=flood)
+    process = start("-c", code, NEDBUS_CONNECT=flood, measured=False)
     wait_for(lambda: "ready" in process.out, what=f"the script: {process.err}")
     process.signal(number)
     signalled = time.monotonic()
@@ -122,7 +122,7 @@ for sample in subscription:
 def test_signal_ends_a_script_that_waits_for_a_router(start: Start) -> None:
     """Ctrl-C ends the wait for a router that is not there."""
     code = 'print("ready", flush=True); import nedbus; nedbus.connect("tcp/127.0.0.1:1", timeout=600)'
-    process = start("-c", code)
+    process = start("-c", code, measured=False)
     wait_for(lambda: "ready" in process.out, what="the script")
     process.signal(signal.SIGINT)
     assert process.wait(10 * LIMIT) in {-signal.SIGINT, 1}
@@ -136,7 +136,7 @@ bus = nedbus.connect()
 bus.publisher("vehicle_local_position", vehicle="mine").publish({"timestamp": 1})
 time.sleep(600)
 """
-    process = start("-c", code, NEDBUS_CONNECT=endpoint)
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
     wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
     process.kill()
     wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from nedbus.bus import Bus
-from nedbus.errors import NoDataError
 from nedbus_msgs import ANY, json_schema, layout_table
 
 from .options import (
@@ -18,9 +17,9 @@ from .options import (
     TopicArgument,
     TopicOption,
     VehicleOption,
+    choose,
     command,
     on_bus,
-    pick_topic,
     tell,
     write,
 )
@@ -57,11 +56,13 @@ def get(
     json_output: JsonOption = False,
 ) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when there is none."""
-    samples = bus.latest(pick_topic(topic, topic_option), vehicle=vehicle, instance=instance)
+    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    samples = bus.latest(wanted.topic, vehicle=wanted.vehicle, instance=wanted.instance)
     for sample in samples:
         write(to_json(sample) if json_output else to_fields(sample))
     if not samples:
-        raise NoDataError(f"{pick_topic(topic, topic_option)} of vehicle {vehicle}", 2.0)
+        tell("nothing like that is published here: 'nedbus list' shows what there is")
+        raise typer.Exit(1)
 
 
 @on_bus

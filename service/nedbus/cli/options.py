@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
@@ -16,7 +17,7 @@ import typer
 from nedbus.bus import Bus
 from nedbus.bus import connect as nedbus_connect
 from nedbus.errors import AddressError, ConfigError, ConnectError, NedbusError
-from nedbus_msgs import ANY
+from nedbus_msgs import ANY, TOPICS
 
 P = ParamSpec("P")
 
@@ -26,7 +27,15 @@ ConnectOption = Annotated[
     typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join (default: tcp/127.0.0.1:7447)"),
 ]
 PrefixOption = Annotated[str | None, typer.Option("--prefix", help="First chunks of every key (default: nedbus)")]
-TopicArgument = Annotated[str | None, typer.Argument(metavar="TOPIC", help="The same as --topic", show_default=False)]
+TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="Authority of tls/ routers, PEM")]
+TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="This client's certificate, PEM")]
+TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of that certificate, PEM")]
+TopicArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="TOPIC", help="TOPIC, or what nedbus list prints: VEHICLE/TOPIC/INSTANCE", show_default=False
+    ),
+]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
@@ -55,6 +64,11 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
             # The reader of a pipe is gone (`| head`): say nothing, and nothing more at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
+        except OSError as exc:
+            tell(f"nedbus: cannot write: {(exc.strerror or str(exc)).lower()}")
+            # What is buffered cannot be written at exit either.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
 
     return run
 
@@ -79,17 +93,32 @@ def _open_bus(
     *,
     connect: ConnectOption = None,
     prefix: PrefixOption = None,
+    tls_ca: TlsCaOption = None,
+    tls_certificate: TlsCertificateOption = None,
+    tls_key: TlsKeyOption = None,
     config: ConfigOption = None,
     wait: WaitOption = False,
 ) -> Bus:
     """Connect as the options say; with `wait` for as long as it takes."""
+
+    def connect_within(seconds: float) -> Bus:
+        return nedbus_connect(
+            connect,
+            timeout=seconds,
+            prefix=prefix,
+            tls_ca=tls_ca,
+            tls_certificate=tls_certificate,
+            tls_key=tls_key,
+            config=config,
+        )
+
     try:
-        return nedbus_connect(connect, timeout=1.0, prefix=prefix, config=config)
+        return connect_within(1.0)
     except ConnectError as exc:
         if not wait:
             raise
         tell(f"{exc}; waiting")
-    return nedbus_connect(connect, timeout=float("inf"), prefix=prefix, config=config)
+    return connect_within(float("inf"))
 
 
 _BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
@@ -107,9 +136,30 @@ def write(line: str) -> None:
     sys.stdout.flush()
 
 
-def pick_topic(argument: str | None, option: str) -> str:
-    """Return the topic that was asked for, as an argument or as an option."""
-    return argument.strip("/") if argument else option or ANY
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What of the bus a command is about."""
+
+    topic: str
+    vehicle: str
+    instance: int | None
+
+
+def choose(argument: str | None, *, topic: str, vehicle: str, instance: int | None) -> Choice:
+    """Return what was asked for: by options, or by an argument as `nedbus list` prints it, [VEHICLE/]TOPIC[/INSTANCE].
+
+    Raises ConfigError when both say something.
+    """
+    if argument is None:
+        return Choice(topic, vehicle, instance)
+    if topic != ANY:
+        raise ConfigError("--topic", f"the topic is given as {argument!r} already: take one away")
+    chunks = argument.strip("/").split("/")
+    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
+        vehicle = chunks.pop(0)
+    if len(chunks) == 2 and chunks[1].isdecimal():
+        instance = int(chunks.pop())
+    return Choice("/".join(chunks), vehicle, instance)
 
 
 def _fail(error: NedbusError, code: int) -> typer.Exit:

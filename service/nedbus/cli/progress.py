@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Final, Self
 
 from nedbus.daemon import Daemon
+from nedbus.session import DEFAULT_ENDPOINT
 from nedbus.worker import WorkerStatus
 
 if TYPE_CHECKING:
@@ -16,11 +17,11 @@ if TYPE_CHECKING:
 _log = logging.getLogger("nedbus")
 _EVERY: Final = 10.0  # s between plain log lines of a replay
 
-HINT: Final = """In a second terminal:
-  nedbus list                       what is published
-  nedbus echo                       every message, a line each
-  nedbus hz                         rate, jitter, latency, loss
-  nedbus get vehicle_local_position all fields of the last message"""
+_HINT: Final = """In a second terminal:
+  nedbus list{where}                        what is published
+  nedbus echo{where}                        every message, a line each
+  nedbus hz{where}                          rate, jitter, latency, loss
+  nedbus get{where} vehicle_local_position  all fields of the last message"""
 
 
 class Display:
@@ -50,7 +51,9 @@ class Display:
         if not self._greeted:
             self._greeted = True
             if self._progress is not None:
-                self._progress.console.print(HINT, highlight=False)
+                known = DEFAULT_ENDPOINT in self._daemon.endpoints
+                where = "" if known else f" -c {self._daemon.endpoints[0]}"
+                self._progress.console.print(_HINT.format(where=where), highlight=False)
         if self._progress is not None:
             for worker in self._daemon.workers:
                 self._show(self._progress, worker)

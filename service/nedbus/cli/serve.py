@@ -17,10 +17,11 @@ import typer
 
 from nedbus import __version__
 from nedbus.daemon import Daemon
+from nedbus.errors import ConfigError
 from nedbus.session import DEFAULT_ENDPOINT, open_router
 from nedbus.settings import load_settings
 
-from .options import ConfigOption, PrefixOption, command
+from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
 from .progress import Display
 
 _log = logging.getLogger("nedbus")
@@ -45,6 +46,9 @@ def serve(
     ] = None,
     listen: ListenOption = None,
     router_config: Annotated[Path | None, typer.Option(help="JSON5 configuration of the embedded router")] = None,
+    tls_ca: TlsCaOption = None,
+    tls_certificate: TlsCertificateOption = None,
+    tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
@@ -57,6 +61,9 @@ def serve(
         connect=connect and tuple(connect),
         listen=listen and tuple(listen),
         router_config=router_config,
+        tls_ca=tls_ca,
+        tls_certificate=tls_certificate,
+        tls_key=tls_key,
         prefix=prefix,
         vehicle=vehicle,
         until_done=until_done,
@@ -75,13 +82,19 @@ def router(
     ] = None,
     *,
     listen: ListenOption = None,
+    connect: Annotated[
+        list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Another router to join")
+    ] = None,
+    config: ConfigOption = None,
 ) -> None:
     """Run a Zenoh router, without sources, for services and scripts to meet at."""
-    endpoints = tuple(listen or (DEFAULT_ENDPOINT,))
+    endpoints = load_settings(config, listen=listen).listen or (DEFAULT_ENDPOINT,)
+    if config_file is not None and (listen or connect):
+        raise ConfigError("CONFIG.json5", "a file says all about the router: drop it, or drop --listen and --connect")
     stop = threading.Event()
 
     def run() -> bool:
-        session = open_router(listen=endpoints, config_file=config_file)
+        session = open_router(listen=endpoints, connect=tuple(connect or ()), config_file=config_file)
         _log.info("router on %s", config_file or ", ".join(endpoints))
         stop.wait()
         session.close()
@@ -125,7 +138,7 @@ def _run_until_signal(
     while thread.is_alive() and time.monotonic() < deadline:
         thread.join(0.05)
     if thread.is_alive():
-        _log.error("a reader that does not read holds the last messages back: they are given up")
+        _log.error("not everything ended in time, perhaps because a reader does not read: what it holds is given up")
         sys.stderr.flush()
         os._exit(1)
     if isinstance(outcome[0], BaseException):

@@ -6,7 +6,9 @@ import json
 import math
 
 from nedbus.subscriber import Sample
-from nedbus_msgs import VehicleLocalPosition
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
+
+_OLD = 1.0  # s of latency that a line tells of: the last value of a stream that ended, or a recovered one
 
 
 def to_line(sample: Sample) -> str:
@@ -15,9 +17,10 @@ def to_line(sample: Sample) -> str:
     position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
     velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
+    old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > _OLD else ""
     return (
         f"{sample.address!s:<38} {message.timestamp / 1e6:12.3f} s  ned {position} m  v {velocity} m/s"
-        f"  hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}  {doubts(message)}{lost}"
+        f"  hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}  {doubts(message)}{old}{lost}"
     )
 
 
@@ -26,7 +29,8 @@ def to_fields(sample: Sample) -> str:
     age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
     lines = [f"{sample.address}{age}"]
     for name, value in sample.message.model_dump().items():
-        lines.append(f"  {name}: {value:.9g}" if isinstance(value, float) else f"  {name}: {value}")
+        # Nine digits tell a float32 apart from all others; ref_lat and ref_lon have more.
+        lines.append(f"  {name}: {value:.9g}" if FIELD_TYPES[name] == "float32" else f"  {name}: {value}")
     return "\n".join([*lines, "---"])
 
 

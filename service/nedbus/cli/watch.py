@@ -23,8 +23,8 @@ from .options import (
     TopicArgument,
     TopicOption,
     VehicleOption,
+    choose,
     on_bus,
-    pick_topic,
     tell,
     write,
 )
@@ -49,11 +49,16 @@ def echo(
 ) -> None:
     """Print every message as it arrives, a line each."""
     show = to_json if json_output else to_fields if full else to_line
-    wanted = pick_topic(topic, topic_option)
+
+    def print_one(sample: Sample) -> bool:
+        write(show(sample))
+        return True
+
+    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     mode: Mode = "latest" if latest else "every"
-    with bus.subscribe(wanted, vehicle=vehicle, instance=instance, mode=mode) as subscription:
+    with bus.subscribe(wanted.topic, vehicle=wanted.vehicle, instance=wanted.instance, mode=mode) as subscription:
         try:
-            _watch(subscription, lambda sample: write(show(sample)), count=count, duration=duration)
+            _watch(subscription, print_one, count=count, duration=duration)
         finally:
             _tell_counts(subscription)
 
@@ -71,9 +76,9 @@ def hz(
     duration: DurationOption = None,
 ) -> None:
     """Measure rate, jitter, latency and loss of each vehicle and topic, every second."""
-    rates = Rates(since=time.time_ns())
-    wanted = pick_topic(topic, topic_option)
-    with bus.subscribe(wanted, vehicle=vehicle, instance=instance, mode="every") as subscription:
+    rates = Rates()
+    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    with bus.subscribe(wanted.topic, vehicle=wanted.vehicle, instance=wanted.instance, mode="every") as subscription:
         _watch(
             subscription,
             rates.add,
@@ -85,13 +90,16 @@ def hz(
 
 def _watch(
     subscription: Subscription,
-    show: Callable[[Sample], object],
+    show: Callable[[Sample], bool],
     *,
     count: int | None,
     duration: float | None,
     each_second: Callable[[], object] | None = None,
 ) -> None:
-    """Show samples until there were enough, or for long enough; raise NoDataError if there were none in that time."""
+    """Show samples until there were enough, or for long enough; raise NoDataError if there were none in that time.
+
+    `show` returns whether a sample counts.
+    """
     start = time.monotonic()
     end = float("inf") if duration is None else start + duration
     tick, told, seen = start + 1.0, False, 0
@@ -106,8 +114,7 @@ def _watch(
             sample = subscription.receive(max(0.0, min(end, tick if each_second else now + 0.5) - now))
         except NoDataError:
             continue
-        seen += 1
-        show(sample)
+        seen += show(sample)
     if each_second is not None and seen:
         each_second()
     if not seen:

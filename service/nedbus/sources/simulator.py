@@ -214,7 +214,7 @@ class SimulatorSource:
         estimate, truth, external = plain
         instances = [Address(self._vehicle, "estimator_local_position", instance) for instance in (0, 1)]
         # In every 100 ticks: 100 estimates, 50 truths, 50 external, 2 of each instance.
-        total = None if self._ticks is None else sum(2 + 2 * (k % 50 == 0) for k in range(self._ticks))
+        total = None if self._ticks is None else 2 * self._ticks + 2 * math.ceil(self._ticks / 50)
         return Flight(
             records=self._records(estimate, truth, external, instances),
             addresses=(estimate, truth, external, *instances),

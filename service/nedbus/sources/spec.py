@@ -27,8 +27,8 @@ class Options(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     vehicle: Annotated[str, AfterValidator(_vehicle)] | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
-    speed: Annotated[float, Field(gt=0, le=1000)] | Literal["max"] = Field(
-        1.0, description="a factor above 0, at most 1000, or max: as fast as readers take it"
+    speed: Annotated[float, Field(ge=0.001, le=1000)] | Literal["max"] = Field(
+        1.0, description="a factor from 0.001 to 1000, or max: as fast as readers take it"
     )
     wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
 
@@ -43,7 +43,9 @@ class SimulatorOptions(Options):
     """Options of `sim:`."""
 
     seed: int = Field(0, description="a whole number: same seed, same flight")
-    duration: Annotated[float, Field(gt=0)] | None = Field(None, description="seconds above 0; endless without it")
+    duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
+        None, description="seconds, 0.01 to 1e8; endless without it"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,19 +88,25 @@ def parse_source(text: str) -> SourceSpec:
     kind_name, _, rest = text.partition(":")
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
-        raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: choose from {', '.join(SOURCE_KINDS)}")
+        hint = (
+            f"write ulog:{text}"
+            if text.partition("?")[0].endswith(".ulg")
+            else f"choose from {', '.join(SOURCE_KINDS)}"
+        )
+        raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     if bool(target) != bool(kind.target):
         form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
         raise ConfigError(f"source {text!r}", f"write it as {form}")
     try:
-        options = kind.options.model_validate(
-            dict(parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query)))
-        )
+        given = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
+        options = kind.options.model_validate(dict(given))
     except ValidationError as exc:
         raise ConfigError(f"source {text!r}", _explain(exc, kind)) from exc
     except ValueError:
         raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE") from None
+    if len(dict(given)) < len(given):
+        raise ConfigError(f"source {text!r}", "an option is given twice: take one away")
     return SourceSpec(text, kind_name, target, options)
 
 

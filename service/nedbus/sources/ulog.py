@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
 import heapq
-import io
 import threading
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
+import pyulog.core
 from pyulog import ULog, ULogException
 
 from nedbus.errors import AddressError, SourceError
@@ -22,8 +22,10 @@ from .record import Flight, Record
 from .spec import UlogOptions
 
 _GAP: Final = 60_000_000  # us: a longer silence in a log is a damaged timestamp, not something to wait for
-_stdout_lock = threading.Lock()  # pyulog prints its warnings, and stdout is one for the process
 
+_HEAD: Final = 3  # bytes before each message of a log
+_READ: Final = 4096  # what a read costs, in bytes, however little it reads
+_PATIENCE: Final = 2**31  # what reading a damaged log may cost, beside what its size makes plausible
 _CHUNK: Final = 1000  # rows that are turned into Python values at a time
 
 _KNOWN: Final = frozenset(name for layout in LAYOUTS.values() for name in layout.fields)
@@ -51,7 +53,7 @@ class UlogSource:
     """A .ulg file; `open` reads its local position topics into memory."""
 
     def __init__(self, path: str, options: UlogOptions, *, vehicle: str) -> None:
-        self._path = Path(path)
+        self._path = Path(path).expanduser()
         self._vehicle = options.vehicle
         self._default_vehicle = vehicle
         self.finite = not options.loop
@@ -100,19 +102,61 @@ class UlogSource:
         )
 
 
+class _Watched:
+    """A file that is read only so much, as pyulog can go round in circles in a damaged one; it tells if it was cut."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self.cut = False
+        self._file = file
+        self._left = _PATIENCE + 1000 * size
+        self.seek = file.seek
+        self.tell = file.tell
+        self.close = file.close
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size)
+        self._left -= _READ + len(data)
+        # The only read that may find nothing is that of the next message's head.
+        if len(data) < size and (data or size != _HEAD):
+            self.cut = True
+        if self._left < 0:
+            raise ULogException("Invalid structure: its parts lead round in circles")
+        return data
+
+
+class _Said(threading.local):
+    """What pyulog said in this thread; it prints, and standard output is not a library's."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+
+_said = _Said()
+
+
+def _note(*words: object) -> None:
+    _said.lines.append(" ".join(map(str, words)))
+
+
+pyulog.core.print = _note
+
+
 def _read(path: Path) -> tuple[ULog, list[str]]:
     """Return the log, and what its reader says is wrong with it."""
-    with _stdout_lock, contextlib.redirect_stdout(io.StringIO()) as said:
-        try:
-            with path.open("rb") as file:
-                log = ULog(file, list(TOPICS))
-        except OSError as exc:
-            raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
-        except ULogException as exc:
-            raise SourceError(str(path), f"this is no ULog file that can be read ({exc})") from exc
-    warnings = [f"damaged: {line}" for line in said.getvalue().splitlines()[:5]]
+    _said.lines = []
+    try:
+        with path.open("rb") as file:
+            watched = _Watched(file, path.stat().st_size)
+            log = ULog(watched, list(TOPICS))
+    except OSError as exc:
+        raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
+    except ULogException as exc:
+        raise SourceError(str(path), f"this is no ULog file that can be read ({exc})") from exc
+    warnings = [f"damaged: {line}" for line in _said.lines[:5]]
     if log.file_corruption and not warnings:
         warnings.append("damaged: parts of it were skipped")
+    elif watched.cut:
+        warnings.append("cut: it ends inside a message")
     return log, warnings
 
 
@@ -146,9 +190,21 @@ def _values(name: str, column: npt.NDArray[np.generic]) -> list[object]:
 def _order(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
     """Return timestamps that never go back, changing as few as possible: one stray must not delay all the others."""
     times = timestamps.astype(np.uint64)
-    raised = np.maximum.accumulate(times)
-    lowered = np.minimum.accumulate(times[::-1])[::-1]
-    return raised if np.count_nonzero(raised != times) <= np.count_nonzero(lowered != times) else lowered
+    if not np.any(times[1:] < times[:-1]):
+        return times
+    # The longest run of rows that are in order keeps its times; each other row takes that of the one before it.
+    tails: list[int] = []  # the smallest time that ends a run, by the length of the run
+    length: list[int] = []  # of the longest run that ends with each row
+    for time in times.tolist():
+        place = bisect_right(tails, time)
+        tails[place : place + 1] = [time]
+        length.append(place)
+    wanted, keep = len(tails) - 1, np.zeros(len(times), dtype=bool)
+    for row in range(len(times) - 1, -1, -1):
+        if length[row] == wanted:
+            keep[row], wanted = True, wanted - 1
+    first = times[np.argmax(keep)]
+    return np.maximum.accumulate(np.where(keep, times, first))
 
 
 def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.float64]], int]:
