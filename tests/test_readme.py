@@ -25,13 +25,13 @@ def test_first_script_is_the_example() -> None:
     assert len(example.splitlines()) == 8
 
 
-COMMANDS = sorted(set(re.findall(r"^nedbus (\w+)([^#\n]*)", "\n".join(blocks("bash")), re.MULTILINE)))
+COMMANDS = sorted(set(re.findall(r"^nedbus ((?:pki )?\w+)([^#\n]*)", "\n".join(blocks("bash")), re.MULTILINE)))
 
 
 @pytest.mark.parametrize(("command", "arguments"), COMMANDS)
 def test_shown_command_exists(run_nedbus: Start, command: str, arguments: str) -> None:
     """Every command of the README exists, with the flags that are shown; every source can be parsed."""
-    overview = run_nedbus(command, "--help", COLUMNS="200")
+    overview = run_nedbus(*command.split(), "--help", COLUMNS="200")
     assert overview.wait() == 0
     for flag in re.findall(r"--[a-z-]+", arguments):
         assert flag in overview.out

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy"},
+    | {"pyulog", "numpy", "cryptography"},
 }
 ONLY = {  # packages that only these files import
     "zenoh": {"session", "publisher", "subscriber"},
@@ -20,11 +20,13 @@ ONLY = {  # packages that only these files import
     "pyulog": {"ulog"},
     "numpy": {"ulog"},
     "pydantic_settings": {"settings"},
-    "typer": {"__init__", "options", "look", "watch", "serve"},
+    "typer": {"__init__", "certificates", "options", "look", "watch", "serve"},
     "rich": {"progress"},
+    "cryptography": {"pki", "certificates"},
 }
 ORDER = [  # each may import those before it only
-    "errors", "session", "settings", "publisher", "subscriber", "rates", "bus", "sources", "worker", "daemon", "cli",
+    "errors", "pki", "session", "settings", "publisher", "subscriber", "rates", "bus", "sources", "worker", "daemon",
+    "cli",
 ]  # fmt: skip
 
 FILES = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])

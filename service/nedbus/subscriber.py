@@ -132,7 +132,7 @@ class Intake:
         self._newest: dict[str, zenoh.Sample] = {}
         self._misses: deque[zenoh.ext.Miss] = deque()
         self._tracks: dict[str, _Track] = {}  # by publisher
-        self._current: dict[str, _Track] = {}  # by key: the publisher that sent the last sample
+        self._single: dict[str, _Track | None] = {}  # by key: its publisher, None once there were several
         self._lost_before: dict[str, int] = {}  # by key: lost since the last sample that was read
         self._received = self._lost = self._dropped = self._invalid = 0
 
@@ -286,7 +286,7 @@ class Intake:
         if info is None:
             return
         number = info.source_sn
-        track = self._current.get(key)
+        track = self._single.get(key)
         if track is not None and number == track.last + 1:
             track.last = number
             return
@@ -297,7 +297,7 @@ class Intake:
             if len(self._tracks) >= _KEYS:
                 return
             self._tracks[source] = track
-        self._current[key] = track
+        self._single[key] = track if self._single.get(key, track) is track else None
         gap = max(0, number - track.last - 1)
         track.last = max(track.last, number)
         # A channel that holds back loses nothing: then all of a gap was lost on the way.

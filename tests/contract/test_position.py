@@ -184,3 +184,13 @@ def test_json_schema_describes_the_json() -> None:
         {"enum": ["NaN", "Infinity", "-Infinity"], "type": "string"},
     ]
     assert schema["additionalProperties"] is False
+
+
+def test_messages_are_equal_by_their_values() -> None:
+    """NaN is the same as NaN here: a message equals its own copy, and can be found in a set."""
+    one, two = VehicleLocalPosition(timestamp=1, x=0.5), VehicleLocalPosition(timestamp=1, x=0.5)
+    assert one == two
+    assert len({one, two}) == 1
+    assert one != VehicleLocalPosition(timestamp=1, x=0.5, delta_xy=(0.0, math.nan))
+    assert one != VehicleLocalPosition(timestamp=1)
+    assert one != "message"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import pytest
 import zenoh
 from hypothesis import given
@@ -126,3 +128,24 @@ def test_impossible_prefix_is_refused(prefix: str) -> None:
     """Prefixes are plain chunks."""
     with pytest.raises(AddressError, match="prefix"):
         check_prefix(prefix)
+
+
+@pytest.mark.parametrize("instance", [-1, 256, True, "0"])
+def test_impossible_instance_is_refused_in_a_selection(instance: int) -> None:
+    """What cannot be published cannot be subscribed to either."""
+    with pytest.raises(AddressError, match="instance"):
+        selection("estimator_local_position", instance=instance)
+
+
+def test_alive_key_must_be_one() -> None:
+    """A data key is no liveliness token."""
+    with pytest.raises(AddressError):
+        address_of_alive_key("nedbus/7/vehicle_local_position")
+
+
+def test_errors_can_be_pickled() -> None:
+    """Errors cross process pools with their text and their facts."""
+    with pytest.raises(AddressError) as info:
+        Address("a b", "vehicle_local_position")
+    again = pickle.loads(pickle.dumps(info.value))
+    assert (type(again), str(again), again.given) == (AddressError, str(info.value), "a b")

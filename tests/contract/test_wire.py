@@ -205,3 +205,12 @@ def test_doubles_of_the_origin_survive() -> None:
     message = VehicleLocalPosition(timestamp=1, ref_lat=math.nextafter(47.0, 48.0), ref_lon=-math.nextafter(8.0, 9.0))
     read = decode(encode(message))
     assert (read.ref_lat, read.ref_lon) == (message.ref_lat, message.ref_lon)
+
+
+def test_deep_nesting_is_refused() -> None:
+    """An array nested a thousand deep is refused before anything prints it: that would exhaust the stack."""
+    deep = b"\x91" * 400 + b"\x01"
+    values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
+    values[6] = deep
+    with pytest.raises(DecodeError, match="x: an array within an array"):
+        decode(b"\xdc\x00\x36\x01" + b"".join(values))

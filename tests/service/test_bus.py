@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import logging
 import math
@@ -396,3 +397,157 @@ def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
         return turns
 
     assert asyncio.run(scenario()) > 5
+
+
+def test_latest_keeps_the_newest_of_a_quiet_key(client: Client, bus: nedbus.Bus) -> None:
+    """A busy vehicle does not push a quiet one out while the reader pauses, and everything is counted."""
+    busy, quiet = (bus.publisher(VLP, vehicle=vehicle) for vehicle in ("busy", "quiet"))
+    busy.publish(message(1))
+    subscription = client.subscribe(VLP)
+    assert subscription.receive(DEADLINE).vehicle == "busy"
+    quiet.publish(message(1))
+    for timestamp in range(2, 6001):
+        busy.publish(message(timestamp))
+    wait_for(lambda: sum(vars_of(subscription.counts)) >= 5999, what="all but the two newest to be counted")
+    newest = {sample.vehicle: sample.message.timestamp for sample in subscription.take(2)}
+    assert newest == {"busy": 6000, "quiet": 1}
+    counts = subscription.counts
+    assert counts.received + counts.dropped + counts.lost == 6001
+
+
+def vars_of(counts: nedbus.Counts) -> tuple[int, ...]:
+    return counts.received, counts.lost, counts.dropped, counts.invalid
+
+
+def test_counts_survive_a_restart_of_the_publisher(client: Client, endpoint: str) -> None:
+    """Another publisher of the same key starts its own sequence: nothing is lost, nothing is dropped."""
+    subscription = client.subscribe(VLP, mode="every")
+    for start in (1, 1001):
+        with nedbus.connect(endpoint) as other:
+            publisher = other.publisher(VLP, vehicle="1")
+            wait_for_reader(other._session, publisher.key)
+            for timestamp in range(start, start + 1000):
+                publisher.publish(message(timestamp))
+            taken = subscription.take(1000)
+        assert [sample.message.timestamp for sample in taken] == list(range(start, start + 1000))
+        assert not any(sample.lost for sample in taken)
+    assert subscription.counts == nedbus.Counts(received=2000)
+
+
+def test_two_publishers_of_one_key_lose_nothing(client: Client, bus: nedbus.Bus, endpoint: str) -> None:
+    """Their sequences are followed apart."""
+    subscription = client.subscribe(VLP, mode="every")
+    with nedbus.connect(endpoint) as other:
+        publishers = [each.publisher(VLP, vehicle="1") for each in (bus, other)]
+        wait_for_reader(other._session, publishers[1].key)
+        wait_for_reader(bus._session, publishers[0].key)
+        for timestamp in range(1, 501):
+            for publisher in publishers:
+                publisher.publish(message(timestamp))
+        taken = subscription.take(1000)
+    assert sum(sample.lost for sample in taken) == 0
+    assert subscription.counts == nedbus.Counts(received=1000)
+
+
+def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
+    """A plain get is answered by whoever publishes the key, also when another publishes the same vehicle."""
+    with nedbus.connect(endpoint) as other:
+        bus.publisher(VLP, vehicle="1").publish(message(1))
+        other.publisher("external_ins_local_position", vehicle="1").publish(message(2))
+        for key in ("nedbus/1/vehicle_local_position", "nedbus/1/external_ins_local_position"):
+            wait_for(lambda key=key: [reply.ok for reply in raw.get(key)], what=key)  # type: ignore[misc] # bound now
+
+
+def test_closed_publisher_is_gone(client: Client, bus: nedbus.Bus) -> None:
+    """A publisher that was closed is not listed, answers no more, refuses to publish, and makes room for another."""
+    publisher = client.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    wait_for(bus.latest, what="the message")
+    publisher.close()
+    publisher.close()
+    assert client.latest() == []
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    with pytest.raises(nedbus.ClosedError):
+        publisher.publish(message(2))
+    with client.publisher(VLP, vehicle="1") as again:
+        again.publish(message(3))
+
+
+def test_publisher_keeps_its_bus_open(endpoint: str, bus: nedbus.Bus) -> None:
+    """A script may hold the publisher alone."""
+    publisher = nedbus.connect(endpoint).publisher(VLP, vehicle="1")
+    gc.collect()
+    publisher.publish(message(1))
+    wait_for(bus.latest, what="the message")
+    publisher._owner.close()  # type: ignore[attr-defined] # it is the bus
+
+
+def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
+    """A receive that times out has taken nothing."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+
+    async def scenario() -> list[int]:
+        taken: list[int] = []
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            taken.append((await subscription.receive(DEADLINE)).message.timestamp)
+            for timestamp in range(2, 641):
+                publisher.publish(message(timestamp))
+            while taken[-1] != 640:
+                try:
+                    taken.append((await subscription.receive(0.0001)).message.timestamp)
+                except nedbus.NoDataError:
+                    continue
+        return taken
+
+    assert asyncio.run(scenario()) == list(range(1, 641))
+
+
+def test_unknown_layout_does_not_hold_the_reader(client: Client, raw: Session, bus: nedbus.Bus) -> None:
+    """Twenty layouts that nobody explains cost the reader nothing but counts."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = client.subscribe(VLP, mode="every")
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    for layout in range(100, 120):
+        raw.put("nedbus/2/vehicle_local_position", msgpack.packb([layout, 1, 2]))
+    wait_for(lambda: subscription.counts.invalid == 20, what="twenty invalid payloads")
+
+
+def test_hostile_answers_do_not_reach_a_script(client: Client, raw: Session) -> None:
+    """A status that is no JSON, or nested without end, is left out."""
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply("nedbus/@service/evil/status", b"[" * 100_000)
+
+    queryable = raw.declare_queryable("nedbus/@service/evil/status", zenoh.handlers.Callback(reply, indirect=False))
+    assert client.services() == []
+    queryable.undeclare()
+
+
+def test_junk_does_not_displace_a_waiting_sample(client: Client, raw: Session, bus: nedbus.Bus) -> None:
+    """Mode "latest" gives the newest valid sample, though junk came after it on the same key."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = client.subscribe(VLP)
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    publisher.publish(message(2))
+    raw.put(publisher.key, b"junk")
+    wait_for(lambda: subscription.counts.invalid == 1, what="the junk to be counted")
+    assert subscription.receive(DEADLINE).message.timestamp == 2
+
+
+def test_wrong_mode_is_refused(client: Client) -> None:
+    """A typo in the mode must not become another mode."""
+    with pytest.raises(nedbus.AddressError, match="mode 'newest' is not valid: expected one of latest, every"):
+        client.subscribe(mode="newest")  # type: ignore[arg-type] # that it is wrong is the test
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
+def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
+    """None of these is an error of another library."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    bus.latest(timeout=timeout)
+    bus.vehicles(timeout=timeout)
+    assert bus.subscribe().receive(timeout if timeout > 0 else None).message.timestamp == 1

@@ -237,3 +237,24 @@ def test_echo_tells_what_was_lost_or_invalid(run_nedbus: Start, endpoint: str, b
     publisher.publish(message(2))
     assert echo.wait() == 0
     assert "2 received, 0 lost, 0 dropped, 1 invalid" in echo.err
+
+
+def test_ended_stream_is_told_apart(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A last value is marked as old by echo, and is nothing that hz could measure."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(lambda: any((sample.latency or 0) > 1.1 for sample in bus.latest()), what="the message to be old")
+    echo = run_nedbus("echo", "-c", endpoint, "-n", "1")
+    assert echo.wait() == 0
+    assert " s old]" in echo.out
+    hz = run_nedbus("hz", "-c", endpoint, "-d", "1.5")
+    assert hz.wait() == 1
+    assert "nothing arrived" in hz.err
+
+
+def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus) -> None:
+    """An output that cannot be written is an error, not a traceback."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(bus.latest, what="the message")
+    command = f"{sys.executable} -m nedbus get -c {endpoint} > /dev/full"
+    ended = subprocess.run(["bash", "-c", command], capture_output=True, timeout=DEADLINE, check=False, text=True)
+    assert (ended.returncode, ended.stderr) == (1, "nedbus: cannot write: no space left on device\n")

@@ -464,3 +464,58 @@ def test_schema_is_on_the_network(run_nedbus: Start, raw: Session, endpoint: str
     assert isinstance(layouts, list)
     current = next(layout for layout in layouts if layout["wire"] == 1)
     assert [field["name"] for field in current["fields"]] == list(VehicleLocalPosition.model_fields)
+
+
+def test_loop_of_one_message_does_not_spin(tmp_path: Path, run_nedbus: Start) -> None:
+    """A lap takes a moment, however short the log is."""
+    path = write_log(tmp_path / "a.ulg", [0])
+    endpoint = free_endpoint()
+    run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}?loop=1")
+    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        sent = [subscription.receive(DEADLINE).sent or 0 for _ in range(6)]
+    assert sent[5] - sent[1] > 0.35e9
+
+
+def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """Two services of one vehicle mix two flights: the second says so."""
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    wait_for(bus.latest, what="the first service")
+    second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    wait_for(lambda: "is published by somebody else too" in second.err, what="the warning")
+
+
+def test_failing_source_lets_go_of_its_addresses(tmp_path: Path, run_nedbus: Start) -> None:
+    """A source that conflicts in one topic does not keep the others from a third."""
+    writer = UlogWriter()
+    writer.define([VLP, "external_ins_local_position"])
+    writer.add(VLP, message(1))
+    writer.add("external_ins_local_position", message(2))
+    both = writer.write(tmp_path / "both.ulg")
+    one = write_log(tmp_path / "one.ulg", [1], topic="external_ins_local_position", vz=7.0)
+    ins = write_log(tmp_path / "vlp.ulg", range(0, 10**9, 10**6))
+    endpoint = free_endpoint()
+    run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{ins}")
+    service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{ins}", "-s", f"ulog:{both}", "-s", f"ulog:{one}")
+    with until_connected(endpoint) as bus:
+        wait_for(
+            lambda: [s.message.vz for s in bus.latest("external_ins_local_position")] == [7.0],
+            what=f"the third source: {service.err}",
+        )
+
+
+def test_contradicting_settings_are_refused(tmp_path: Path, run_nedbus: Start) -> None:
+    """A router file and an endpoint say two things: neither is silently ignored."""
+    file = tmp_path / "router.json5"
+    file.write_text("{}")
+    for flag in ("--connect", "--listen"):
+        service = run_nedbus("serve", "-s", "sim:", "--router-config", str(file), flag, free_endpoint())
+        assert service.wait() == 2
+        assert "router_config: a file says all about the embedded router" in service.err
+
+
+@pytest.mark.parametrize("option", ["duration=inf", "duration=1e308", "speed=1e-300", "speed=nan", "seed=1&seed=2"])
+def test_extreme_options_are_usage_errors(run_nedbus: Start, option: str) -> None:
+    """No option ends in a traceback."""
+    service = run_nedbus("serve", "-s", f"sim:?{option}")
+    assert service.wait() == 2
+    assert len(service.err.splitlines()) == 1

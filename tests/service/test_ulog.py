@@ -236,3 +236,13 @@ def test_log_without_the_topics_is_a_clear_error(tmp_path: Path) -> None:
     """A log of something else says so."""
     with pytest.raises(SourceError, match="no message of the local position topics is in this log"):
         open_log(write_log(tmp_path / "a.ulg", [1], topic="something_else"))
+
+
+def test_log_that_leads_round_in_circles_ends(tmp_path: Path) -> None:
+    """A size that points back into what was read already must not hold a source for ever."""
+    writer = UlogWriter()
+    for number in range(3000):
+        writer.define([f"topic_{number:05d}"], without=list(FIELD_TYPES)[3:])
+    writer.data += b"\x60\xea\x00" + b"\x60\xea\x00"
+    with pytest.raises(SourceError):
+        open_log(writer.write(tmp_path / "a.ulg"))

@@ -11,6 +11,7 @@ import typer
 
 from nedbus import __version__
 
+from .certificates import pki
 from .look import get, info, list_, schema
 from .options import write
 from .serve import router, serve
@@ -37,6 +38,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
 }
 for _name, _function in _COMMANDS.items():
     app.command(_name)(_function)
+app.add_typer(pki, name="pki")
 
 
 def main() -> None:

@@ -1,0 +1,206 @@
+"""config/router-secure.json5 and `nedbus pki`: who may do what, proved by what arrives; denials are silent in Zenoh."""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import nedbus
+from nedbus.pki import make_authority, make_certificate
+from nedbus.session import open_router
+from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+
+CONFIG = Path(__file__).parents[2] / "config"
+VLP = "vehicle_local_position"
+
+Join = Callable[[str], nedbus.Bus]
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make the certificates of a small fleet, and some that must not work."""
+    folder = tmp_path_factory.mktemp("pki")
+    make_authority(folder)
+    make_certificate(folder, "router", hosts=["127.0.0.1", "localhost"])
+    for name in ("vehicle-1", "vehicle-2", "reader", "operator"):
+        make_certificate(folder, name)
+    make_certificate(folder, "expired", days=-1)
+    make_authority(folder / "foreign")
+    make_certificate(folder / "foreign", "reader")
+    return folder
+
+
+@pytest.fixture
+def secure(pki: Path, tmp_path: Path) -> Iterator[str]:
+    """Run a router on the shipped configuration, with these certificates on a free port."""
+    endpoint = free_endpoint().replace("tcp/", "tls/")
+    text = (CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(pki))
+    file = tmp_path / "router-secure.json5"
+    file.write_text(text.replace("tls/0.0.0.0:7447", endpoint))
+    session = open_router(config_file=file)
+    yield endpoint
+    session.close()
+
+
+@pytest.fixture
+def join(secure: str, pki: Path) -> Iterator[Join]:
+    """Connect as somebody."""
+    opened: list[nedbus.Bus] = []
+
+    def join_as(name: str) -> nedbus.Bus:
+        ca, certificate, key = (pki / file for file in ("ca.crt", f"{name}.crt", f"{name}.key"))
+        bus = nedbus.connect(secure, tls_ca=ca, tls_certificate=certificate, tls_key=key, timeout=DEADLINE)
+        opened.append(bus)
+        return bus
+
+    yield join_as
+    for bus in opened:
+        bus.close()
+
+
+def test_vehicle_is_read_whole(join: Join) -> None:
+    """Through the secure router everything works as through an open one: data, liveliness, last values, recovery."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    reader = join("reader")
+    wait_for(lambda: reader.latest(VLP), what="the last value")
+    wait_for(lambda: "1" in reader.vehicles(), what="the vehicle")
+    with reader.subscribe(mode="every") as subscription:
+        assert subscription.receive(DEADLINE).message.timestamp == 1
+        for timestamp in range(2, 500):
+            publisher.publish(message(timestamp))
+        assert [subscription.receive(DEADLINE).message.timestamp for _ in range(2, 500)] == list(range(2, 500))
+
+
+@pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])
+def test_nobody_else_writes_a_vehicles_keys(join: Join, intruder: str) -> None:
+    """What an intruder publishes as vehicle 1 reaches nobody: no data, no liveliness, no last value."""
+    genuine = join("vehicle-1").publisher(VLP, vehicle="1")
+    genuine.publish(message(1))
+    reader = join("reader")
+    with reader.subscribe(mode="every") as subscription:
+        assert subscription.receive(DEADLINE).message.timestamp == 1
+        other = join(intruder)
+        other.publisher(VLP, vehicle="1").publish(message(666))
+        other.publisher(VLP, vehicle="3").publish(message(667))
+        genuine.publish(message(2))
+        assert subscription.receive(DEADLINE).message.timestamp == 2
+        genuine.publish(message(3))
+        assert subscription.receive(DEADLINE).message.timestamp == 3
+        assert [sample.message.timestamp for sample in reader.latest()] == [3]
+        assert list(reader.vehicles()) == ["1"]
+
+
+def test_vehicle_does_not_read_others(join: Join) -> None:
+    """A vehicle's certificate is for writing: it gets no data, from another vehicle's keys or its own."""
+    join("vehicle-1").publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(join("reader").latest, what="the message")
+    assert join("vehicle-2").latest() == []
+
+
+def test_only_operators_see_the_admin_space(join: Join) -> None:
+    """Who is connected is for operators to ask."""
+    operator, reader = join("operator"), join("reader")
+    wait_for(lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer to the operator")
+    assert [reply.ok for reply in reader._session.get("@/*/router")] == []
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate"),
+    [
+        ("ca.crt", None),  # no certificate
+        ("ca.crt", "foreign/reader"),  # signed by somebody else
+        ("foreign/ca.crt", "reader"),  # trusts somebody else
+        ("ca.crt", "expired"),
+    ],
+)
+def test_stranger_is_refused_with_a_hint(secure: str, pki: Path, ca: str, certificate: str | None) -> None:
+    """The error says what to check, as Zenoh says nothing."""
+    own, key = (None, None) if certificate is None else (pki / f"{certificate}.crt", pki / f"{certificate}.key")
+    with pytest.raises(nedbus.ConnectError, match=r"check that tls_ca is the router's authority"):
+        nedbus.connect(secure, tls_ca=pki / ca, tls_certificate=own, tls_key=key, timeout=0.3)
+
+
+def test_plain_tcp_is_refused(secure: str) -> None:
+    """The secure router speaks TLS only."""
+    with pytest.raises(nedbus.ConnectError):
+        nedbus.connect(secure.replace("tls/", "tcp/"), timeout=0.3)
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate", "key", "reason"),
+    [
+        (None, "vehicle-1.crt", "vehicle-1.key", "tls_ca: a certificate is given, but not"),
+        ("ca.crt", None, "vehicle-1.key", "a certificate needs its key"),
+        ("gone.crt", None, None, "gone.crt cannot be read"),
+    ],
+)
+def test_half_a_setting_is_refused(
+    pki: Path, ca: str | None, certificate: str | None, key: str | None, reason: str
+) -> None:
+    """A missing half or file is told before anything is dialled."""
+    paths = [pki / file if file else None for file in (ca, certificate, key)]
+    with pytest.raises(nedbus.ConfigError, match=reason):
+        nedbus.connect("tls/127.0.0.1:1", timeout=0.1, tls_ca=paths[0], tls_certificate=paths[1], tls_key=paths[2])
+
+
+def test_commands_use_certificates(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """The service and the commands take the same three files, as flags or from the environment."""
+    vehicle = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/vehicle-1.crt", f"--tls-key={pki}/vehicle-1.key"]
+    run_nedbus("serve", "--connect", secure, *vehicle, "-s", "sim:")
+    environment = {
+        "NEDBUS_TLS_CA": f"{pki}/ca.crt",
+        "NEDBUS_TLS_CERTIFICATE": f"{pki}/reader.crt",
+        "NEDBUS_TLS_KEY": f"{pki}/reader.key",
+    }
+    echo = run_nedbus("echo", "-c", secure, "-n", "20", **environment)
+    assert echo.wait() == 0, echo.err
+    assert len(echo.out.splitlines()) == 20
+    info = run_nedbus("info", "-c", secure, **environment)
+    assert info.wait() == 0
+    assert "sim:" in info.out
+
+
+def test_pki_commands_never_overwrite(tmp_path: Path, run_nedbus: Start) -> None:
+    """Keys are made once, for their owner only, and never shown."""
+    folder = tmp_path / "pki"
+    assert run_nedbus("pki", "cert", str(folder), "reader").wait() == 1
+    for arguments in (["ca", str(folder)], ["cert", str(folder), "router", "--host", "127.0.0.1", "--host", "gcs"]):
+        made = run_nedbus("pki", *arguments)
+        assert made.wait() == 0, made.err
+        key = Path(made.out.splitlines()[0])
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        before = key.read_bytes()
+        assert b"PRIVATE KEY" in before
+        assert "PRIVATE" not in made.out + made.err
+        again = run_nedbus("pki", *arguments)
+        assert again.wait() == 1
+        assert "it is not overwritten" in again.err
+        assert key.read_bytes() == before
+    assert run_nedbus("pki", "cert", str(folder), "../evil").wait() == 1
+
+
+def test_every_setting_of_the_router_files_has_a_reason() -> None:
+    """Each line that sets something stands below or beside a comment, or within a block that has one."""
+    for name in ("router.json5", "router-secure.json5"):
+        text = (CONFIG / name).read_text()
+        assert len(re.findall(r"^\s*//", text, re.MULTILINE)) > 10
+        open_words = re.findall(r"^  (\w+):", text, re.MULTILINE)
+        assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(open_words)
+
+
+def test_open_router_file_works() -> None:
+    """config/router.json5 starts a router that needs nothing else."""
+    endpoint = free_endpoint()
+    file = CONFIG / "router.json5"
+    copy = Path("router.json5")
+    copy.write_text(file.read_text().replace("tcp/0.0.0.0:7447", endpoint))
+    session = open_router(config_file=copy)
+    with nedbus.connect(endpoint) as bus:
+        bus.publisher(VLP, vehicle="1").publish(message(1))
+        wait_for(bus.latest, what="the message")
+    session.close()
