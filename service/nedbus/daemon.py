@@ -71,6 +71,11 @@ class Daemon:
             self.endpoints = (str(settings.router_config),)
 
     @property
+    def until_done(self) -> bool:
+        """Whether it ends when its finite sources have ended."""
+        return self._settings.until_done
+
+    @property
     def status(self) -> ServiceStatus:
         """What the service is doing now."""
         return ServiceStatus(

@@ -67,6 +67,7 @@ class Worker:
     ) -> None:
         self.text = text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
         self.source = source
+        self._name = self.text.rstrip(":")  # as the log says it
         self._outbox = outbox
         self._stop = stop
         self._retry = retry
@@ -108,7 +109,7 @@ class Worker:
                 except NedbusError as exc:
                     self._fail(str(exc))
                 except Exception as exc:  # noqa: BLE001 - a fault in one source must not stop the others
-                    _log.exception("%s: an unexpected error", self.text)
+                    _log.exception("%s: an unexpected error", self._name)
                     self._fail(f"an unexpected {type(exc).__name__}: {exc}")
                 else:
                     if not self.source.loop:
@@ -128,7 +129,7 @@ class Worker:
     def _end(self, state: State) -> None:
         if not self._stop.is_set():
             self._state = state
-            _log.info("%s: %s, %d published, %d rejected", self.text, state, self._published, self._rejected)
+            _log.info("%s: %s, %d published, %d rejected", self._name, state, self._published, self._rejected)
 
     def _fail(self, reason: str) -> None:
         """Take note, and let go of all addresses: another source may have a use for them meanwhile."""
@@ -142,9 +143,9 @@ class Worker:
         flight = self.source.open()
         first = self._flight is None
         if self._flight is None or self._flight.summary != flight.summary:
-            _log.info("%s: %s", self.text, flight.summary)
+            _log.info("%s: %s", self._name, flight.summary)
             for warning in flight.warnings:
-                _log.warning("%s: %s", self.text, warning)
+                _log.warning("%s: %s", self._name, warning)
         self._flight, self._done = flight, 0
         if self.source.wait and first:
             self._wait_for_reader(flight)
@@ -152,7 +153,7 @@ class Worker:
         for address in flight.addresses:
             if address not in self._publishers:
                 if self._outbox.is_alive(address):
-                    _log.warning("%s: %s is published by somebody else too: readers get both", self.text, address)
+                    _log.warning("%s: %s is published by somebody else too: readers get both", self._name, address)
                 self._publishers[address] = self._outbox.publisher(address, lossless=self.source.speed is None)
         self._state, self._error = "running", None
         self._replay(flight, self.source.speed)
@@ -164,7 +165,7 @@ class Worker:
 
     def _wait_for_reader(self, flight: Flight) -> None:
         self._state = "waiting"
-        _log.info("%s: waiting for a subscriber", self.text)
+        _log.info("%s: waiting for a subscriber", self._name)
         while not self._outbox.is_read(flight.addresses) and not self._stop.wait(0.05):
             pass
 
@@ -174,7 +175,7 @@ class Worker:
             if speed is not None:
                 early = start + record.due / speed - time.monotonic()
                 if early < -_BEHIND:
-                    _log.warning("%s: %.1f s late, going on from here", self.text, -early)
+                    _log.warning("%s: %.1f s late, going on from here", self._name, -early)
                     start -= early
                 elif early > 0:
                     self._stop.wait(early)
@@ -196,5 +197,5 @@ class Worker:
         self._rejected += 1
         if self._rejected <= _REJECTS_LOGGED:
             last = "; further ones are only counted" if self._rejected == _REJECTS_LOGGED else ""
-            _log.warning("%s: %s rejected: %s%s", self.text, record.address, reason, last)
+            _log.warning("%s: %s rejected: %s%s", self._name, record.address, reason, last)
         self._outbox.reject(record.address, {"source": self.text, "reason": reason, "fields": dict(record.fields)})

@@ -50,10 +50,10 @@ class Display:
             return
         if not self._greeted:
             self._greeted = True
-            if self._progress is not None:
+            if not self._daemon.until_done:
                 known = DEFAULT_ENDPOINT in self._daemon.endpoints
                 where = "" if known else f" -c {self._daemon.endpoints[0]}"
-                self._progress.console.print(_HINT.format(where=where), highlight=False)
+                self._tell(_HINT.format(where=where))
         if self._progress is not None:
             for worker in self._daemon.workers:
                 self._show(self._progress, worker)
@@ -62,6 +62,12 @@ class Display:
             for worker in self._daemon.workers:
                 if worker.state == "running" and worker.total:
                     _log.info("%s: %d of %d", worker.source, worker.done, worker.total)
+
+    def _tell(self, text: str) -> None:
+        if self._progress is not None:
+            self._progress.console.print(text, highlight=False)
+        else:
+            sys.stderr.write(f"{text}\n")
 
     def _start_progress(self) -> None:
         from rich.console import Console

@@ -1,0 +1,56 @@
+"""What `nedbus serve` shows on a terminal."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+from functools import partial
+from pathlib import Path
+
+from tests.conftest import DEADLINE, free_endpoint, wait_for
+from tests.ulogs import write_log
+
+
+def test_terminal_shows_progress_and_what_to_type(tmp_path: Path) -> None:
+    """A bar for each source with its state and numbers, what went wrong, and the next commands with their endpoint."""
+    path = write_log(tmp_path / "flight.ulg", range(0, 2_000_000, 10_000))
+    endpoint = free_endpoint()
+    sources = [f"--source=ulog:{path}", "--source=sim:?vehicle=2", "--source=ulog:/nowhere.ulg"]
+    main, terminal = pty.openpty()
+    command = [sys.executable, "-m", "nedbus", "serve", "-l", endpoint, *sources]
+    environment = {**os.environ, "COLUMNS": "200", "TERM": "xterm"}
+    service = subprocess.Popen(command, stderr=terminal, stdin=subprocess.DEVNULL, env=environment)
+    os.close(terminal)
+    shown = bytearray()
+
+    def read() -> None:
+        try:
+            while chunk := os.read(main, 4096):
+                shown.extend(chunk)
+        except OSError:  # the other side is closed
+            pass
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        for text in (
+            f"nedbus list -c {endpoint}",
+            "running",
+            "retrying",
+            "no such file",
+            "200 of 200 messages",
+            "done",
+        ):
+            wait_for(partial(shown.__contains__, text.encode()), what=text)
+        service.send_signal(signal.SIGTERM)
+        assert service.wait(DEADLINE) == 0
+    finally:
+        service.kill()
+        service.wait(DEADLINE)
+        reader.join(DEADLINE)
+        os.close(main)
+    assert b"Traceback" not in shown
