@@ -297,14 +297,15 @@ class Intake:
             if len(self._tracks) >= _KEYS:
                 return
             self._tracks[source] = track
-        self._single[key] = track if self._single.get(key, track) is track else None
+        if key in self._single or len(self._single) < _KEYS:
+            self._single[key] = track if self._single.get(key, track) is track else None
         gap = max(0, number - track.last - 1)
         track.last = max(track.last, number)
         # A channel that holds back loses nothing: then all of a gap was lost on the way.
         lost = min(gap, track.missed) if self.newest_only else gap
         track.missed -= min(track.missed, lost)
         self._dropped += gap - lost
-        if lost:
+        if lost and (key in self._lost_before or len(self._lost_before) < _KEYS):
             self._lost_before[key] = self._lost_before.get(key, 0) + lost
 
 
@@ -312,7 +313,7 @@ class Feed:
     """The Zenoh side of one subscription: a channel, the listener for losses, and the thread that empties it.
 
     An `every` subscription has a session of its own: its channel holds back when it is full, and so would everything
-    else on that session. The feed closes that session, also when it cannot be made.
+    else on that session. The feed closes it.
     """
 
     def __init__(self, session: zenoh.Session, key_expr: str, intake: Intake) -> None:
