@@ -26,7 +26,7 @@ class Topic:
     `instances`: it has uORB instances, one per EKF.
     `rate`: messages a second that PX4 sends or logs, nominal.
     `priority`: Zenoh's name of the priority on a congested link.
-    `cache`: how many messages a publisher keeps for readers that missed some, about 10 s at full rate.
+    `cache`: how many messages a publisher keeps for readers that missed some, about 20 s at full rate.
     `doc`: who publishes it.
     """
 
@@ -41,10 +41,10 @@ class Topic:
 TOPICS: Final[Mapping[str, Topic]] = {
     topic.name: topic
     for topic in (
-        Topic("vehicle_local_position", False, 100.0, "DATA_HIGH", 1000, "EKF2, or the EKF2 selector of several"),
-        Topic("vehicle_local_position_groundtruth", False, 50.0, "DATA", 500, "simulators (SITL, HITL)"),
-        Topic("external_ins_local_position", False, 50.0, "DATA", 1000, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_local_position", True, 2.0, "DATA", 200, "each EKF instance, when several run"),
+        Topic("vehicle_local_position", False, 100.0, "DATA_HIGH", 2000, "EKF2, or the EKF2 selector of several"),
+        Topic("vehicle_local_position_groundtruth", False, 50.0, "DATA", 1000, "simulators (SITL, HITL)"),
+        Topic("external_ins_local_position", False, 50.0, "DATA", 2000, "an external INS driver (VectorNav, ...)"),
+        Topic("estimator_local_position", True, 2.0, "DATA", 400, "each EKF instance, when several run"),
     )
 }
 

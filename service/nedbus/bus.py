@@ -112,7 +112,7 @@ class Bus:
         """Subscribe, and iterate over what comes: first the last value of each key, if there is one.
 
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
-        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 10 s.
+        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s.
         Either way `counts` tells what was lost, dropped or invalid.
 
         Raises ConnectError when mode "every" cannot open its session, because the router is away at this moment.

@@ -11,13 +11,14 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
-from nedbus_msgs import status_key
+from nedbus_msgs import decode, status_key
 
 from .errors import ConfigError, ConnectError
 from .publisher import HEARTBEAT, Outbox
 from .session import DEFAULT_ENDPOINT, Session, open_client, open_router
 from .settings import Settings
 from .sources import parse_source
+from .subscriber import Sample
 from .worker import Worker, WorkerStatus
 
 _log = logging.getLogger(__name__)
@@ -27,9 +28,13 @@ _GRACE: Final = 1.0  # s that a source has to end
 
 @dataclass(frozen=True, slots=True)
 class ServiceStatus:
-    """What a service tells of itself on `nedbus/@service/<id>/status`; times are seconds since the epoch."""
+    """What a service tells of itself on `nedbus/@service/<id>/status`.
+
+    Times are seconds since the epoch; `host` is the name of its host, or of its container.
+    """
 
     service: str
+    host: str
     version: str
     started: float
     now: float
@@ -58,17 +63,13 @@ class Daemon:
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: list[Worker] = []
+        self._outbox: Outbox | None = None
         # In containers every service may be process 1 of the same host name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.ready = threading.Event()
-        self.role: Literal["router", "client"] = "client" if settings.connect and not settings.listen else "router"
-        self.endpoints = settings.connect if self.role == "client" else settings.listen or (DEFAULT_ENDPOINT,)
-        if settings.router_config is not None:
-            if settings.connect or settings.listen:
-                raise ConfigError(
-                    "router_config", "a file says all about the embedded router: drop it, or drop connect and listen"
-                )
-            self.endpoints = (str(settings.router_config),)
+        own = settings.listen or (settings.router_config and (str(settings.router_config),))
+        self.role: Literal["router", "client"] = "client" if settings.connect and not own else "router"
+        self.endpoints = settings.connect if self.role == "client" else own or (DEFAULT_ENDPOINT,)
 
     @property
     def until_done(self) -> bool:
@@ -79,13 +80,29 @@ class Daemon:
     def status(self) -> ServiceStatus:
         """What the service is doing now."""
         return ServiceStatus(
-            self.id, self._version, self._started, time.time(), self.role, self.endpoints, self.workers
+            service=self.id,
+            host=socket.gethostname(),
+            version=self._version,
+            started=self._started,
+            now=time.time(),
+            role=self.role,
+            endpoints=self.endpoints,
+            sources=self.workers,
         )
 
     @property
     def workers(self) -> tuple[WorkerStatus, ...]:
         """What each source is doing now."""
         return tuple(worker.status for worker in self._workers)
+
+    def newest(self) -> list[Sample]:
+        """Return the last message of each address that was published."""
+        publishers = self._outbox.publishers if self._outbox else []
+        last = [(publisher.address, *publisher.last) for publisher in publishers if publisher.last]
+        return [
+            Sample(decode(payload), address, time.time_ns(), stamp.get_time_as_ntp64().as_nanos())
+            for address, payload, stamp in last
+        ]
 
     def stop(self) -> None:
         """Ask it to end; callable from anywhere, a signal handler included."""
@@ -105,7 +122,7 @@ class Daemon:
             _log.info("router on %s%s", ", ".join(self.endpoints), joined)
         else:
             _log.info("client of %s", ", ".join(self.endpoints))
-        outbox = Outbox(session, prefix=self._settings.prefix)
+        outbox = self._outbox = Outbox(session, prefix=self._settings.prefix)
         threads: list[threading.Thread] = []
         try:
             outbox.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
@@ -131,8 +148,8 @@ class Daemon:
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router for as long as it takes."""
         if self.role == "router":
-            config_file = self._settings.router_config
-            return open_router(listen=self.endpoints, connect=self._settings.connect, config_file=config_file)
+            settings = self._settings
+            return open_router(listen=settings.listen, connect=settings.connect, config_file=settings.router_config)
         told = False
         while not self._stop.is_set():
             try:

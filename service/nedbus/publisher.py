@@ -41,7 +41,7 @@ Answer = tuple[str, bytes, str, "zenoh.Timestamp | None"]
 class Publisher:
     """Publish the messages of one address; get one from `bus.publisher(...)`.
 
-    Messages are kept for about 10 s for readers that missed some, and the last one for readers that ask.
+    Messages are kept for about 20 s for readers that missed some, and the last one for readers that ask.
     `publish` never waits for a slow reader, unless the publisher was made to lose nothing.
     Usable from one thread at a time, and from asyncio; as a context manager it closes itself.
     """

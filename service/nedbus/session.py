@@ -31,12 +31,14 @@ RawSample = zenoh.Sample
 
 # What holds for every session of ours. Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
+# A side that says nothing for as long as its lease is given up: a frozen host, a cut cable.
 # Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a stamp.
 _COMMON: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
+    "transport/link/tx/lease": 5000,
 }
 
 
@@ -88,7 +90,7 @@ def open_client(
         left = start + timeout - time.monotonic()
         settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
         try:
-            return zenoh.open(_config(settings, where="connect"))
+            return zenoh.open(_insert(zenoh.Config(), settings, where="connect"))
         except zenoh.ZError:
             left = start + timeout - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
@@ -96,19 +98,22 @@ def open_client(
     raise ConnectError(endpoints, timeout)
 
 
-def open_router(
-    *, listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = (), config_file: Path | None = None
-) -> Session:
-    """Open a session that is itself a router, from these endpoints or from a JSON5 file that `zenohd` reads too.
+def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), config_file: Path | None = None) -> Session:
+    """Open a session that is itself a router, by default on loopback, or as a JSON5 file says that `zenohd` reads too.
+
+    Endpoints that are given replace those of the file, as the flags of `zenohd` do.
 
     Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file.
     """
+    check_endpoints(listen, where="listen")
+    check_endpoints(connect, where="connect")
     if config_file is not None:
+        given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
         config = _read_config(config_file)
-        listen = (f"what {config_file} names",)
+        _insert(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
+        listen = listen or (f"what {config_file} names",)
     else:
-        check_endpoints(listen, where="listen")
-        check_endpoints(connect, where="connect")
+        listen = listen or (DEFAULT_ENDPOINT,)
         settings = {
             **_COMMON,
             "mode": "router",
@@ -120,7 +125,7 @@ def open_router(
             "transport/unicast/accept_pending": 1000,
             "transport/link/rx/max_message_size": 2**20,
         }
-        config = _config(settings, where="listen")
+        config = _insert(zenoh.Config(), settings, where="listen")
     try:
         return zenoh.open(config)
     except zenoh.ZError as exc:
@@ -178,8 +183,7 @@ def _in_range(timeout: float) -> float:
     return min(max(timeout, 0.001), 86_400.0)
 
 
-def _config(settings: Mapping[str, object], *, where: str) -> zenoh.Config:
-    config = zenoh.Config()
+def _insert(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))

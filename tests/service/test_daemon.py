@@ -421,7 +421,7 @@ def test_status_tells_everything(run_nedbus: Start, raw: Session, endpoint: str)
         return bool(found) and source_of(found[0])["published"] != 0
 
     wait_for(ask, what="a status with messages")
-    assert {"service", "version", "started", "now", "role", "endpoints", "sources"} == set(found[0])
+    assert {"service", "host", "version", "started", "now", "role", "endpoints", "sources"} == set(found[0])
     assert (found[0]["role"], found[0]["endpoints"]) == ("client", [endpoint])
     source = source_of(found[0])
     assert (source["source"], source["state"], source["rejected"], source["total"]) == ("sim:", "running", 0, None)
@@ -503,14 +503,48 @@ def test_failing_source_lets_go_of_its_addresses(tmp_path: Path, run_nedbus: Sta
         )
 
 
-def test_contradicting_settings_are_refused(tmp_path: Path, run_nedbus: Start) -> None:
-    """A router file and an endpoint say two things: neither is silently ignored."""
+def test_endpoints_replace_those_of_a_router_file(tmp_path: Path, run_nedbus: Start) -> None:
+    """With a file the service is a router, which listens and joins where the flags say, as zenohd does."""
     file = tmp_path / "router.json5"
-    file.write_text("{}")
-    for flag in ("--connect", "--listen"):
-        service = run_nedbus("serve", "-s", "sim:", "--router-config", str(file), flag, free_endpoint())
-        assert service.wait() == 2
-        assert "router_config: a file says all about the embedded router" in service.err
+    file.write_text("{ mode: 'router', listen: { endpoints: ['tcp/127.0.0.1:1'] } }")
+    endpoint, other = free_endpoint(), free_endpoint()
+    run_nedbus("router", "--listen", other)
+    flags = ["--router-config", str(file), "--listen", endpoint, "--connect", other]
+    run_nedbus("serve", "-s", "sim:", *flags)
+    for where in (endpoint, other):
+        with until_connected(where) as bus:
+            wait_for(bus.latest, what=f"a message at {where}")
+
+
+def test_router_takes_endpoints_beside_its_file(tmp_path: Path, run_nedbus: Start) -> None:
+    """The file says all but where: one file serves several routers of a network."""
+    file = tmp_path / "router.json5"
+    file.write_text("{ mode: 'router', listen: { endpoints: ['tcp/127.0.0.1:1'] } }")
+    near, far = free_endpoint(), free_endpoint()
+    run_nedbus("router", "--listen", near)
+    run_nedbus("router", str(file), "--listen", far, "--connect", near)
+    with until_connected(near) as writer, until_connected(far) as reader:
+        writer.publisher(VLP, vehicle="1").publish(message(1))
+        wait_for(reader.latest, what="the message behind the second router")
+
+
+def test_health_is_that_of_this_host(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A healthy service exits with 0; none at all, and one with a source that fails, with 1 and the reason."""
+    none = run_nedbus("health", "-c", endpoint)
+    assert none.wait() == 1
+    assert "no service of" in none.err
+    service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
+    wait_for(bus.latest, what="data")
+    healthy = run_nedbus("health", NEDBUS_CONNECT=endpoint)
+    assert healthy.wait() == 0, healthy.err
+    assert healthy.out.startswith("1 services, 1 sources, ")
+    service.kill()
+    run_nedbus("serve", "-c", endpoint, "-s", "ulog:/gone.ulg", "-s", "sim:?vehicle=2")
+    wait_for(lambda: "2" in bus.vehicles(), what="the second service")
+    wait_for(lambda: "retrying" in str(bus.services()), what="its failure")
+    failing = run_nedbus("health", "-c", endpoint)
+    assert failing.wait() == 1
+    assert "ulog:/gone.ulg is retrying: " in failing.err
 
 
 @pytest.mark.parametrize("option", ["duration=inf", "duration=1e308", "speed=1e-300", "speed=nan", "seed=1&seed=2"])

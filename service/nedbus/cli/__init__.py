@@ -12,7 +12,7 @@ import typer
 from nedbus import __version__
 
 from .certificates import pki
-from .look import get, info, list_, schema
+from .look import get, health, info, list_, schema
 from .options import write
 from .serve import router, serve
 from .watch import echo, hz
@@ -34,6 +34,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "hz": hz,
     "get": get,
     "info": info,
+    "health": health,
     "schema": schema,
 }
 for _name, _function in _COMMANDS.items():

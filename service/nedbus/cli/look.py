@@ -1,14 +1,16 @@
-"""Commands that look once: list, get, info, schema."""
+"""Commands that look once: list, get, info, health, schema."""
 
 from __future__ import annotations
 
 import json
+import socket
 import time
 from typing import Annotated
 
 import typer
 
 from nedbus.bus import Bus
+from nedbus.errors import NedbusError
 from nedbus_msgs import ANY, json_schema, layout_table
 
 from .options import (
@@ -78,14 +80,25 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     write(f"vehicles  {', '.join(vehicles) or 'none'}")
     for service in services:
         write(f"\nservice {service.get('service')}, nedbus {service.get('version')}, as {service.get('role')}")
-        sources = service.get("sources")
-        rows = (
-            [_source_row(source) for source in sources if isinstance(source, dict)] if isinstance(sources, list) else []
-        )
+        rows = [_source_row(source) for source in _sources(service)]
         if rows:
             write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "RESTARTS", "ERROR"], rows))
     if not services:
         tell("no nedbus service answers here")
+
+
+@on_bus
+def health(bus: Bus) -> None:
+    """Exit 0 when the services of this host answer and all their sources work, else 1 with the reason."""
+    host = socket.gethostname()
+    own = [service for service in bus.services() if service.get("host") == host]
+    if not own:
+        raise NedbusError(f"no service of {host} answers at {' or '.join(bus.routers)}")
+    sources = [source for service in own for source in _sources(service)]
+    for source in sources:
+        if source.get("state") in {"retrying", "failed"}:
+            raise NedbusError(f"{source.get('source')} is {source.get('state')}: {source.get('error')}")
+    write(f"{len(own)} services, {len(sources)} sources, {sum(map(_published, sources))} messages published")
 
 
 @command
@@ -98,6 +111,17 @@ def schema(
 
 def _address(vehicle: str, topic: str, instance: int | None) -> dict[str, object]:
     return {"vehicle": vehicle, "topic": topic, "instance": instance}
+
+
+def _sources(service: dict[str, object]) -> list[dict[str, object]]:
+    """Return what a service says of its sources; the status comes from the network."""
+    sources = service.get("sources")
+    return [source for source in sources if isinstance(source, dict)] if isinstance(sources, list) else []
+
+
+def _published(source: dict[str, object]) -> int:
+    count = source.get("published")
+    return count if isinstance(count, int) else 0
 
 
 def _source_row(source: dict[str, object]) -> list[str]:

@@ -11,11 +11,14 @@ from nedbus.daemon import Daemon
 from nedbus.session import DEFAULT_ENDPOINT
 from nedbus.worker import WorkerStatus
 
+from .text import to_line
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _log = logging.getLogger("nedbus")
-_EVERY: Final = 10.0  # s between plain log lines of a replay
+_PAUSES: Final = (10.0,) * 6 + (60.0,)  # s between reports in a plain log; the last one stays
+_SHOWN: Final = 3  # messages that a report shows
 
 _HINT: Final = """In a second terminal:
   nedbus list{where}                        what is published
@@ -30,6 +33,7 @@ class Display:
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon
         self._greeted = False
+        self._reports = 0
         self._last = time.monotonic()
         self._progress: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
@@ -50,18 +54,28 @@ class Display:
             return
         if not self._greeted:
             self._greeted = True
-            if not self._daemon.until_done:
+            for worker in self._daemon.workers:
+                self._rate(worker)  # from here on it is measured
+            if not self._daemon.until_done and (self._daemon.role == "router" or sys.stderr.isatty()):
                 known = DEFAULT_ENDPOINT in self._daemon.endpoints
                 where = "" if known else f" -c {self._daemon.endpoints[0]}"
                 self._tell(_HINT.format(where=where))
         if self._progress is not None:
             for worker in self._daemon.workers:
                 self._show(self._progress, worker)
-        elif time.monotonic() - self._last >= _EVERY:
+        elif time.monotonic() - self._last >= _PAUSES[min(self._reports, len(_PAUSES) - 1)]:
             self._last = time.monotonic()
-            for worker in self._daemon.workers:
-                if worker.state == "running" and worker.total:
-                    _log.info("%s: %d of %d", worker.source, worker.done, worker.total)
+            self._reports += 1
+            self._report()
+
+    def _report(self) -> None:
+        """Log how far each source is, and some of what it published last."""
+        for worker in self._daemon.workers:
+            if worker.state == "running":
+                _log.info("%s: %s", worker.source.rstrip(":"), self._numbers(worker))
+        shown = [sample for sample in self._daemon.newest() if sample.topic == "vehicle_local_position"]
+        for sample in shown[:_SHOWN]:
+            _log.info("%s", to_line(sample))
 
     def _tell(self, text: str) -> None:
         if self._progress is not None:
@@ -88,15 +102,17 @@ class Display:
     def _show(self, progress: Progress, worker: WorkerStatus) -> None:
         if worker.source not in self._tasks:
             self._tasks[worker.source] = progress.add_task(worker.source, total=None, state="", numbers="")
-        count = f"{worker.done} of {worker.total}" if worker.total else f"{worker.published}"
-        numbers = f"{count} messages, {self._rate(worker):.0f}/s"
-        if worker.rejected:
-            numbers += f", {worker.rejected} rejected"
+        numbers = self._numbers(worker)
         if worker.error:
             numbers += f", {worker.error}"
         total = worker.total or (1 if worker.ended else None)
         done = worker.done if worker.total else int(worker.ended)
         progress.update(self._tasks[worker.source], completed=done, total=total, state=worker.state, numbers=numbers)
+
+    def _numbers(self, worker: WorkerStatus) -> str:
+        count = f"{worker.done} of {worker.total}" if worker.total else f"{worker.published}"
+        rejected = f", {worker.rejected} rejected" if worker.rejected else ""
+        return f"{count} messages, {self._rate(worker):.0f}/s{rejected}"
 
     def _rate(self, worker: WorkerStatus) -> float:
         """Return messages a second, as an average that follows within about a second."""

@@ -17,7 +17,6 @@ import typer
 
 from nedbus import __version__
 from nedbus.daemon import Daemon
-from nedbus.errors import ConfigError
 from nedbus.session import DEFAULT_ENDPOINT, open_router
 from nedbus.settings import load_settings
 
@@ -87,15 +86,17 @@ def router(
     ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Run a Zenoh router, without sources, for services and scripts to meet at."""
-    endpoints = load_settings(config, listen=listen).listen or (DEFAULT_ENDPOINT,)
-    if config_file is not None and (listen or connect):
-        raise ConfigError("CONFIG.json5", "a file says all about the router: drop it, or drop --listen and --connect")
+    """Run a Zenoh router, without sources, for services and scripts to meet at.
+
+    Endpoints that are given replace those of the file, as the flags of zenohd do.
+    """
+    endpoints = load_settings(config, listen=listen).listen
     stop = threading.Event()
 
     def run() -> bool:
         session = open_router(listen=endpoints, connect=tuple(connect or ()), config_file=config_file)
-        _log.info("router on %s", config_file or ", ".join(endpoints))
+        joined = f", joined to {', '.join(connect)}" if connect else ""
+        _log.info("router on %s%s", ", ".join(endpoints) or config_file or DEFAULT_ENDPOINT, joined)
         stop.wait()
         session.close()
         return True

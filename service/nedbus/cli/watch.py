@@ -13,7 +13,7 @@ from nedbus.bus import Bus
 from nedbus.errors import NoDataError
 from nedbus.rates import Rates
 from nedbus.subscriber import Mode, Sample, Subscription
-from nedbus_msgs import ANY
+from nedbus_msgs import ANY, Address
 
 from .options import (
     CountOption,
@@ -44,13 +44,20 @@ def echo(
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
     latest: Annotated[bool, typer.Option("--latest", help="Skip to the newest when this terminal is slow")] = False,
     json_output: JsonOption = False,
+    interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
     count: CountOption = None,
     duration: DurationOption = None,
 ) -> None:
     """Print every message as it arrives, a line each."""
     show = to_json if json_output else to_fields if full else to_line
+    due: dict[Address, float] = {}
 
     def print_one(sample: Sample) -> bool:
+        if interval:
+            now = time.monotonic()
+            if now < due.get(sample.address, 0.0):
+                return False
+            due[sample.address] = now + interval
         write(show(sample))
         return True
 

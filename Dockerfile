@@ -1,0 +1,33 @@
+# The service and the commands. Zenoh has no wheels for musl: the base must be Debian or another glibc system.
+ARG NEDBUS_BASE_IMAGE=python:3.11-slim-bookworm
+
+# What changes seldom: everything that nedbus depends on, for which an empty nedbus is enough.
+FROM ${NEDBUS_BASE_IMAGE} AS dependencies
+RUN python3 -m venv /opt/nedbus
+WORKDIR /build
+COPY pyproject.toml LICENSE ./
+RUN mkdir -p service/nedbus schemas/nedbus_msgs \
+    && echo '__version__ = "0"' > service/nedbus/__init__.py \
+    && touch schemas/nedbus_msgs/__init__.py README.md \
+    && /opt/nedbus/bin/pip install --no-cache-dir ".[pki]" \
+    && /opt/nedbus/bin/pip uninstall -y nedbus
+
+# What changes often: nedbus itself, as files that fit into the same place.
+FROM dependencies AS code
+COPY README.md ./
+COPY service service
+COPY schemas schemas
+RUN /opt/nedbus/bin/pip install --no-cache-dir --no-deps --prefix /code .
+
+FROM ${NEDBUS_BASE_IMAGE}
+# The usual number of a first user: keys that this user made can be read inside as well.
+RUN useradd --uid 1000 --create-home nedbus
+COPY --from=dependencies /opt/nedbus /opt/nedbus
+COPY --from=code /code /opt/nedbus
+ENV PATH=/opt/nedbus/bin:$PATH PYTHONUNBUFFERED=1
+# A nedbus.toml mounted here is read.
+WORKDIR /etc/nedbus
+USER nedbus
+HEALTHCHECK --interval=10s --timeout=5s --start-period=20s --retries=3 CMD ["nedbus", "health"]
+ENTRYPOINT ["nedbus"]
+CMD ["serve"]
