@@ -28,6 +28,6 @@ ENV PATH=/opt/nedbus/bin:$PATH PYTHONUNBUFFERED=1
 # A nedbus.toml mounted here is read.
 WORKDIR /etc/nedbus
 USER nedbus
-HEALTHCHECK --interval=10s --timeout=5s --start-period=20s --retries=3 CMD ["nedbus", "health"]
+HEALTHCHECK --interval=30s --timeout=5s CMD ["nedbus", "health"]
 ENTRYPOINT ["nedbus"]
 CMD ["serve"]

@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run check test wheel bench clean
+.PHONY: run check test compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight; then it says what to type in a second terminal
 	$(BIN)/nedbus serve --source sim:
@@ -15,11 +15,14 @@ check: $(READY)  ## lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: check  ## everything that CI runs: lint, types, tests with branch coverage
+test: check  ## lint, types, and the tests that need no containers, with branch coverage
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest -q --junitxml=build/tests.xml
+	$(BIN)/coverage run -m pytest -q -m "not compose" --junitxml=build/tests.xml
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
+
+compose-test: $(READY)  ## the tests in containers; they need Docker with compose, and some minutes
+	$(BIN)/pytest -q -m compose --junitxml=build/compose-tests.xml
 
 wheel: $(READY)  ## build the wheel, install it where nothing else is, and use it
 	rm -rf dist build/wheel-venv

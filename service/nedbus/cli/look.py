@@ -39,7 +39,7 @@ def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
         age = None if sample is None or sample.sent is None else (time.time_ns() - sample.sent) / 1e9
         if json_output:
             write(json.dumps({**_address(address.vehicle, address.topic, address.instance), "age": age}))
-        state = doubts(sample.message) if sample else "no message yet"
+        state = doubts(sample.message) if sample else "no answer"
         rows.append([str(address), "-" if age is None else to_age(age), state])
     if not json_output and rows:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))

@@ -1,0 +1,1 @@
+"""Real containers on real networks: the compose files as shipped."""

@@ -1,0 +1,82 @@
+"""Bad input on the router's port and on the data keys: nothing crashes, nothing invalid arrives, counters tell."""
+
+from __future__ import annotations
+
+import random
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus_msgs import Address, encode
+from tests.conftest import DEADLINE, message, wait_for
+
+from .conftest import StartStack
+from .flight import Flight, is_whole
+from .recorder import Recorder, places
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+
+VLP = "vehicle_local_position"
+BLOCK = zenoh.CongestionControl.BLOCK
+GARBAGE = [b"GET / HTTP/1.1\r\n\r\n", b"\0" * 4096, b"\xff" * 4096, b"\x16\x03\x01\x02\x00\x01\x00"]
+
+
+def malformed(count: int) -> Iterator[bytes]:
+    """Return payloads of which none is a message: random ones, and genuine ones that were cut, stretched or broken."""
+    chance = random.Random(0)
+    good = encode(message(5, timestamp_sample=3))
+    late = bytearray(good)
+    late[12:21] = good[3:12]  # timestamp_sample = timestamp ...
+    late[20] += 1  # ... and a microsecond more
+    kinds: list[Callable[[], bytes]] = [
+        lambda: chance.randbytes(chance.randrange(300)),
+        lambda: chance.randbytes(len(good)),
+        lambda: good[: chance.randrange(len(good))],
+        lambda: good + b"\0",
+        lambda: bytes(late),
+        lambda: b"\xdc\xff\xff" + good[3:],
+        lambda: b"\xdd\xff\xff\xff\xff",
+    ]
+    return (kinds[number % len(kinds)]() for number in range(count))
+
+
+def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: list[Recorder]) -> None:
+    """Garbage on the port, 1,000 malformed payloads, 10 MB, wildcard puts, false tokens: counted, and harmless."""
+    stack = make_stack("hostile")
+    stack.up()
+    host, port = stack.address.split(":")
+    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
+        reader = Recorder(bus.subscribe(mode="every"))
+        latest = Recorder(bus.subscribe())
+        record += [reader, latest]
+        reader.wait_for_more(100)
+        chance = random.Random(1)
+        for number in range(100):
+            with socket.create_connection((host, int(port)), timeout=DEADLINE) as connection:
+                connection.sendall(GARBAGE[number] if number < len(GARBAGE) else chance.randbytes(200))
+        with nedbus.connect(stack.endpoint, timeout=DEADLINE) as hostile:
+            session = hostile._session
+            for payload in malformed(1000):
+                session.put(f"nedbus/1/{VLP}", payload, congestion_control=BLOCK)
+            for key in (f"nedbus/*/{VLP}", "nedbus/1/*", "nedbus/**", "nedbus/1/no_such_topic", f"nedbus/1/{VLP}/0"):
+                session.put(key, encode(message(1)), congestion_control=BLOCK)
+            session.delete(f"nedbus/1/{VLP}", congestion_control=BLOCK)
+            token = session.liveliness().declare_token("nedbus/no vehicle/@alive/nothing")
+            wait_for(lambda: reader.subscription.counts.invalid == 1006, what="1,006 refusals")
+            assert list(bus.vehicles()) == ["1"]
+            token.undeclare()
+        with nedbus.connect(stack.endpoint, timeout=DEADLINE) as hostile:
+            hostile._session.put(f"nedbus/1/{VLP}", b"\xc0" * 10_000_000, congestion_control=BLOCK)
+            reader.wait_for_more(500)
+        assert reader.subscription.counts == nedbus.Counts(received=len(reader.samples), invalid=1006)
+        assert is_whole(places(reader.of(Address("1", VLP)), Flight()))
+        assert 500 < latest.subscription.counts.invalid <= 1006, "superseded ones are not judged"
+        assert {sample.vehicle for sample in reader.samples + latest.samples} == {"1"}
+    for service in ("router", "service"):
+        known = stack.inspect(service)
+        assert known["State"]["Running"], service
+        assert known["RestartCount"] == 0, service
+    assert "Traceback" not in stack.compose("logs")

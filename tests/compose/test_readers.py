@@ -1,0 +1,124 @@
+"""Who reads what, where: on the host, in containers, behind a second router."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+import nedbus
+from nedbus_msgs import TOPICS, Address, VehicleLocalPosition
+from tests.conftest import DEADLINE, Mode, Process, wait_for
+
+from .conftest import StartStack
+from .flight import Flight, is_whole
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+
+VLP = "vehicle_local_position"
+STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in TOPICS.items()}
+COUNT = 1500  # samples: about 7 s of all streams
+
+
+def parse(output: str) -> list[tuple[Address, VehicleLocalPosition]]:
+    """Return what `nedbus echo --json` printed."""
+    rows = [json.loads(line) for line in output.splitlines()]
+    return [
+        (
+            Address(row["vehicle"], row["topic"], row["instance"]),
+            VehicleLocalPosition.model_validate_json(json.dumps(row["message"])),
+        )
+        for row in rows
+    ]
+
+
+def read_on_host(endpoint: str) -> list[tuple[Address, VehicleLocalPosition]]:
+    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(mode="every") as subscription:
+        arrived = [subscription.receive(DEADLINE) for _ in range(COUNT)]
+        assert subscription.counts == nedbus.Counts(received=COUNT)
+    return [(sample.address, sample.message) for sample in arrived]
+
+
+def check(arrived: list[tuple[Address, VehicleLocalPosition]]) -> None:
+    places = Flight().places(arrived)
+    assert set(places) >= STREAMS
+    assert all(map(is_whole, places.values()))
+
+
+def check_echo(echo: Process) -> None:
+    assert echo.wait() == 0, echo.err
+    arrived = parse(echo.out)
+    assert len(arrived) == COUNT
+    assert "lost" not in echo.err
+    check(arrived)
+
+
+ECHO = ("echo", "--wait", "--json", "--count", str(COUNT))
+
+
+def test_host_and_container_read_everything(make_stack: StartStack) -> None:
+    """Every sample of all four topics, with the right values, on the host and in a container beside the service."""
+    stack = make_stack("readers")
+    stack.up()
+    echo = stack.run("subscriber", *ECHO)
+    check(read_on_host(stack.endpoint))
+    check_echo(echo)
+
+
+def test_second_host_reads_everything(make_stack: StartStack) -> None:
+    """The same behind a second router, on a network that the service is not on, and from the host through that one."""
+    stack = make_stack("far", "docker-compose.hosts.yml")
+    stack.up()
+    echo = stack.run("subscriber", *ECHO)
+    check(read_on_host(stack.endpoint))
+    check_echo(echo)
+    for service, networks in {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]}.items():
+        assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(map(stack.network, networks))
+
+
+def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
+    """Within a second, even though nothing is published any more."""
+    stack = make_stack("late", NEDBUS_SOURCE="sim:?duration=2")
+    stack.up()
+    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
+        wait_for(lambda: "'state': 'done'" in str(bus.services()), what="the end of the flight")
+        last = Flight("sim:?duration=2").last(Address("1", VLP))
+        modes: tuple[Mode, ...] = ("latest", "every")
+        for mode in modes:
+            start = time.monotonic()
+            with bus.subscribe(VLP, mode=mode) as subscription:
+                assert subscription.receive(DEADLINE).message == last
+            assert time.monotonic() - start < 1.0
+
+
+def test_compose_up_shows_data(make_stack: StartStack) -> None:
+    """The service tells what it publishes; the demo prints it; both run as nobody special, and are healthy."""
+    stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml")
+    stack.compose("--profile", "demo", "up", "--detach", "--no-build")
+    wait_for(lambda: " ned " in stack.compose("logs", "service"), what="a message in the service's log", seconds=60)
+    wait_for(lambda: stack.compose("logs", "subscriber").count(" ned ") > 5, what="messages in the subscriber's log")
+    wait_for(lambda: stack.health("service") == "healthy", what="health", seconds=60)
+    assert stack.compose("exec", "--no-TTY", "service", "id", "-un").strip() == "nedbus"
+    stack.compose("kill", "router")
+    wait_for(lambda: stack.health("service") == "unhealthy", what="its sickness", seconds=120)
+
+
+def test_clean_end(make_stack: StartStack) -> None:
+    """`compose stop` ends the service with exit code 0, at once."""
+    stack = make_stack("end")
+    stack.up()
+    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
+        wait_for(bus.latest, what="data")
+    stack.compose("stop", "service")
+    assert stack.inspect("service")["State"]["ExitCode"] == 0
+
+
+def test_flags_are_those_of_zenohd(make_stack: StartStack) -> None:
+    """What compose files ask of a router image is what zenohd takes."""
+    for file in ("docker-compose.yml", "docker-compose.hosts.yml"):
+        config = json.loads(make_stack("flags", file).compose("config", "--format", "json"))
+        for name, service in config["services"].items():
+            if "router" in name:
+                flags = [word for word in service["command"] if word.startswith("-")]
+                assert set(flags) <= {"--config", "--listen", "--connect"}

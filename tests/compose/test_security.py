@@ -1,0 +1,198 @@
+"""The stack with certificates: who may do what, proved by what arrives, as Zenoh denies in silence."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+import nedbus
+from nedbus.pki import make_authority, make_certificate
+from nedbus_msgs import Address
+from tests.conftest import DEADLINE, Process, message, wait_for
+
+from .conftest import StartStack
+from .flight import Flight, is_whole
+from .recorder import Recorder, places
+from .stack import Stack
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+
+VLP = "vehicle_local_position"
+MINE = Address("1", VLP)
+PEOPLE = ("vehicle-1", "vehicle-2", "reader", "operator")
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make certificates as docs/security.md says, and some that must not work; the first user of a host owns them."""
+    folder = tmp_path_factory.mktemp("pki")
+    make_authority(folder)
+    make_certificate(folder, "router", hosts=["router", "localhost", "127.0.0.1"])
+    for name in PEOPLE:
+        make_certificate(folder, name)
+    make_certificate(folder, "expired", days=-1)
+    make_authority(folder / "foreign")
+    make_certificate(folder / "foreign", "vehicle-1")
+    if os.getuid() == 0:
+        for file in folder.rglob("*"):
+            os.chown(file, 1000, 1000)
+    return folder
+
+
+@pytest.fixture
+def secure(make_stack: StartStack, pki: Path) -> Stack:
+    """Start the shipped stack with these certificates."""
+    user = f"{os.getuid() or 1000}:{os.getgid() or 1000}"
+    files = ("docker-compose.yml", "docker-compose.secure.yml")
+    stack = make_stack("secure", *files, NEDBUS_PKI=str(pki), NEDBUS_USER=user)
+    stack.up()
+    return stack
+
+
+def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE) -> nedbus.Bus:
+    """Connect from the host, as somebody."""
+    own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
+    endpoint = f"tls/{stack.address}"
+    return nedbus.connect(endpoint, tls_ca=pki / ca, tls_certificate=own, tls_key=key, timeout=timeout)
+
+
+@pytest.fixture
+def reader(secure: Stack, pki: Path, record: list[Recorder]) -> Recorder:
+    """Read everything, as the host's script of the README does."""
+    bus = join(secure, pki, "reader")
+    record.append(Recorder(bus.subscribe(mode="every")))
+    record[-1].wait_for_more(100)
+    return record[-1]
+
+
+def check_genuine(reader: Recorder) -> None:
+    """Whatever was tried meanwhile: this reader saw vehicle 1, whole and with the right values, and nothing else."""
+    reader.wait_for_more(300)
+    samples = list(reader.samples)
+    assert {sample.vehicle for sample in samples} == {"1"}
+    assert is_whole(places([sample for sample in samples if sample.address == MINE], Flight()))
+    assert reader.subscription.counts.invalid == 0
+
+
+@pytest.mark.parametrize("name", ["vehicle-2", "reader", "operator"])
+def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, name: str) -> None:
+    """Another vehicle, a reader and an operator write in vain: as vehicle 1, as an unknown vehicle, as a status."""
+    with join(secure, pki, name) as intruder:
+        for vehicle in ("1", "3"):
+            publisher = intruder.publisher(VLP, vehicle=vehicle)
+            for timestamp in range(1, 100):
+                publisher.publish(message(timestamp))
+        intruder._session.put("nedbus/@rejected/1/vehicle_local_position", b"{}")
+        check_genuine(reader)
+        with join(secure, pki, "reader") as other:
+            assert list(other.vehicles()) == ["1"]
+            assert {sample.vehicle for sample in other.latest()} == {"1"}
+
+
+def test_service_with_a_wrong_name_publishes_nothing(secure: Stack, reader: Recorder) -> None:
+    """Vehicle 1's certificate does not publish vehicle 2."""
+    impostor = secure.run("service", "serve", "-s", "sim:?vehicle=2&duration=3", "--until-done")
+    assert impostor.wait(60.0) == 0, impostor.err
+    assert "published" in impostor.err
+    check_genuine(reader)
+
+
+@pytest.mark.parametrize(
+    ("ca", "certificate"),
+    [("ca.crt", None), ("ca.crt", "foreign/vehicle-1"), ("foreign/ca.crt", "vehicle-1"), ("ca.crt", "expired")],
+    ids=["no certificate", "foreign certificate", "foreign authority", "expired certificate"],
+)
+def test_strangers_are_refused(secure: Stack, pki: Path, reader: Recorder, ca: str, certificate: str | None) -> None:
+    """On the host and in a container: no session, and an error that says what to check."""
+    with pytest.raises(nedbus.ConnectError, match=r"check that tls_ca is the router's authority"):
+        join(secure, pki, certificate, ca=ca, timeout=1.0)
+    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]
+    if certificate is None:
+        volumes += ["--env=NEDBUS_TLS_CERTIFICATE=", "--env=NEDBUS_TLS_KEY="]
+    else:
+        volumes += [f"--volume={pki / certificate}.{kind}:/etc/nedbus/pki/own.{kind}:ro" for kind in ("crt", "key")]
+    echo = secure.run("subscriber", "echo", "--count", "1", options=tuple(volumes))
+    assert echo.wait(60.0) == 1, echo.out
+    assert "check that tls_ca is the router's authority" in echo.err
+    assert echo.out == ""
+    check_genuine(reader)
+
+
+PEER = """
+import json, sys, threading, time, zenoh
+name, puts = sys.argv[1], int(sys.argv[2])
+tls = {"root_ca_certificate": "/etc/nedbus/pki/ca.crt", "enable_mtls": True}
+if name != "nobody":
+    tls |= {"connect_certificate": "/etc/nedbus/pki/own.crt", "connect_private_key": "/etc/nedbus/pki/own.key"}
+settings = {
+    "mode": "peer",
+    "listen/endpoints": ["tcp/0.0.0.0:7448"],
+    "connect/endpoints": ["tls/router:7447", "tcp/router:7447", "tcp/service:7448"],
+    "connect/timeout_ms": 2000,
+    "connect/exit_on_failure": False,
+    "scouting/gossip/enabled": True,
+    "scouting/multicast/enabled": name == "nobody",
+    "transport/link/tls": tls,
+}
+config = zenoh.Config()
+for key, value in settings.items():
+    config.insert_json5(key, json.dumps(value))
+session = zenoh.open(config)
+seen = {"genuine": 0, "forged": 0}
+def take(sample):
+    seen["forged" if sample.payload.to_bytes() == b"forged" else "genuine"] += 1
+subscriber = session.declare_subscriber("nedbus/1/**", take)
+print("ready", flush=True)
+for number in range(puts):
+    session.put("nedbus/1/vehicle_local_position", b"forged")
+    time.sleep(0.01)
+while True:
+    print(json.dumps(seen), flush=True)
+    if puts:
+        break
+    time.sleep(0.1)
+session.close()
+"""
+
+
+def last_count(peer: Process) -> dict[str, int]:
+    """Return what a peer has seen so far."""
+    lines = [line for line in peer.out.splitlines(keepends=True) if line.endswith("}\n")]
+    counts: dict[str, int] = json.loads(lines[-1]) if lines else {"genuine": 0, "forged": 0}
+    return counts
+
+
+def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Recorder) -> None:
+    """Peers with certificates are not introduced to each other, one without finds nobody: nothing forged arrives."""
+    run = ("--entrypoint", "/opt/nedbus/bin/python")
+    listener = secure.run("subscriber", "-c", PEER, "reader", "0", options=run)
+    wait_for(lambda: "ready" in listener.out, what=f"the listening peer {listener.err}")
+    for name in ("vehicle-2", "nobody"):
+        own = tuple(f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/own.{kind}:ro" for kind in ("crt", "key"))
+        peer = secure.run("subscriber", "-c", PEER, name, "300", options=(*run, *own))
+        assert peer.wait(60.0) == 0, peer.err
+        assert '{"genuine": 0, "forged": 300}' in peer.out, "it sees its own puts, and nothing else"
+    before = last_count(listener)["genuine"]
+    wait_for(lambda: last_count(listener)["genuine"] > before + 100, what="what it may read")
+    assert last_count(listener)["forged"] == 0
+    check_genuine(reader)
+
+
+def test_only_operators_see_who_is_connected(secure: Stack, pki: Path) -> None:
+    """The router's admin space answers operators, and is read-only."""
+    with join(secure, pki, "operator") as operator, join(secure, pki, "reader") as other:
+        wait_for(lambda: [reply.ok for reply in operator._session.get("@/*/router")], what="an answer")
+        assert [reply.ok for reply in other._session.get("@/*/router")] == []
+
+
+def test_secrets_are_not_shown(secure: Stack, pki: Path) -> None:
+    """Neither logs nor what Docker knows of the containers hold a key."""
+    shown = secure.compose("logs") + str(secure.inspect("service")) + str(secure.inspect("router"))
+    assert "PRIVATE KEY" not in shown
+    for name in ("router", "vehicle-1"):
+        secret = (pki / f"{name}.key").read_text().splitlines()[1]
+        assert secret not in shown
+    assert "ca.key" not in shown
