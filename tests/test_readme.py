@@ -1,4 +1,4 @@
-"""The README: its script is the example, its commands exist."""
+"""The README and the pages in docs/: the script is the example, the commands exist."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from tests.conftest import Start
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+PAGES = README + "".join(page.read_text() for page in sorted(ROOT.glob("docs/*.md")))
 
 
 def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+    return re.findall(rf"```{language}\n(.*?)```", PAGES, re.DOTALL)
+
+
+BASH = "\n".join(blocks("bash"))
+COMMANDS = sorted(set(re.findall(r"^nedbus ((?:pki )?\w+)([^#\n]*)", BASH, re.MULTILINE)))
 
 
 def test_first_script_is_the_example() -> None:
@@ -25,29 +30,49 @@ def test_first_script_is_the_example() -> None:
     assert len(example.splitlines()) == 8
 
 
-COMMANDS = sorted(set(re.findall(r"^nedbus ((?:pki )?\w+)([^#\n]*)", "\n".join(blocks("bash")), re.MULTILINE)))
-
-
 @pytest.mark.parametrize(("command", "arguments"), COMMANDS)
 def test_shown_command_exists(run_nedbus: Start, command: str, arguments: str) -> None:
-    """Every command of the README exists, with the flags that are shown; every source can be parsed."""
+    """Every command that is shown exists, with its flags; every source can be parsed, every file is there."""
     overview = run_nedbus(*command.split(), "--help", COLUMNS="200")
     assert overview.wait() == 0
     for flag in re.findall(r"--[a-z-]+", arguments):
         assert flag in overview.out
     for source in re.findall(r"(?:--source )\"?([^\s\"]+)", arguments):
         parse_source(source)
+    for file in re.findall(r"config/\S+", arguments):
+        assert (ROOT / file).is_file()
 
 
 def test_shown_targets_exist() -> None:
     """Every make target of the README is in the Makefile."""
     makefile = (ROOT / "Makefile").read_text()
-    targets = set(re.findall(r"^make (\w+)", "\n".join(blocks("bash")), re.MULTILINE))
+    targets = set(re.findall(r"^make (\w+)", BASH, re.MULTILINE))
     assert targets == {"run", "test"}
     assert all(f"\n{target}:" in makefile for target in targets)
+
+
+def test_shown_stacks_exist() -> None:
+    """Every compose command names files, profiles and services that are there; every variable is in a file."""
+    stacks = {file.name: file.read_text() for file in ROOT.glob("docker-compose*.yml")}
+    commands = re.findall(r"^docker compose ([^#\n]*)", BASH, re.MULTILINE)
+    assert len(commands) > 4
+    for command in commands:
+        files = re.findall(r"-f (\S+)", command)
+        assert set(files) <= set(stacks)
+        for profile in re.findall(r"--profile (\S+)", command):
+            assert f"profiles: [{profile}]" in stacks["docker-compose.yml"]
+    for variable in re.findall(r"`(NEDBUS_[A-Z]+_IMAGE|NEDBUS_PUBLISH|NEDBUS_PKI|NEDBUS_USER)`", PAGES):
+        assert any(variable in text for text in stacks.values())
 
 
 def test_shown_options_exist() -> None:
     """Every option of ulog: in the table is one."""
     rows = re.findall(r"^\| `(\w+)=\S+` \|", README, re.MULTILINE)
     assert set(rows) == set(SOURCE_KINDS["ulog"].options.model_fields)
+
+
+def test_links_lead_somewhere() -> None:
+    """Every link to a file of this project has a file at its end."""
+    for page in (ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "CONTRIBUTING.md"):
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"

@@ -36,11 +36,12 @@ def cert(
     host: Annotated[
         list[str] | None, typer.Option("--host", help="For a router: a name or address that clients dial; repeatable")
     ] = None,
+    days: Annotated[int | None, typer.Option(min=1, help="Days until it expires (default: 825)")] = None,
 ) -> None:
     """Make NAME.key and NAME.crt; config/router-secure.json5 says what each name may do."""
     with _needing_cryptography():
-        from nedbus.pki import make_certificate
-    _tell_paths(make_certificate(folder, name, hosts=host or ()))
+        from nedbus.pki import DAYS, make_certificate
+    _tell_paths(make_certificate(folder, name, hosts=host or (), days=days or DAYS))
 
 
 @contextmanager
