@@ -25,6 +25,11 @@ LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
 Mode = Literal["latest", "every"]
 
 
+def pytest_configure() -> None:
+    """Make Ctrl-C work: a shell's background job ignores it, and so would every process that the tests start."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEADLINE) -> None:
     """Wait until a condition holds, and fail with words when it never does."""
     end = time.monotonic() + seconds
