@@ -3,6 +3,7 @@
 from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
 from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
 from .position import FIELD_TYPES, VehicleLocalPosition
+from .rows import Row
 from .schema import json_schema, layout_table
 from .topics import (
     ANY,
@@ -20,7 +21,7 @@ from .topics import (
     selection,
     status_key,
 )
-from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, describe, encode
+from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, decode_row, describe, encode, encode_fields, encode_row
 
 __all__ = [
     "ANY",
@@ -40,6 +41,7 @@ __all__ = [
     "Layout",
     "LayoutError",
     "NedbusError",
+    "Row",
     "Topic",
     "UnknownLayoutError",
     "VehicleLocalPosition",
@@ -48,9 +50,12 @@ __all__ = [
     "check_prefix",
     "check_vehicle",
     "decode",
+    "decode_row",
     "describe",
     "downgrade",
     "encode",
+    "encode_fields",
+    "encode_row",
     "find_layout",
     "get_topic",
     "json_schema",

@@ -7,8 +7,7 @@ Any other valid msgpack of the array is read as well.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from operator import itemgetter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, cast
 
 import msgpack
@@ -17,6 +16,7 @@ from pydantic import ValidationError
 from .errors import DecodeError, EncodeError, UnknownLayoutError
 from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
 from .position import FIELD_TYPES, TypeName, VehicleLocalPosition
+from .rows import NAMES, Row, Values, check_row, message_of, row_of
 
 PAYLOAD_SIZE: Final = 244
 """Bytes of every payload that `encode` writes."""
@@ -36,13 +36,22 @@ _FULL_WIDTH: Final[Mapping[TypeName, tuple[bytes, str, bytes]]] = {
 }
 _HEAD = struct.pack(">BHB", 0xDC, 1 + len(FIELD_TYPES), cast("int", CURRENT.wire))
 _TYPES = [_FULL_WIDTH[kind] for kind in FIELD_TYPES.values()]
-_TAGS = int.from_bytes(_HEAD + b"".join(tags for tags, _, _ in _TYPES), "big")
+TAGS = int.from_bytes(_HEAD + b"".join(tags for tags, _, _ in _TYPES), "big")
 _VALUES = int.from_bytes(bytes(len(_HEAD)) + b"".join(values for _, _, values in _TYPES), "big")
+NO_VALUES = ~_VALUES
 _RECORD = struct.Struct(f">{len(_HEAD)}x" + "".join(form for _, form, _ in _TYPES))
 
-_PAIRS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
-_FIRST, _SECOND = (tuple(FIELD_TYPES).index(name) for name in _PAIRS)  # delta_xy, delta_vxy
-_get_values = cast("Callable[[dict[str, object]], tuple[object, ...]]", itemgetter(*FIELD_TYPES))
+_FIRST, _SECOND = (NAMES.index(name) for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
+
+
+def places_on_the_wire() -> Iterator[tuple[str, int, int]]:
+    """Yield name, part (of delta_xy and delta_vxy, else 0) and offset of every value in a full-width payload."""
+    offset = len(_HEAD)
+    for name, kind in FIELD_TYPES.items():
+        tags, _, _ = _FULL_WIDTH[kind]
+        starts = {"bool": (0,), "float32[2]": (2, 7)}.get(kind, (1,))
+        yield from ((name, part, offset + start) for part, start in enumerate(starts))
+        offset += len(tags)
 
 
 def encode(message: VehicleLocalPosition) -> bytes:
@@ -50,15 +59,31 @@ def encode(message: VehicleLocalPosition) -> bytes:
 
     Raises EncodeError for a message whose validation was bypassed and that holds what its fields cannot.
     """
-    values = list(_get_values(message.__dict__))
     try:
-        values[_SECOND : _SECOND + 1] = cast("tuple[float, float]", values[_SECOND])
-        values[_FIRST : _FIRST + 1] = cast("tuple[float, float]", values[_FIRST])
-        record = _RECORD.pack(*values)
+        return _write(tuple(message.__dict__.values()))
     except (struct.error, OverflowError, TypeError) as exc:
         raise EncodeError(str(exc)) from exc
-    # The record has zeros where the tags belong, and the tags have zeros where the values are.
-    return (int.from_bytes(record, "big") | _TAGS).to_bytes(PAYLOAD_SIZE, "big")
+
+
+def encode_fields(fields: Mapping[str, object]) -> bytes:
+    """Return the 244 bytes of the message that these fields make, without making it.
+
+    Raises pydantic.ValidationError for what the model refuses.
+    """
+    row = row_of(fields)
+    return encode(VehicleLocalPosition.model_validate(fields)) if row is None else _write_row(row)
+
+
+def encode_row(values: Sequence[object] | Row) -> bytes:
+    """Return the 244 bytes of the message with these values of all fields in PX4's order, without making it.
+
+    Raises EncodeError for another number of values, pydantic.ValidationError for what the model refuses.
+    """
+    values = tuple(values)
+    if len(values) != len(NAMES):
+        raise EncodeError(f"{len(values)} values, where a row has {len(NAMES)}")
+    row = check_row(values)
+    return encode(_model_of(values)) if row is None else _write_row(row)
 
 
 def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> VehicleLocalPosition:
@@ -70,13 +95,14 @@ def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) 
     Raises UnknownLayoutError for a layout that is neither known nor given, DecodeError for anything else that is not
     one message: other types, other lengths, trailing, missing or too many bytes, values that the model refuses.
     """
-    fields = _read_full_width(payload)
-    try:
-        if fields is not None:
-            return VehicleLocalPosition.model_validate(fields)
-        return upgrade(_read_any(payload, newer or {}))
-    except ValidationError as exc:
-        raise DecodeError(describe(exc)) from exc
+    row = _read_full_width(payload)
+    return _decode_slowly(payload, newer) if row is None else message_of(row)
+
+
+def decode_row(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> Row:
+    """Return the message of a payload as a named tuple, checked by the same validators and rules as by `decode`."""
+    row = _read_full_width(payload)
+    return Row._make(tuple(_decode_slowly(payload, newer).__dict__.values()) if row is None else row)
 
 
 def describe(error: ValidationError) -> str:
@@ -87,17 +113,42 @@ def describe(error: ValidationError) -> str:
     )
 
 
-def _read_full_width(payload: bytes) -> dict[str, object] | None:
-    """Read what `encode` writes, None for anything else."""
+def _write(row: Values) -> bytes:
+    """Pack a row; raise struct.error, OverflowError or TypeError for what its fields cannot hold."""
+    one, two = cast("tuple[Values, Values]", (row[_FIRST], row[_SECOND]))
+    flat = (*row[:_FIRST], *one, *row[_FIRST + 1 : _SECOND], *two, *row[_SECOND + 1 :])
+    # The record has zeros where the tags belong, and the tags have zeros where the values are.
+    return (int.from_bytes(_RECORD.pack(*flat), "big") | TAGS).to_bytes(PAYLOAD_SIZE, "big")
+
+
+def _write_row(row: Values) -> bytes:
+    try:
+        return _write(row)
+    except OverflowError:  # beyond float32: the model says so
+        return encode(_model_of(row))
+
+
+def _model_of(row: Values) -> VehicleLocalPosition:
+    return VehicleLocalPosition.model_validate(dict(zip(NAMES, row, strict=True)))
+
+
+def _read_full_width(payload: bytes) -> Values | None:
+    """Read what `encode` writes, validated; None for anything that needs a closer look."""
     if len(payload) != PAYLOAD_SIZE:
         return None
     number = int.from_bytes(payload, "big")
-    if number & ~_VALUES != _TAGS:
+    if number & NO_VALUES != TAGS:
         return None
-    values: list[object] = list(_RECORD.unpack((number & _VALUES).to_bytes(PAYLOAD_SIZE, "big")))
-    values[_FIRST : _FIRST + 2] = [(values[_FIRST], values[_FIRST + 1])]
-    values[_SECOND : _SECOND + 2] = [(values[_SECOND], values[_SECOND + 1])]
-    return dict(zip(FIELD_TYPES, values, strict=True))
+    flat = _RECORD.unpack((number & _VALUES).to_bytes(PAYLOAD_SIZE, "big"))
+    first, second = flat[_FIRST : _FIRST + 2], flat[_SECOND + 1 : _SECOND + 3]
+    return check_row((*flat[:_FIRST], first, *flat[_FIRST + 2 : _SECOND + 1], second, *flat[_SECOND + 3 :]))
+
+
+def _decode_slowly(payload: bytes, newer: Mapping[int, Sequence[str]] | None) -> VehicleLocalPosition:
+    try:
+        return upgrade(_read_any(payload, newer or {}))
+    except ValidationError as exc:
+        raise DecodeError(describe(exc)) from exc
 
 
 def _read_any(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, object]:

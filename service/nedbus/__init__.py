@@ -25,8 +25,9 @@ from .errors import (
     SourceError,
     UnknownLayoutError,
 )
+from .intake import Counts, Sample
 from .publisher import Publisher
-from .subscriber import AsyncSubscription, Counts, Sample, Subscription
+from .subscriber import AsyncSubscription, Subscription
 
 __version__ = "0.1.0"
 

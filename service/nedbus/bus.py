@@ -23,10 +23,11 @@ from nedbus_msgs import (
 )
 
 from .errors import ClosedError, NedbusError
+from .intake import Intake, Mode, Sample
 from .publisher import Outbox, Publisher
 from .session import RawSample, Session, Tls, alive_keys, open_client, query
 from .settings import load_settings
-from .subscriber import AsyncSubscription, Feed, Intake, Mode, Sample, Subscription
+from .subscriber import AsyncSubscription, Feed, Subscription
 
 _log = logging.getLogger(__name__)
 _FIELDS: Final = 256  # fields that a layout may have
@@ -149,10 +150,14 @@ class Bus:
             found.setdefault(address.vehicle, []).append(address)
         return found
 
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> Publisher:
-        """Return a publisher of one address; raise AddressInUseError if this bus has one already."""
+    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None, lossless: bool = False) -> Publisher:
+        """Return a publisher of one address; raise AddressInUseError if this bus has one already.
+
+        `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, and a stuck one
+        holds up all others for 5 s, until it is cut off.
+        """
         self._require_open()
-        return self._outbox.publisher(Address(vehicle, topic, instance), owner=self)
+        return self._outbox.publisher(Address(vehicle, topic, instance), lossless=lossless, owner=self)
 
     def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service on this network, as it tells it."""
@@ -236,9 +241,12 @@ class AsyncBus:
         """Return the vehicles that are published now as `Bus.vehicles` does."""
         return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
 
-    async def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> Publisher:
-        """Return a publisher as `Bus.publisher` does; its `publish` does not wait, so it needs no await."""
-        return await asyncio.to_thread(self._opened().publisher, topic, vehicle=vehicle, instance=instance)
+    async def publisher(
+        self, topic: str, *, vehicle: str, instance: int | None = None, lossless: bool = False
+    ) -> Publisher:
+        """Return a publisher as `Bus.publisher` does; its `publish` waits only if it is `lossless`."""
+        bus = self._opened()
+        return await asyncio.to_thread(bus.publisher, topic, vehicle=vehicle, instance=instance, lossless=lossless)
 
     async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service as `Bus.services` does."""

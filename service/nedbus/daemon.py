@@ -14,11 +14,11 @@ from typing import Final, Literal
 from nedbus_msgs import decode, status_key
 
 from .errors import ConfigError, ConnectError
+from .intake import Sample
 from .publisher import HEARTBEAT, Outbox
 from .session import DEFAULT_ENDPOINT, Session, open_client, open_router
 from .settings import Settings
 from .sources import parse_source
-from .subscriber import Sample
 from .worker import Worker, WorkerStatus
 
 _log = logging.getLogger(__name__)
@@ -99,10 +99,7 @@ class Daemon:
         """Return the last message of each address that was published."""
         publishers = self._outbox.publishers if self._outbox else []
         last = [(publisher.address, *publisher.last) for publisher in publishers if publisher.last]
-        return [
-            Sample(decode(payload), address, time.time_ns(), stamp.get_time_as_ntp64().as_nanos())
-            for address, payload, stamp in last
-        ]
+        return [Sample(decode(payload), address, time.time_ns(), stamp) for address, payload, stamp in last]
 
     def stop(self) -> None:
         """Ask it to end; callable from anywhere, a signal handler included."""

@@ -6,19 +6,23 @@ import json
 import logging
 import queue
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Final, Self, cast
+from typing import TYPE_CHECKING, Final, Self, cast
 
 import zenoh
 from pydantic_core import to_json
 
 from nedbus_msgs import (
     ENCODING,
+    PAYLOAD_SIZE,
     Address,
+    Row,
     VehicleLocalPosition,
     encode,
+    encode_fields,
+    encode_row,
     get_topic,
     json_schema,
     layout_table,
@@ -26,7 +30,10 @@ from nedbus_msgs import (
 )
 
 from .errors import AddressInUseError, ClosedError
-from .session import alive_keys, while_open
+from .session import alive_keys, translate, while_open
+
+if TYPE_CHECKING:
+    from nedbus_msgs.arrays import Records
 
 _log = logging.getLogger(__name__)
 
@@ -89,14 +96,45 @@ class Publisher:
         Raises pydantic.ValidationError for fields that are no message, EncodeError for a message whose validation was
         bypassed, ClosedError once the publisher or its bus is closed.
         """
-        if not isinstance(message, VehicleLocalPosition):
-            message = VehicleLocalPosition.model_validate(message)
-        payload = encode(message)
+        self._put(encode(message) if isinstance(message, VehicleLocalPosition) else encode_fields(message))
+
+    def publish_row(self, values: Sequence[object] | Row) -> None:
+        """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and send them.
+
+        The same as `publish` with these fields, and faster: no message is made of them.
+        """
+        self._put(encode_row(values))
+
+    def publish_many(self, records: Records) -> None:
+        """Validate messages in an array with the dtype nedbus_msgs.arrays.DTYPE, and send them; all or none.
+
+        Raises TypeError for another dtype, pydantic.ValidationError for the first message that the model refuses.
+        """
+        from nedbus_msgs.arrays import DTYPE, find_sound, to_message, write_records
+
+        if records.dtype != DTYPE:
+            raise TypeError("records have the dtype nedbus_msgs.arrays.DTYPE: convert with astype")
+        for record in records[~find_sound(records)]:
+            to_message(record)  # says what is wrong
         if self._closed:
             raise ClosedError
+        payloads = write_records(records)
+        put, new_timestamp = self._publisher.put, self._session.new_timestamp
         with while_open(self._session):
+            for start in range(0, len(payloads), PAYLOAD_SIZE):
+                payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
+                put(payload, timestamp=stamp)
+                self.last = payload, stamp
+                self.published += 1
+
+    def _put(self, payload: bytes) -> None:
+        if self._closed:
+            raise ClosedError
+        try:
             stamp = self._session.new_timestamp()
             self._publisher.put(payload, timestamp=stamp)
+        except zenoh.ZError as exc:
+            raise translate(exc, self._session) from exc
         self.last = payload, stamp
         self.published += 1
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 from nedbus_msgs import Address
 
-from .subscriber import Sample
+from .intake import Sample
 
 
 @dataclass(slots=True)

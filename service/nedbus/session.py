@@ -145,9 +145,12 @@ def while_open(session: Session) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as exc:
-        if session.is_closed():
-            raise ClosedError from exc
-        raise NedbusError(f"Zenoh refuses: {_first_sentence(exc)}") from exc
+        raise translate(exc, session) from exc
+
+
+def translate(error: zenoh.ZError, session: Session) -> NedbusError:
+    """Return what `while_open` raises for this error."""
+    return ClosedError() if session.is_closed() else NedbusError(f"Zenoh refuses: {_first_sentence(error)}")
 
 
 def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
@@ -169,11 +172,11 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 
 
 def receive(handler: zenoh.Handler[_T]) -> list[_T]:
-    """Wait for something, and return all that is there, up to 256; empty once the subscriber is undeclared."""
+    """Wait for something, and return all that is there, up to 1024; empty once the subscriber is undeclared."""
     batch: list[_T] = []
     with suppress(zenoh.ZError):
         batch.append(handler.recv())
-        while len(batch) < 256 and (item := handler.try_recv()) is not None:
+        while len(batch) < 1024 and (item := handler.try_recv()) is not None:
             batch.append(item)
     return batch
 

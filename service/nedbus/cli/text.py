@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 
-from nedbus.subscriber import Sample
+from nedbus.intake import Sample
 from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
 
 _OLD = 1.0  # s of latency that a line tells of: the last value of a stream that ended, or a recovered one

@@ -11,8 +11,9 @@ import typer
 
 from nedbus.bus import Bus
 from nedbus.errors import NoDataError
+from nedbus.intake import Mode, Sample
 from nedbus.rates import Rates
-from nedbus.subscriber import Mode, Sample, Subscription
+from nedbus.subscriber import Subscription
 from nedbus_msgs import ANY, Address
 
 from .options import (

@@ -1,0 +1,40 @@
+"""The straightforward way: a Pydantic model, a msgpack map of its fields, validated again on arrival."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import msgpack
+import zenoh
+from pydantic import BaseModel, ConfigDict, create_model
+
+from .fields import FIELDS
+from .zenoh_session import KEY, open_session
+
+Position = create_model(
+    "Position",
+    __config__=ConfigDict(frozen=True, strict=True, extra="forbid"),
+    **{name: (tuple[float, float] if type(value) is tuple else type(value), ...) for name, value in FIELDS.items()},
+)
+
+
+@contextmanager
+def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+    with open_session(endpoint) as session:
+        publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
+
+        def send(stamp: int) -> None:
+            message = Position(**{**FIELDS, "timestamp": stamp})
+            publisher.put(msgpack.packb(message.model_dump()))
+
+        yield send
+
+
+def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    with open_session(endpoint) as session:
+        subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1024))
+        ready()
+        for sample in subscriber:
+            message: BaseModel = Position.model_validate(msgpack.unpackb(sample.payload.to_bytes(), use_list=False))
+            if not seen(message.timestamp if message.x else 0):
+                break
+        subscriber.undeclare()

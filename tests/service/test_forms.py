@@ -1,0 +1,172 @@
+"""Rows and batches over a real router: what arrives, from where, and what is counted."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+
+import msgpack
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+import nedbus
+from nedbus.batches import Batch
+from nedbus.session import Session
+from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
+from nedbus_msgs.arrays import DTYPE, to_message, to_records
+from tests.conftest import message
+
+VLP = "vehicle_local_position"
+COUNT = 5000
+
+
+def take_rows(subscription: nedbus.Subscription, count: int) -> list[nedbus.Sample]:
+    rows = subscription.rows()
+    return [next(rows) for _ in range(count)]
+
+
+def as_message(sample: nedbus.Sample) -> VehicleLocalPosition:
+    assert isinstance(sample.message, Row)
+    return VehicleLocalPosition(**sample.message._asdict())
+
+
+def take_batches(batches: Iterator[Batch], count: int) -> list[Batch]:
+    taken: list[Batch] = []
+    while sum(map(len, taken)) < count:
+        taken.append(next(batches))
+    return taken
+
+
+def test_rows_are_the_messages(bus: nedbus.Bus, endpoint: str) -> None:
+    """Sent as rows, read as rows: named tuples with the same values, in order, none lost."""
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        sent = [message(number, x=number / 3, xy_valid=True, y=0.0) for number in range(1, COUNT)]
+        for each in sent:
+            publisher.publish_row(tuple(each.__dict__.values()))
+        samples = take_rows(subscription, len(sent))
+        assert all(isinstance(sample.message, Row) for sample in samples)
+        assert [as_message(sample) for sample in samples] == sent
+        assert {sample.address for sample in samples} == {Address("1", VLP)}
+        assert subscription.counts == nedbus.Counts(received=len(sent))
+
+
+def test_batches_hold_everything(bus: nedbus.Bus, endpoint: str) -> None:
+    """Sent as an array, read as arrays: the same values, with address, sequence and time of each."""
+    records = to_records([message(number, x=number / 3) for number in range(1, COUNT)])
+    with nedbus.connect(endpoint) as other, other.subscribe(mode="every") as subscription:
+        for vehicle in ("1", "2"):
+            bus.publisher(VLP, vehicle=vehicle, lossless=True).publish_many(records)
+        batches = take_batches(subscription.batches(), 2 * len(records))
+        for vehicle in ("1", "2"):
+            own = np.concatenate([batch.of(Address(vehicle, VLP)) for batch in batches])
+            assert own.tobytes() == records.tobytes()
+        for batch in batches:
+            assert len(batch) == len(batch.which) == len(batch.sent) == len(batch.sequence)
+            assert (batch.sent <= batch.received).all()
+            assert (batch.sent > batch.received - 60e9).all()
+            for place in range(len(batch.addresses)):
+                assert (np.diff(batch.sequence[batch.which == place]) == 1).all()
+        assert subscription.counts == nedbus.Counts(received=2 * len(records))
+        assert sum(batch.lost for batch in batches) == 0
+
+
+@pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
+def test_odd_ones_go_the_slow_way(bus: nedbus.Bus, raw: Session, endpoint: str, filler: int) -> None:
+    """Among others: another encoder's, an older layout's, invalid ones and wrong keys, with the same end as singly."""
+    good = message(7, x=1.5, hagl_max_z=3.0, hagl_max_xy=3.0)
+    values = [list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()]
+    old = [list(value) if isinstance(value, tuple) else value for value in downgrade(good, "V0").values()]
+    assert len(old) == len(LAYOUTS["V0"].fields)
+    key = f"nedbus/1/{VLP}"
+    payloads = [encode(good)] * filler + [msgpack.packb([1, *values]), msgpack.packb([0, *old])]
+    bad = bytearray(encode(good))
+    bad[4 + 9] = 0xC0  # a tag
+    with nedbus.connect(endpoint) as other, other.subscribe(mode="every") as subscription:
+        for payload in (*payloads, bytes(bad), b"", encode(good) + b"\0", *payloads):
+            raw.put(key, payload)
+        raw.put(f"nedbus/*/{VLP}", encode(good))
+        raw.delete(key)
+        raw.put("nedbus/1/nothing", encode(good))
+        batches = subscription.batches()
+        taken = take_batches(batches, 2 * len(payloads))
+        raw.put(key, encode(message(8)))
+        taken += take_batches(batches, 1)
+        messages = [to_message(record) for batch in taken for record in batch.messages]
+        assert messages == [good] * 2 * len(payloads) + [message(8)]
+        assert {address for batch in taken for address in batch.addresses} == {Address("1", VLP)}
+        assert subscription.counts == nedbus.Counts(received=len(messages), invalid=6)
+
+
+def test_batches_then_singles(bus: nedbus.Bus, endpoint: str) -> None:
+    """A reader may change from batches to single samples: nothing counts as lost for that."""
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        for start in (1, 101, 201):
+            for number in range(start, start + 100):
+                publisher.publish(message(number))
+            if start == 101:
+                taken = sum(map(len, take_batches(subscription.batches(), 100)))
+                assert taken == 100
+            else:
+                samples = [subscription.receive(30.0) for _ in range(100)]
+                assert [sample.message.timestamp for sample in samples] == list(range(start, start + 100))
+                assert not any(sample.lost for sample in samples)
+        assert subscription.counts == nedbus.Counts(received=300)
+
+
+def test_latest_in_batches(bus: nedbus.Bus, endpoint: str) -> None:
+    """In mode "latest" a batch has the newest of each key."""
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP) as subscription:
+        publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in "ab"]
+        for number in range(1, 200):
+            for publisher in publishers:
+                publisher.publish(message(number))
+        seen: dict[str, int] = {}
+        for batch in subscription.batches():
+            assert len(batch.addresses) == len(batch)
+            for address, place in zip(batch.addresses, batch.which, strict=True):
+                seen[address.vehicle] = int(batch.messages["timestamp"][place])
+            if seen == {"a": 199, "b": 199}:
+                break
+
+
+def test_array_that_is_refused_sends_nothing(bus: nedbus.Bus) -> None:
+    """One bad message, or another dtype: an error, and none of the array is sent."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    records = to_records([message(1), message(2)])
+    records["eph"][1] = -1.0
+    with pytest.raises(ValidationError, match="eph"):
+        publisher.publish_many(records)
+    with pytest.raises(TypeError, match="astype"):
+        publisher.publish_many(np.zeros(3, [("x", "f4")]))
+    assert publisher.published == 0
+    publisher.publish_many(np.empty(0, DTYPE))
+    publisher.close()
+    with pytest.raises(nedbus.ClosedError):
+        publisher.publish_many(records[:1])
+
+
+def test_async_rows_and_batches(bus: nedbus.Bus, endpoint: str) -> None:
+    """The twin has the same two ways, for `async for`."""
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+
+    async def read() -> tuple[list[int], int]:
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            publisher.publish_many(to_records([message(number) for number in range(1, 301)]))
+            stamps = []
+            async for sample in subscription.rows():
+                stamps.append(sample.message.timestamp)
+                if len(stamps) == 100:
+                    break
+            count = 0
+            async for batch in subscription.batches():
+                count += len(batch)
+                if count == 200:
+                    break
+            await subscription.close()
+            assert [sample async for sample in subscription.rows()] == []
+            return stamps, count
+
+    assert asyncio.run(read()) == (list(range(1, 101)), 200)
