@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import Start
+
 ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
@@ -20,7 +22,7 @@ ONLY = {  # packages that only these files import
     "pyulog": {"ulog"},
     "numpy": {"ulog", "arrays", "batches"},
     "pydantic_settings": {"settings"},
-    "typer": {"__init__", "certificates", "options", "look", "watch", "serve"},
+    "typer": {"app", "certificates", "options", "look", "watch", "serve"},
     "rich": {"progress"},
     "cryptography": {"pki", "certificates"},
 }
@@ -76,7 +78,21 @@ def test_door_is_sorted_and_complete(name: str) -> None:
         assert getattr(module, word).__doc__, word
     public = {word for word in vars(module) if not word.startswith("_")}
     submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
-    assert public - submodules - {"annotations"} <= set(module.__all__)
+    assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
+
+
+@pytest.mark.parametrize(
+    ("program", "absent"),
+    [
+        ("import sys; sys.argv = ['nedbus', '--version']; from nedbus.cli import main; main()", "pydantic zenoh typer"),
+        ("import nedbus; nedbus.connect", "numpy pyulog typer rich cryptography"),
+        ("import nedbus.cli.app", "numpy pyulog rich.progress cryptography"),
+    ],
+)
+def test_what_is_not_used_is_not_loaded(start: Start, program: str, absent: str) -> None:
+    """A command is there at once: what it does not need is not imported."""
+    process = start("-c", f"{program}\nimport sys\nassert not set({absent.split()!r}) & set(sys.modules)")
+    assert process.wait() == 0, process.err
 
 
 def test_error_tree_is_drawn() -> None:

@@ -7,27 +7,32 @@ with nedbus.connect() as bus:
         print(sample.vehicle, sample.message.x, sample.message.y, sample.message.z)
 """
 
-from nedbus_msgs import Address, VehicleLocalPosition
+from __future__ import annotations
 
-from .bus import AsyncBus, Bus, connect, connect_async
-from .errors import (
-    AddressError,
-    AddressInUseError,
-    ClosedError,
-    ConfigError,
-    ConnectError,
-    DecodeError,
-    EncodeError,
-    LayoutError,
-    ListenError,
-    NedbusError,
-    NoDataError,
-    SourceError,
-    UnknownLayoutError,
-)
-from .intake import Counts, Sample
-from .publisher import Publisher
-from .subscriber import AsyncSubscription, Subscription
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nedbus_msgs import Address, Row, VehicleLocalPosition
+
+    from .bus import AsyncBus, Bus, connect, connect_async
+    from .errors import (
+        AddressError,
+        AddressInUseError,
+        ClosedError,
+        ConfigError,
+        ConnectError,
+        DecodeError,
+        EncodeError,
+        LayoutError,
+        ListenError,
+        NedbusError,
+        NoDataError,
+        SourceError,
+        UnknownLayoutError,
+    )
+    from .intake import Counts, Sample
+    from .publisher import Publisher
+    from .subscriber import AsyncSubscription, Subscription
 
 __version__ = "0.1.0"
 
@@ -49,6 +54,7 @@ __all__ = [
     "NedbusError",
     "NoDataError",
     "Publisher",
+    "Row",
     "Sample",
     "SourceError",
     "Subscription",
@@ -57,3 +63,16 @@ __all__ = [
     "connect",
     "connect_async",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Load everything when the first thing is asked for, and nothing before: `nedbus --version` needs nothing."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import nedbus_msgs
+
+    from . import bus, errors, intake, publisher, subscriber
+
+    for module in (nedbus_msgs, bus, errors, intake, publisher, subscriber):
+        globals().update({each: vars(module)[each] for each in __all__ if each in vars(module)})
+    return globals()[name]

@@ -1,0 +1,56 @@
+"""The table of commands."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Mapping
+from typing import Annotated
+
+import typer
+
+from nedbus import __version__
+
+from .certificates import pki
+from .look import get, health, info, list_, schema
+from .options import write
+from .serve import router, serve
+from .watch import echo, hz
+
+app = typer.Typer(
+    name="nedbus",
+    help="PX4's local position estimate, validated, on every host.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+_COMMANDS: Mapping[str, Callable[..., None]] = {
+    "serve": serve,
+    "router": router,
+    "list": list_,
+    "echo": echo,
+    "hz": hz,
+    "get": get,
+    "info": info,
+    "health": health,
+    "schema": schema,
+}
+for _name, _function in _COMMANDS.items():
+    app.command(_name)(_function)
+app.add_typer(pki, name="pki")
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        write(f"nedbus {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _set_up(
+    *,
+    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
+) -> None:
+    logging.basicConfig(stream=sys.stderr, format="%(asctime)s %(levelname)-7s %(message)s", datefmt="%H:%M:%S")
+    logging.getLogger("nedbus").setLevel(logging.DEBUG if debug else logging.INFO)
