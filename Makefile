@@ -31,7 +31,12 @@ wheel: $(READY)  ## build the wheel, install it where nothing else is, and use i
 	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
 
-bench: $(READY)  ## measure: pacing of a replay, cost of an idle service
+bench: $(READY)  ## measure: beside the peers, with many vehicles, pacing of a replay, cost of an idle service
+	$(BIN)/pip install -q --group bench
+	$(BIN)/python -m benchmarks.compare
+	$(BIN)/python -m benchmarks.picture
+	$(BIN)/python -m benchmarks.scale
+	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, cast
 
-QUIET = 5.0  # s without a message after which a receiver gives up
+QUIET = 3.0  # s without a message after which a receiver gives up
 
 
 class Form(Protocol):
@@ -54,17 +54,17 @@ def publish(form: Form, endpoint: str, count: int, rate: float) -> None:
         else:
             for number in range(0, count, size):
                 send(range(number + 1, min(count, number + size) + 1))
-        report(start, cpu)
+        report(start, cpu, end=time.monotonic())
         sys.stdin.readline()
 
 
 def receive(form: Form, endpoint: str, count: int, rate: float) -> None:
     """Take this many messages, or fewer if no more come."""
-    received, first, last, cpu = 0, 0.0, 0.0, 0.0
+    received, first, cpu = 0, 0.0, 0.0
     delays: list[int] = []
 
     def seen(stamp: int | Sequence[int]) -> bool:
-        nonlocal received, first, last, cpu
+        nonlocal received, first, cpu
         if not received:
             first, cpu = time.monotonic(), time.process_time()
         if isinstance(stamp, int):
@@ -79,30 +79,30 @@ def receive(form: Form, endpoint: str, count: int, rate: float) -> None:
         return received < count
 
     def watch() -> None:
-        before = -1
         sys.stdin.readline()
-        while received > before:
-            before = received
-            time.sleep(QUIET)
-        finish()
+        before, changed = -1, time.monotonic()
+        while time.monotonic() < changed + QUIET:
+            if received > before:
+                before, changed = received, time.monotonic()
+            time.sleep(0.05)
+        finish(changed)
 
-    def finish() -> None:
+    def finish(end: float) -> None:
         delays.sort()
         found = {f"p{part}": delays[len(delays) * part // 100] / 1e3 for part in (50, 99)} if delays else {}
-        report(first, cpu, received=received, **found)
-        sys.stdout.flush()
+        report(first, cpu, end=end, received=received, **found)
         os._exit(0)  # it may be waiting for ever for the rest
 
     threading.Thread(target=watch, daemon=True).start()
     form.receive(endpoint, lambda: print("ready", flush=True), seen)
-    finish()
+    finish(time.monotonic())
 
 
-def report(start: float, cpu: float, **measured: float) -> None:
+def report(start: float, cpu: float, *, end: float, **measured: float) -> None:
     """Print the result."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(
-        json.dumps({"seconds": time.monotonic() - start, "cpu": time.process_time() - cpu, "peak": peak, **measured}),
+        json.dumps({"seconds": end - start, "cpu": time.process_time() - cpu, "peak": peak, **measured}),
         flush=True,
     )
 

@@ -15,6 +15,7 @@ SAYS = {
     "position_async.py": "Counts(received=",
     "fleet.py": "vehicle 1: 5 streams",
     "compare_estimators.py": "estimator 1: ",
+    "batches.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
 }
 

@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from .position import FIELD_TYPES, TypeName, VehicleLocalPosition
+from .position import FIELD_TYPES, VehicleLocalPosition
+from .px4_types import TypeName
 from .rules import FLAGGED, NOT_NEGATIVE, WITHIN
 from .wire import NO_VALUES, PAYLOAD_SIZE, TAGS, places_on_the_wire
 
@@ -92,7 +93,6 @@ def to_records(messages: Sequence[VehicleLocalPosition]) -> Records:
 
 def to_message(record: np.void) -> VehicleLocalPosition:
     """Return one record as a message; raise pydantic.ValidationError for what the model refuses."""
-    fields: dict[str, Any] = {name: record[name].tolist() for name in FIELD_TYPES}
-    return VehicleLocalPosition.model_validate(
-        {name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()}
-    )
+    values = (tuple(value.tolist()) if isinstance(value, np.ndarray) else value for value in record.item())
+    fields: dict[str, Any] = dict(zip(FIELD_TYPES, values, strict=True))
+    return VehicleLocalPosition(**fields)

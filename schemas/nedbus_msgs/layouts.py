@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Final, cast
 
 from .errors import LayoutError
-from .position import FIELD_TYPES, TypeName, VehicleLocalPosition
+from .position import FIELD_TYPES, VehicleLocalPosition
+from .px4_types import TypeName
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,9 @@ from pydantic import ValidationError
 
 from .errors import DecodeError, EncodeError, UnknownLayoutError
 from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
-from .position import FIELD_TYPES, TypeName, VehicleLocalPosition
-from .rows import NAMES, Row, Values, check_row, message_of, row_of
+from .position import FIELD_TYPES, NAMES, Values, VehicleLocalPosition, check_row, message_of, row_of
+from .px4_types import TypeName
+from .rows import Row
 
 PAYLOAD_SIZE: Final = 244
 """Bytes of every payload that `encode` writes."""

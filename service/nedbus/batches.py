@@ -12,7 +12,7 @@ import numpy.typing as npt
 import zenoh
 
 from nedbus_msgs import PAYLOAD_SIZE, Address, VehicleLocalPosition
-from nedbus_msgs.arrays import DTYPE, Records, read_records, to_records
+from nedbus_msgs.arrays import Records, read_records, to_records
 
 _FEW: Final = 8  # messages below which whole columns cost more than one by one
 
@@ -71,22 +71,37 @@ def make_batch(
     `judge` gives the message of one that needs a closer look, None if it is invalid.
     """
     if len(raw) < _FEW:
-        messages, valid = np.empty(len(raw), DTYPE), np.zeros(len(raw), np.bool_)
+        judged = list(map(judge, raw))
+        messages = to_records([message for message in judged if message is not None])
+        valid = np.array([message is not None for message in judged])
     else:
-        payloads = [sample.payload.to_bytes() for sample in raw]
-        if set(map(len, payloads)) != {PAYLOAD_SIZE}:
-            payloads = [payload if len(payload) == PAYLOAD_SIZE else bytes(PAYLOAD_SIZE) for payload in payloads]
-        messages, valid = read_records(b"".join(payloads))
-        if len(addresses) < len(set(keys)):
-            valid &= [key in addresses for key in keys]
+        messages, valid = _read(raw, keys, addresses, judge)
     if not valid.all():
-        for place in np.flatnonzero(~valid).tolist():
-            message = judge(raw[place])
-            if message is not None:
-                messages[place : place + 1] = to_records([message])
-                valid[place] = True
         kept = np.flatnonzero(valid).tolist()
-        messages, raw, keys = messages[kept], [raw[place] for place in kept], [keys[place] for place in kept]
+        raw, keys = [raw[place] for place in kept], [keys[place] for place in kept]
     places = {key: place for place, key in enumerate(dict.fromkeys(keys))}
     which = np.fromiter(map(places.__getitem__, keys), np.intp, len(keys))
     return Batch(messages, tuple(addresses[key] for key in places), which, received, lost, raw)
+
+
+def _read(
+    raw: Sequence[zenoh.Sample],
+    keys: Sequence[str],
+    addresses: Mapping[str, Address],
+    judge: Callable[[zenoh.Sample], VehicleLocalPosition | None],
+) -> tuple[Records, npt.NDArray[np.bool_]]:
+    """Return the valid messages, and which of all were valid."""
+    payloads = [sample.payload.to_bytes() for sample in raw]
+    if set(map(len, payloads)) != {PAYLOAD_SIZE}:
+        payloads = [payload if len(payload) == PAYLOAD_SIZE else bytes(PAYLOAD_SIZE) for payload in payloads]
+    messages, valid = read_records(b"".join(payloads))
+    if len(addresses) < len(set(keys)):
+        valid &= [key in addresses for key in keys]
+    if valid.all():
+        return messages, valid
+    for place in np.flatnonzero(~valid).tolist():
+        message = judge(raw[place])
+        if message is not None:
+            messages[place : place + 1] = to_records([message])
+            valid[place] = True
+    return messages[valid], valid

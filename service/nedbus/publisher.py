@@ -39,6 +39,7 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
+_FEW: Final = 8  # messages below which whole columns cost more than one by one
 _JSON: Final = "application/json"
 
 Answer = tuple[str, bytes, str, "zenoh.Timestamp | None"]
@@ -114,6 +115,10 @@ class Publisher:
 
         if records.dtype != DTYPE:
             raise TypeError("records have the dtype nedbus_msgs.arrays.DTYPE: convert with astype")
+        if len(records) < _FEW:
+            for message in [to_message(record) for record in records]:
+                self.publish(message)
+            return
         for record in records[~find_sound(records)]:
             to_message(record)  # says what is wrong
         if self._closed:

@@ -31,6 +31,7 @@ RawSample = zenoh.Sample
 
 # What holds for every session of ours. Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
+# Longer queues than Zenoh's own take up the bursts of a fleet, where two batches are full in a moment.
 # A side that says nothing for as long as its lease is given up: a frozen host, a cut cable.
 # Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a stamp.
 _COMMON: Final = {
@@ -39,6 +40,8 @@ _COMMON: Final = {
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
     "transport/link/tx/lease": 5000,
+    "transport/link/tx/queue/size/data_high": 4,
+    "transport/link/tx/queue/size/data": 4,
 }
 
 
@@ -172,11 +175,11 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 
 
 def receive(handler: zenoh.Handler[_T]) -> list[_T]:
-    """Wait for something, and return all that is there, up to 1024; empty once the subscriber is undeclared."""
+    """Wait for something, and return all that is there, up to 4096; empty once the subscriber is undeclared."""
     batch: list[_T] = []
     with suppress(zenoh.ZError):
         batch.append(handler.recv())
-        while len(batch) < 1024 and (item := handler.try_recv()) is not None:
+        while len(batch) < 4096 and (item := handler.try_recv()) is not None:
             batch.append(item)
     return batch
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _RING: Final = 4096  # samples that wait for the pump of a `latest` reader
 _FIFO: Final = 4096  # samples that wait for the pump of an `every` reader; then Zenoh holds back, drops and recovers
 _BUSY: Final = 8  # samples at once from which on a pump waits a little, to be woken once for many
-_PAUSE: Final = 0.001  # s
+_PAUSE: Final = 0.002  # s
 _TURNS: Final = 64  # samples after which an asyncio reader gives way to others
 _T = TypeVar("_T")
 

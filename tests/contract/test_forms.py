@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pydantic import ValidationError
+from pydantic import ValidationError, field_validator
 
 from nedbus_msgs import (
     FIELD_TYPES,
@@ -29,6 +29,7 @@ from nedbus_msgs.arrays import DTYPE, find_sound, read_records, to_message, to_r
 
 from .strategies import FLAGGED, NOT_NEGATIVE, WITHIN, bits, messages
 
+GOOD = encode(VehicleLocalPosition.model_validate({"timestamp": 5, **dict.fromkeys(["vxy_max", "eph"], math.inf)}))
 # What a field may be given, good or bad, whatever its type.
 ODD = st.one_of(
     st.integers(-(2**70), 2**70),
@@ -72,13 +73,16 @@ def reasons(send: Callable[[Any], bytes], values: object) -> str:
 
 @given(messages(), CHANGES)
 def test_fields_and_rows_are_judged_as_by_the_model(message: VehicleLocalPosition, changes: dict[str, object]) -> None:
-    """Sent as fields or as a row: the same bytes, or the same refusal, with the same reasons."""
+    """Made by keywords, sent as fields or as a row: the same bytes, or the same refusal, with the same reasons."""
     fields = {**message.model_dump(), **changes}
     right = judged(fields)
     if right is not None:
-        assert encode_fields(fields) == encode_row(list(fields.values())) == right
+        made = VehicleLocalPosition(**fields)
+        assert encode(made) == encode_fields(fields) == encode_row(list(fields.values())) == right
+        assert bits(made) == bits(VehicleLocalPosition.model_validate(fields))
         return
     why = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == why
     assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == why
 
 
@@ -172,3 +176,29 @@ def test_row_of_another_length_is_refused(values: list[object]) -> None:
     """Too few or too many values are no message."""
     with pytest.raises(EncodeError, match="where a row has 53"):
         encode_row(values)
+
+
+class Low(VehicleLocalPosition):
+    """A user's own model, which wants more."""
+
+    @field_validator("z")
+    @classmethod
+    def _low(cls, z: float) -> float:
+        if z < -10:
+            raise ValueError("too high")
+        return z
+
+
+def test_subclass_keeps_its_own_rules() -> None:
+    """The quick lane is for the model itself: whoever derives from it is asked."""
+    fields = {name: value for name, value in decode(GOOD).model_dump().items() if name != "z"}
+    assert type(Low(z=-5.0, **fields)) is Low
+    with pytest.raises(ValidationError, match="too high"):
+        Low(z=-20.0, **fields)
+
+
+def test_dicts_and_json_do_not_pass_through_the_constructor() -> None:
+    """Pydantic takes the constructor for its own: JSON keeps its words for what is no number."""
+    assert not VehicleLocalPosition.__pydantic_custom_init__
+    message = decode(GOOD)
+    assert bits(VehicleLocalPosition.model_validate_json(message.model_dump_json())) == bits(message)

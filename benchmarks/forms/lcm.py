@@ -1,0 +1,76 @@
+"""LCM without a router: the class that lcm-gen makes, over UDP multicast that stays on this machine; may lose some."""
+
+import importlib
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import lcm
+
+from .fields import FIELDS
+
+PACKAGES = ["lcm==1.5.3"]
+
+URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4194304"
+CHANNEL = "vehicle_local_position"
+
+
+def field(name: str, value: object) -> str:
+    """Declare it with the type that PX4 has, but signed where LCM has no other."""
+    if type(value) is bool:
+        return f"boolean {name};"
+    if type(value) is int:
+        return f"{'int64_t' if 'timestamp' in name else 'byte'} {name};"
+    if type(value) is tuple:
+        return f"float {name}[2];"
+    return f"{'double' if name in {'ref_lat', 'ref_lon'} else 'float'} {name};"
+
+
+def generate() -> Any:
+    """Run lcm-gen, as a build does, and import what it wrote."""
+    with tempfile.TemporaryDirectory() as directory:
+        source = Path(directory, "position.lcm")
+        source.write_text(f"struct bench_position {{ {' '.join(field(*item) for item in FIELDS.items())} }}")
+        subprocess.run([Path(lcm.LCM_BIN_DIR, "lcm-gen"), "-p", "--ppath", directory, source], check=True)
+        sys.path.insert(0, directory)
+        try:
+            return importlib.import_module("bench_position").bench_position
+        finally:
+            sys.path.remove(directory)
+
+
+Position = generate()
+
+
+@contextmanager
+def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+    link = lcm.LCM(URL)
+
+    def send(stamp: int) -> None:
+        message = Position()
+        for name, value in FIELDS.items():
+            setattr(message, name, value)
+        message.timestamp = stamp
+        link.publish(CHANNEL, message.encode())
+
+    yield send
+
+
+def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    going = True
+
+    def take(_channel: str, data: bytes) -> None:
+        nonlocal going
+        message = Position.decode(data)
+        going = seen(message.timestamp if message.x else 0)
+
+    link = lcm.LCM(URL)
+    subscription = link.subscribe(CHANNEL, take)
+    subscription.set_queue_capacity(0)  # no limit
+    ready()
+    while going:
+        link.handle()

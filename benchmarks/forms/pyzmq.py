@@ -1,0 +1,39 @@
+"""ZeroMQ without a router: PUB and SUB, a msgpack map without types; a publisher that is too fast waits."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import msgpack
+import zmq
+
+from .fields import FIELDS
+
+PACKAGES = ["pyzmq==27.3.0", "msgpack==1.2.4"]
+
+
+def address(endpoint: str) -> str:
+    """Take the port beside the router's."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    return f"tcp://{host}:{int(port) + 1}"
+
+
+@contextmanager
+def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+    with zmq.Context() as context, context.socket(zmq.PUB) as socket:
+        socket.set(zmq.SNDHWM, 1024)
+        socket.set(zmq.XPUB_NODROP, 1)
+        socket.set(zmq.LINGER, 0)
+        socket.bind(address(endpoint))
+        yield lambda stamp: socket.send(msgpack.packb({**FIELDS, "timestamp": stamp}))
+
+
+def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.set(zmq.RCVHWM, 1024)
+        socket.set(zmq.SUBSCRIBE, b"")
+        socket.connect(address(endpoint))
+        ready()
+        while True:
+            message = msgpack.unpackb(socket.recv())
+            if not seen(message["timestamp"] if message["x"] else 0):
+                break

@@ -1,0 +1,106 @@
+"""A real load: 10 vehicles, all four topics at PX4's rates, one reader of everything; CPU time beside raw Zenoh's.
+
+2,040 messages a second. The publisher makes a validated message of each, the reader gets validated ones.
+"""
+
+from __future__ import annotations
+
+import time
+
+import psutil
+
+from .scale import expect, start, tell
+
+ENDPOINT = "tcp/127.0.0.1:17464"
+SECONDS = 20
+VEHICLES = 10
+
+PLAN = """
+import sys, time
+from benchmarks.forms.fields import FIELDS
+vehicles, seconds, endpoint = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+STREAMS = {"vehicle_local_position": 1, "vehicle_local_position_groundtruth": 2, "external_ins_local_position": 2,
+           "estimator_local_position/0": 50, "estimator_local_position/1": 50}  # every how many ticks of 10 ms
+def play(send):
+    print("ready", flush=True)
+    sys.stdin.readline()
+    start = time.monotonic()
+    for tick in range(seconds * 100):
+        wait = start + tick / 100 - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        for vehicle in range(vehicles):
+            for stream, every in STREAMS.items():
+                if tick % every == 0:
+                    send(vehicle, stream, tick + 1)
+    print("done", flush=True)
+    sys.stdin.readline()
+"""
+RAW_PUBLISHER = """
+from benchmarks.forms.zenoh_session import open_session
+session = open_session(endpoint)
+publishers = {(v, s): session.declare_publisher(f"raw/{v}/{s}") for v in range(vehicles) for s in STREAMS}
+payload = bytes(244)
+play(lambda vehicle, stream, stamp: publishers[vehicle, stream].put(payload))
+session.close()
+"""
+RAW_READER = """
+import sys, zenoh
+from benchmarks.forms.zenoh_session import open_session
+session = open_session(sys.argv[1])
+subscriber = session.declare_subscriber("raw/**", zenoh.handlers.FifoChannel(1024))
+print("ready", flush=True)
+for sample in subscriber:
+    sample.payload.to_bytes()
+"""
+PUBLISHER = """
+import nedbus
+with nedbus.connect(endpoint) as bus:
+    publishers = {}
+    for v in range(vehicles):
+        for s in STREAMS:
+            topic, _, instance = s.partition("/")
+            publishers[v, s] = bus.publisher(topic, vehicle=str(v), instance=int(instance) if instance else None)
+    play(lambda vehicle, stream, stamp: publishers[vehicle, stream].publish({**FIELDS, "timestamp": stamp}))
+"""
+READER = """
+import sys, nedbus
+with nedbus.connect(sys.argv[1]) as bus, bus.subscribe() as subscription:
+    print("ready", flush=True)
+    for sample in subscription:
+        sample.message.x
+"""
+
+
+def main() -> None:
+    """Measure and print."""
+    print(f"{VEHICLES} vehicles, four topics, {SECONDS} s      CPU: publisher  router  reader")
+    raw = measure("raw Zenoh", PLAN + RAW_PUBLISHER, RAW_READER)
+    own = measure("nedbus", PLAN + PUBLISHER, READER)
+    ratios = [one / other for one, other in zip(own, raw, strict=True)]
+    print(f"{'nedbus / raw':40} {ratios[0]:10.2f} {ratios[1]:7.2f} {ratios[2]:7.2f}, all {sum(own) / sum(raw):.2f}")
+
+
+def measure(name: str, publish: str, read: str) -> list[float]:
+    """Return the CPU time of publisher, router and reader, as shares of a core."""
+    router = start("-m", "nedbus", "router", "--listen", ENDPOINT)
+    time.sleep(1.0)
+    reader = start("-c", read, ENDPOINT)
+    expect(reader)
+    publisher = start("-c", publish, str(VEHICLES), str(SECONDS), ENDPOINT)
+    expect(publisher)
+    time.sleep(1.0)
+    processes = [psutil.Process(process.pid) for process in (publisher, router, reader)]
+    before = [sum(process.cpu_times()[:2]) for process in processes]
+    tell(publisher)
+    expect(publisher)
+    used = [(sum(process.cpu_times()[:2]) - each) / SECONDS for process, each in zip(processes, before, strict=True)]
+    for process in (reader, publisher, router):
+        process.kill()
+        process.wait()
+    print(f"{name:40} {used[0]:10.1%} {used[1]:7.1%} {used[2]:7.1%}", flush=True)
+    return used
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,13 @@
+"""Read all vehicles by the thousand: mean speed of each, from NumPy arrays."""
+
+import numpy as np
+
+import nedbus
+
+with nedbus.connect() as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+    for batch in subscription.batches():
+        for address in batch.addresses:
+            own = batch.of(address)
+            own = own[own["v_xy_valid"]]
+            if len(own):
+                print(address.vehicle, len(own), f"{np.hypot(own['vx'], own['vy']).mean():.2f} m/s", flush=True)

@@ -1,0 +1,61 @@
+"""The hot path cannot silently get slow: ratios in one process, whatever the machine."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.conftest import Start
+
+# Coverage would slow down our Python and not what it is compared with: this runs in a process without it.
+PROGRAM = """
+import json, timeit
+import msgpack
+from pydantic import ConfigDict, create_model
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, decode, decode_row, encode, encode_row
+from nedbus_msgs.arrays import read_records, to_records, write_records
+
+numbers = {"uint64": 5, "uint8": 3, "bool": True, "float32": 0.1, "float32[2]": (0.5, 0.7), "float64": 47.123456789}
+message = VehicleLocalPosition(**{name: numbers[kind] for name, kind in FIELD_TYPES.items()})
+fields = message.model_dump()
+types = {name: (tuple[float, float] if type(value) is tuple else type(value), ...) for name, value in fields.items()}
+Plain = create_model("Plain", __config__=ConfigDict(frozen=True, strict=True, extra="forbid"), **types)
+payload, row, many = encode(message), tuple(fields.values()), to_records([message] * 1000)
+packed, payloads = msgpack.packb(fields), encode(message) * 1000
+cases = {
+    "plain decode": lambda: Plain.model_validate(msgpack.unpackb(packed, use_list=False)),
+    "plain encode": lambda: msgpack.packb(Plain(**fields).model_dump()),
+    "decode": lambda: decode(payload),
+    "decode_row": lambda: decode_row(payload),
+    "encode": lambda: encode(VehicleLocalPosition(**fields)),
+    "encode_row": lambda: encode_row(row),
+    "read_records": lambda: read_records(payloads),
+    "write_records": lambda: write_records(many),
+}
+best = dict.fromkeys(cases, float("inf"))
+for _ in range(30):  # interleaved, and the best counts: what else the machine does falls on all alike
+    for name, case in cases.items():
+        count = 2 if "records" in name else 200
+        best[name] = min(best[name], timeit.timeit(case, number=count) / count)
+print(json.dumps(best))
+"""
+
+BOUNDS = {  # of the straightforward way: unpack a map and validate it, or validate, dump and pack one
+    "decode": ("plain decode", 1.1, 1),
+    "decode_row": ("plain decode", 0.75, 1),
+    "read_records": ("plain decode", 0.05, 1000),
+    "encode": ("plain encode", 1.5, 1),
+    "encode_row": ("plain encode", 0.6, 1),
+    "write_records": ("plain encode", 0.05, 1000),
+}
+
+
+@pytest.mark.timeout(120)
+def test_hot_path_is_as_fast_as_it_was(start: Start) -> None:
+    """Each form costs no more than its share of the straightforward way, with room of a half over what was measured."""
+    process = start("-c", PROGRAM, measured=False)
+    assert process.wait(100.0) == 0, process.err
+    best = json.loads(process.out)
+    ratios = {name: best[name] / messages / best[plain] for name, (plain, _, messages) in BOUNDS.items()}
+    assert all(ratios[name] < bound for name, (_, bound, _) in BOUNDS.items()), ratios
