@@ -102,7 +102,7 @@ class Counts:
     invalid: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Track:
     """Where the sequence of one publisher stands: its last number, and what is known to be lost but not yet a gap."""
 
@@ -110,7 +110,7 @@ class _Track:
     missed: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Stream:
     """One key: its address, its only publisher (None while there is none, or several), and what was lost unread."""
 
@@ -366,7 +366,7 @@ class Intake:
                 return
             self._tracks[source] = track
         if not stream.shared:
-            stream.shared = stream.track not in (None, track)
+            stream.shared = stream.track is not None and stream.track is not track
             stream.track = None if stream.shared else track
         gap = max(0, number - track.last - 1)
         track.last = max(track.last, number)
