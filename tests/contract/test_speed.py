@@ -42,20 +42,25 @@ print(json.dumps(best))
 """
 
 BOUNDS = {  # of the straightforward way: unpack a map and validate it, or validate, dump and pack one
-    "decode": ("plain decode", 1.1, 1),
-    "decode_row": ("plain decode", 0.75, 1),
-    "read_records": ("plain decode", 0.05, 1000),
-    "encode": ("plain encode", 1.5, 1),
+    "decode": ("plain decode", 1.3, 1),
+    "decode_row": ("plain decode", 0.9, 1),
+    "read_records": ("plain decode", 0.06, 1000),
+    "encode": ("plain encode", 1.8, 1),
     "encode_row": ("plain encode", 0.6, 1),
-    "write_records": ("plain encode", 0.05, 1000),
+    "write_records": ("plain encode", 0.04, 1000),
 }
 
 
 @pytest.mark.timeout(120)
 def test_hot_path_is_as_fast_as_it_was(start: Start) -> None:
-    """Each form costs no more than its share of the straightforward way, with room of a half over what was measured."""
-    process = start("-c", PROGRAM, measured=False)
-    assert process.wait(100.0) == 0, process.err
-    best = json.loads(process.out)
-    ratios = {name: best[name] / messages / best[plain] for name, (plain, _, messages) in BOUNDS.items()}
-    assert all(ratios[name] < bound for name, (_, bound, _) in BOUNDS.items()), ratios
+    """Each form costs at most twice its share of the straightforward way, at the best of three looks."""
+    ratios = dict.fromkeys(BOUNDS, float("inf"))
+    for _ in range(3):
+        process = start("-c", PROGRAM, measured=False)
+        assert process.wait(100.0) == 0, process.err
+        best = json.loads(process.out)
+        for name, (plain, _, messages) in BOUNDS.items():
+            ratios[name] = min(ratios[name], best[name] / messages / best[plain])
+        if all(ratios[name] < bound for name, (_, bound, _) in BOUNDS.items()):
+            return
+    pytest.fail(f"slower than it was, as shares of the straightforward way: {ratios}")

@@ -494,13 +494,15 @@ def test_failing_source_lets_go_of_its_addresses(tmp_path: Path, run_nedbus: Sta
     one = write_log(tmp_path / "one.ulg", [1], topic="external_ins_local_position", vz=7.0)
     ins = write_log(tmp_path / "vlp.ulg", range(0, 10**9, 10**6))
     endpoint = free_endpoint()
-    run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{ins}")
-    service = run_nedbus("serve", "-c", endpoint, "-s", f"ulog:{ins}", "-s", f"ulog:{both}", "-s", f"ulog:{one}")
+    sources = [f"ulog:{ins}", f"ulog:{both}?wait=1", f"ulog:{one}?wait=1"]
+    run_nedbus("serve", "-l", endpoint, *(f"--source={source}" for source in sources))
     with until_connected(endpoint) as bus:
-        wait_for(
-            lambda: [s.message.vz for s in bus.latest("external_ins_local_position")] == [7.0],
-            what=f"the third source: {service.err}",
-        )
+        wait_for(lambda: bus.latest(VLP), what="the first source, before the others start")
+        with bus.subscribe("external_ins_local_position"):
+            wait_for(
+                lambda: [s.message.vz for s in bus.latest("external_ins_local_position")] == [7.0],
+                what="the third source",
+            )
 
 
 def test_endpoints_replace_those_of_a_router_file(tmp_path: Path, run_nedbus: Start) -> None:
