@@ -37,7 +37,7 @@ ODD = st.one_of(
     st.floats(width=32),
     st.booleans(),
     st.none(),
-    st.text(max_size=3),
+    st.sampled_from(["", "x", "NaN"]),
     st.sampled_from([math.nan, math.inf, -math.inf, 1e39, -0.0, -1e-50, 2**64, 2**64 - 1, 256, 255, math.pi, 90.5]),
     st.tuples(st.floats(), st.floats()),
     st.lists(st.floats(), max_size=3),
