@@ -28,6 +28,9 @@ _ON_WIRE: Final[Mapping[TypeName, str]] = {**_NATIVE, "bool": "u1", "float32[2]"
 DTYPE: Final = np.dtype([(name, _NATIVE[kind]) for name, kind in FIELD_TYPES.items()])
 """The columns of Records: PX4's fields in PX4's order, with PX4's types."""
 
+FEW: Final = 8
+"""Messages below which whole columns cost more than one by one."""
+
 _PARTS: Final = list(places_on_the_wire())
 _WIRE: Final = np.dtype(
     {

@@ -49,10 +49,10 @@ def places_on_the_wire() -> Iterator[tuple[str, int, int]]:
     """Yield name, part (of delta_xy and delta_vxy, else 0) and offset of every value in a full-width payload."""
     offset = len(_HEAD)
     for name, kind in FIELD_TYPES.items():
-        tags, _, _ = _FULL_WIDTH[kind]
-        starts = {"bool": (0,), "float32[2]": (2, 7)}.get(kind, (1,))
+        _, _, bits = _FULL_WIDTH[kind]
+        starts = (place for place, each in enumerate(bits) if each and not (place and bits[place - 1]))
         yield from ((name, part, offset + start) for part, start in enumerate(starts))
-        offset += len(tags)
+        offset += len(bits)
 
 
 def encode(message: VehicleLocalPosition) -> bytes:

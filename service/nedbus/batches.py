@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import zenoh
 
 from nedbus_msgs import PAYLOAD_SIZE, Address, VehicleLocalPosition
-from nedbus_msgs.arrays import Records, read_records, to_records
-
-_FEW: Final = 8  # messages below which whole columns cost more than one by one
+from nedbus_msgs.arrays import FEW, Records, read_records, to_records
 
 
 @dataclass(eq=False)
@@ -70,7 +67,7 @@ def make_batch(
 
     `judge` gives the message of one that needs a closer look, None if it is invalid.
     """
-    if len(raw) < _FEW:
+    if len(raw) < FEW:
         judged = list(map(judge, raw))
         messages = to_records([message for message in judged if message is not None])
         valid = np.array([message is not None for message in judged])

@@ -39,7 +39,6 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
-_FEW: Final = 8  # messages below which whole columns cost more than one by one
 _JSON: Final = "application/json"
 
 Answer = tuple[str, bytes, str, "zenoh.Timestamp | None"]
@@ -111,11 +110,11 @@ class Publisher:
 
         Raises TypeError for another dtype, pydantic.ValidationError for the first message that the model refuses.
         """
-        from nedbus_msgs.arrays import DTYPE, find_sound, to_message, write_records
+        from nedbus_msgs.arrays import DTYPE, FEW, find_sound, to_message, write_records
 
         if records.dtype != DTYPE:
             raise TypeError("records have the dtype nedbus_msgs.arrays.DTYPE: convert with astype")
-        if len(records) < _FEW:
+        if len(records) < FEW:
             for message in [to_message(record) for record in records]:
                 self.publish(message)
             return
