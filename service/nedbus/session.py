@@ -212,6 +212,10 @@ def _read_config(path: Path) -> zenoh.Config:
         place = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
         line, column = map(int, place.groups()) if place else (None, None)
         raise ConfigError.in_file(path, _reason(text), line=line, column=column) from exc
+    for name, value in json.loads(config.get_json("transport/link/tls")).items():
+        # Zenoh would say only that there is no such file, and not which.
+        if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
+            raise ConfigError.in_file(path, f"{name}: {value} cannot be read: is it there, and may this user read it?")
     return config
 
 

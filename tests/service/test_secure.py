@@ -193,6 +193,15 @@ def test_router_files_set_what_they_must_and_are_commented() -> None:
         assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(open_words)
 
 
+def test_missing_certificate_is_named(run_nedbus: Start, tmp_path: Path) -> None:
+    """A router whose certificates were forgotten says which file it misses."""
+    file = tmp_path / "secure.json5"
+    file.write_text((CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(tmp_path / "nowhere")))
+    router = run_nedbus("router", str(file))
+    assert router.wait() == 2
+    assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: is it there", router.err)
+
+
 def test_open_router_file_works() -> None:
     """config/router.json5 starts a router that needs nothing else."""
     endpoint = free_endpoint()
