@@ -1,8 +1,10 @@
 """The contract of nedbus: the message, its layouts, its topics and its wire format; no I/O, no Zenoh."""
 
+from .cdr import decode_cdr, encode_cdr
 from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
 from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
 from .position import FIELD_TYPES, VehicleLocalPosition
+from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, type_hash
 from .rows import Row
 from .schema import json_schema, layout_table
 from .topics import (
@@ -32,6 +34,8 @@ __all__ = [
     "LAYOUTS",
     "PAYLOAD_LIMIT",
     "PAYLOAD_SIZE",
+    "ROS2_TYPE",
+    "ROS2_TYPES",
     "TOPICS",
     "WIRE_LAYOUTS",
     "Address",
@@ -49,19 +53,24 @@ __all__ = [
     "alive_selection",
     "check_prefix",
     "check_vehicle",
+    "dds_type",
     "decode",
+    "decode_cdr",
     "decode_row",
     "describe",
     "downgrade",
     "encode",
+    "encode_cdr",
     "encode_fields",
     "encode_row",
     "find_layout",
     "get_topic",
     "json_schema",
+    "layout_of_type_hash",
     "layout_table",
     "schema_key",
     "selection",
     "status_key",
+    "type_hash",
     "upgrade",
 ]

@@ -97,7 +97,7 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleL
     Raises LayoutError for other fields than the layout's, pydantic.ValidationError for what the model refuses.
     """
     if layout is not None:
-        _require_fields(fields, _get_layout(layout))
+        require_fields(fields, get_layout(layout))
     known = {_RENAMED.get(name, name): value for name, value in fields.items()}
     if "hagl_max" in known:
         known.setdefault("hagl_max_z", known["hagl_max"])
@@ -113,17 +113,19 @@ def downgrade(message: VehicleLocalPosition, layout: str) -> dict[str, object]:
     Raises LayoutError for the name of no layout.
     """
     values: dict[str, object] = {**message.__dict__, "hagl_max": message.hagl_max_z}
-    return {name: values[name] for name in _get_layout(layout).fields}
+    return {name: values[name] for name in get_layout(layout).fields}
 
 
-def _get_layout(name: str) -> Layout:
+def get_layout(name: str) -> Layout:
+    """Return a row of LAYOUTS; raise LayoutError for a name that has none."""
     try:
         return LAYOUTS[name]
     except KeyError:
         raise LayoutError(f"no layout {name!r}: choose from {', '.join(LAYOUTS)}") from None
 
 
-def _require_fields(fields: Mapping[str, object], layout: Layout) -> None:
+def require_fields(fields: Mapping[str, object], layout: Layout) -> None:
+    """Raise LayoutError, which says what is missing and what is too many, unless these are the layout's fields."""
     given, wanted = set(fields), set(layout.fields)
     if given == wanted:
         return
