@@ -14,21 +14,22 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography"},
+    | {"pyulog", "numpy", "cryptography", "pymavlink"},
 }
 ONLY = {  # packages that only these files import
-    "zenoh": {"session", "publisher", "intake", "batches", "subscriber"},
+    "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
     "msgpack": {"wire"},
     "pyulog": {"ulog"},
+    "pymavlink": {"mavlink"},
     "numpy": {"ulog", "arrays", "batches"},
     "pydantic_settings": {"settings"},
-    "typer": {"app", "certificates", "options", "look", "watch", "serve"},
+    "typer": {"app", "bridge", "certificates", "options", "look", "watch", "serve"},
     "rich": {"progress"},
     "cryptography": {"pki", "certificates"},
 }
 ORDER = [  # each may import those before it only
     "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "rates",
-    "bus", "sources", "worker", "daemon",
+    "bus", "rmw_zenoh", "sources", "worker", "daemon", "ros2",
     "cli",
 ]  # fmt: skip
 

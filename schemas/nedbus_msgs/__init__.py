@@ -3,6 +3,7 @@
 from .cdr import decode_cdr, encode_cdr
 from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
 from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
+from .origin import Origin, encoding_of, origin_of
 from .position import FIELD_TYPES, VehicleLocalPosition
 from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, type_hash
 from .rows import Row
@@ -45,6 +46,7 @@ __all__ = [
     "Layout",
     "LayoutError",
     "NedbusError",
+    "Origin",
     "Row",
     "Topic",
     "UnknownLayoutError",
@@ -63,11 +65,13 @@ __all__ = [
     "encode_cdr",
     "encode_fields",
     "encode_row",
+    "encoding_of",
     "find_layout",
     "get_topic",
     "json_schema",
     "layout_of_type_hash",
     "layout_table",
+    "origin_of",
     "schema_key",
     "selection",
     "status_key",

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import zenoh
 
-from nedbus_msgs import PAYLOAD_SIZE, Address, VehicleLocalPosition
+from nedbus_msgs import PAYLOAD_SIZE, Address, Origin, VehicleLocalPosition, origin_of
 from nedbus_msgs.arrays import FEW, Records, read_records, to_records
 
 
@@ -52,6 +52,11 @@ class Batch:
         """Each one's number in the sequence of its publisher; -1 if that has none."""
         infos = (raw.source_info for raw in self.raw)
         return np.array([info.source_sn if info else -1 for info in infos], np.int64)
+
+    @cached_property
+    def origins(self) -> list[Origin]:
+        """Where each comes from, and what that source did not provide."""
+        return [origin_of(str(raw.encoding)) for raw in self.raw]
 
 
 def make_batch(

@@ -150,14 +150,27 @@ class Bus:
             found.setdefault(address.vehicle, []).append(address)
         return found
 
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None, lossless: bool = False) -> Publisher:
+    def publisher(
+        self,
+        topic: str,
+        *,
+        vehicle: str,
+        instance: int | None = None,
+        lossless: bool = False,
+        source: str | None = None,
+    ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
         `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, and a stuck one
         holds up all others for 5 s, until it is cut off.
+        `source` says where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
         """
         self._require_open()
-        return self._outbox.publisher(Address(vehicle, topic, instance), lossless=lossless, owner=self)
+        return self._outbox.publisher(Address(vehicle, topic, instance), lossless=lossless, source=source, owner=self)
+
+    def join(self, endpoint: str | None = None, *, timeout: float = 3.0) -> Session:
+        """Return a Zenoh session of its own at the same routers, or at another one; whoever asks for it closes it."""
+        return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
 
     def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service on this network, as it tells it."""
@@ -184,7 +197,7 @@ class Bus:
         if intake.newest_only:
             feed = Feed(self._session, key_expr, intake)
         else:
-            own = open_client(self.routers, timeout=3.0, tls=self._tls)
+            own = self.join()
             try:
                 feed = Feed(own, key_expr, intake)
             except NedbusError:
@@ -242,11 +255,19 @@ class AsyncBus:
         return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
 
     async def publisher(
-        self, topic: str, *, vehicle: str, instance: int | None = None, lossless: bool = False
+        self,
+        topic: str,
+        *,
+        vehicle: str,
+        instance: int | None = None,
+        lossless: bool = False,
+        source: str | None = None,
     ) -> Publisher:
         """Return a publisher as `Bus.publisher` does; its `publish` waits only if it is `lossless`."""
         bus = self._opened()
-        return await asyncio.to_thread(bus.publisher, topic, vehicle=vehicle, instance=instance, lossless=lossless)
+        return await asyncio.to_thread(
+            bus.publisher, topic, vehicle=vehicle, instance=instance, lossless=lossless, source=source
+        )
 
     async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service as `Bus.services` does."""

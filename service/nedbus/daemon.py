@@ -11,14 +11,14 @@ import time
 from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
-from nedbus_msgs import decode, status_key
+from nedbus_msgs import decode, origin_of, status_key
 
 from .errors import ConfigError, ConnectError
 from .intake import Sample
 from .publisher import HEARTBEAT, Outbox
 from .session import DEFAULT_ENDPOINT, Session, open_client, open_router
 from .settings import Settings
-from .sources import parse_source
+from .sources import Live, Source, parse_source
 from .worker import Worker, WorkerStatus
 
 _log = logging.getLogger(__name__)
@@ -56,8 +56,8 @@ class Daemon:
             raise ConfigError("source", "nothing to publish: give --source sim: or --source ulog:FILE, or several")
         self._settings = settings
         self._version = version
-        self._sources = [(text, parse_source(text).open_source(vehicle=settings.vehicle)) for text in settings.source]
-        if settings.until_done and not any(source.finite for _, source in self._sources):
+        self._sources = [(text, self._open_source(text)) for text in settings.source]
+        if settings.until_done and not any(_is_finite(source) for _, source in self._sources):
             raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
         self._started = time.time()
         self._stop = threading.Event()
@@ -99,7 +99,10 @@ class Daemon:
         """Return the last message of each address that was published."""
         publishers = self._outbox.publishers if self._outbox else []
         last = [(publisher.address, *publisher.last) for publisher in publishers if publisher.last]
-        return [Sample(decode(payload), address, time.time_ns(), stamp) for address, payload, stamp in last]
+        return [
+            Sample(decode(payload), address, time.time_ns(), stamp, origin=origin_of(encoding))
+            for address, payload, stamp, encoding in last
+        ]
 
     def stop(self) -> None:
         """Ask it to end; callable from anywhere, a signal handler included."""
@@ -142,6 +145,10 @@ class Daemon:
             session.close()
         return not any(worker.state == "failed" for worker in self.workers)
 
+    def _open_source(self, text: str) -> Source:
+        settings = self._settings
+        return parse_source(text).open_source(vehicle=settings.vehicle, routers=settings.routers, tls=settings.tls)
+
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router for as long as it takes."""
         if self.role == "router":
@@ -161,9 +168,17 @@ class Daemon:
         """Wait for `stop`, or for the end of all finite sources and for their readers to have had a second look."""
         while not self._stop.is_set():
             if self._settings.until_done:
-                finite = [worker for worker in self._workers if worker.source.finite]
+                finite = [worker for worker in self._workers if _is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
-                    self._stop.wait(2 * HEARTBEAT if any(worker.source.speed for worker in finite) else 0.0)
+                    self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     return
             self._changed.wait()
             self._changed.clear()
+
+
+def _is_finite(source: Source) -> bool:
+    return not isinstance(source, Live) and source.finite
+
+
+def _is_paced(source: Source) -> bool:
+    return isinstance(source, Live) or source.speed is not None

@@ -18,14 +18,17 @@ from typing import TYPE_CHECKING, Final, Literal, get_args
 import zenoh
 
 from nedbus_msgs import (
+    FIELD_TYPES,
     PAYLOAD_LIMIT,
     PAYLOAD_SIZE,
     Address,
     AddressError,
     DecodeError,
+    Origin,
     UnknownLayoutError,
     VehicleLocalPosition,
     decode,
+    origin_of,
 )
 
 if TYPE_CHECKING:
@@ -40,6 +43,7 @@ _KEYS: Final = 10_000  # keys that a reader keeps in mind
 _LAYOUTS: Final = 16  # unknown layouts that a reader keeps in mind
 _ASK_AGAIN: Final = 10.0  # s until a layout that nobody could explain is asked for again
 _BATCH: Final = 4096  # messages that a batch has at most
+_UNKNOWN: Final = Origin()
 
 
 @dataclass(slots=True)
@@ -51,6 +55,7 @@ class Sample:
     `received`: when it was taken here, ns since the epoch.
     `stamp`: Zenoh's timestamp, None if its publisher did not say.
     `lost`: messages of this key that were lost on the way just before this one.
+    `origin`: where it comes from, `source` and `missing` also as attributes of their own.
     """
 
     message: VehicleLocalPosition
@@ -58,6 +63,7 @@ class Sample:
     received: int
     stamp: zenoh.Timestamp | None = None
     lost: int = 0
+    origin: Origin = _UNKNOWN
 
     @property
     def sent(self) -> int | None:
@@ -78,6 +84,18 @@ class Sample:
     def instance(self) -> int | None:
         """The uORB instance, for estimator_local_position."""
         return self.address.instance
+
+    @property
+    def source(self) -> str | None:
+        """The kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if its publisher did not say."""
+        return self.origin.source
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """The fields that the source did not provide; they hold NaN, false or 0."""
+        if isinstance(self.message, VehicleLocalPosition):  # of an older layout perhaps, by another encoder
+            return self.origin.missing | (FIELD_TYPES.keys() - self.message.model_fields_set)
+        return self.origin.missing
 
     @property
     def latency(self) -> float | None:
@@ -112,12 +130,14 @@ class _Track:
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """One key: its address, its only publisher (None while there is none, or several), and what was lost unread."""
+    """One key: its address, its only publisher (None for none, or several), what was lost unread; and its origin."""
 
     address: Address
     track: _Track | None = None
     shared: bool = False
     lost: int = 0
+    encoding: zenoh.Encoding | None = None
+    origin: Origin = _UNKNOWN
 
 
 class Intake:
@@ -261,7 +281,10 @@ class Intake:
             self._refuse(key, exc)
             return None
         lost, stream.lost = stream.lost, 0
-        return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost)
+        encoding = raw.encoding
+        if encoding != stream.encoding:  # almost always it is the same: comparing is all that it costs
+            stream.encoding, stream.origin = encoding, origin_of(str(encoding))
+        return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, stream.origin)
 
     def screen(self, batch: Iterable[zenoh.Sample]) -> list[zenoh.Sample]:
         """Return what is worth keeping; look up the layouts that are not known here, waiting for publishers' answers.

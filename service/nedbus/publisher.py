@@ -6,7 +6,7 @@ import json
 import logging
 import queue
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, Self, cast
@@ -15,14 +15,16 @@ import zenoh
 from pydantic_core import to_json
 
 from nedbus_msgs import (
-    ENCODING,
+    FIELD_TYPES,
     PAYLOAD_SIZE,
     Address,
+    Origin,
     Row,
     VehicleLocalPosition,
     encode,
     encode_fields,
     encode_row,
+    encoding_of,
     get_topic,
     json_schema,
     layout_table,
@@ -39,6 +41,7 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
+_FIELDS: Final = len(FIELD_TYPES)
 _JSON: Final = "application/json"
 
 Answer = tuple[str, bytes, str, "zenoh.Timestamp | None"]
@@ -60,17 +63,20 @@ class Publisher:
         *,
         prefix: str,
         lossless: bool,
+        source: str | None,
         on_close: Callable[[], object],
         owner: object,
     ) -> None:
         self.address = address
         self.key = address.key(prefix=prefix)
         self.published = 0
-        self.last: tuple[bytes, zenoh.Timestamp] | None = None
+        self.source = Origin(source).source
+        self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._session = session
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as somebody may publish
         self._closed = False
+        self._encoding = encoding_of(source)
         topic = get_topic(address.topic)
         control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         # A heartbeat together with BLOCK and recovering readers can stall a saturated link for 5 s.
@@ -80,7 +86,7 @@ class Publisher:
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
                 self.key,
-                encoding=ENCODING,
+                encoding=self._encoding,
                 congestion_control=control,
                 priority=getattr(zenoh.Priority, topic.priority),
                 cache=zenoh.ext.CacheConfig(topic.cache),
@@ -92,18 +98,22 @@ class Publisher:
         """Validate a message, or the fields of one by name, and send it.
 
         A message that exists was validated when it was made; it is not validated again.
+        Readers are told which fields it was made without: `sample.missing`.
 
         Raises pydantic.ValidationError for fields that are no message, EncodeError for a message whose validation was
         bypassed, ClosedError once the publisher or its bus is closed.
         """
-        self._put(encode(message) if isinstance(message, VehicleLocalPosition) else encode_fields(message))
+        if isinstance(message, VehicleLocalPosition):
+            self._put(encode(message), message.__pydantic_fields_set__)
+        else:
+            self._put(encode_fields(message), message.keys())
 
     def publish_row(self, values: Sequence[object] | Row) -> None:
         """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and send them.
 
         The same as `publish` with these fields, and faster: no message is made of them.
         """
-        self._put(encode_row(values))
+        self._put(encode_row(values), FIELD_TYPES)
 
     def publish_many(self, records: Records) -> None:
         """Validate messages in an array with the dtype nedbus_msgs.arrays.DTYPE, and send them; all or none.
@@ -128,18 +138,23 @@ class Publisher:
             for start in range(0, len(payloads), PAYLOAD_SIZE):
                 payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
                 put(payload, timestamp=stamp)
-                self.last = payload, stamp
+                self.last = payload, stamp, self._encoding
                 self.published += 1
 
-    def _put(self, payload: bytes) -> None:
+    def _put(self, payload: bytes, provided: Collection[str]) -> None:
         if self._closed:
             raise ClosedError
+        encoding = self._encoding
         try:
             stamp = self._session.new_timestamp()
-            self._publisher.put(payload, timestamp=stamp)
+            if len(provided) == _FIELDS:
+                self._publisher.put(payload, timestamp=stamp)
+            else:
+                encoding = encoding_of(self.source, frozenset(provided))
+                self._publisher.put(payload, timestamp=stamp, encoding=encoding)
         except zenoh.ZError as exc:
             raise translate(exc, self._session) from exc
-        self.last = payload, stamp
+        self.last = payload, stamp, encoding
         self.published += 1
 
     def close(self) -> None:
@@ -181,7 +196,9 @@ class Outbox:
         """All publishers that are open."""
         return list(self._publishers.values())
 
-    def publisher(self, address: Address, *, lossless: bool = False, owner: object = None) -> Publisher:
+    def publisher(
+        self, address: Address, *, lossless: bool = False, source: str | None = None, owner: object = None
+    ) -> Publisher:
         """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one."""
         with self._lock:
             if address in self._publishers:
@@ -191,6 +208,7 @@ class Outbox:
                 address,
                 prefix=self.prefix,
                 lossless=lossless,
+                source=source,
                 on_close=lambda: self._publishers.pop(address, None),
                 owner=owner,
             )
@@ -267,8 +285,8 @@ class Outbox:
             if publisher.last is None or publisher.address.vehicle != vehicle:
                 continue
             if query.key_expr.intersects(publisher.key):
-                payload, stamp = publisher.last
-                yield publisher.key, payload, ENCODING, stamp
+                payload, stamp, encoding = publisher.last
+                yield publisher.key, payload, encoding, stamp
 
     def _answer_schema(self, _: zenoh.Query) -> Iterable[Answer]:
         content = {"json_schema": json_schema(), "layouts": layout_table()}

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from nedbus.sources import Record, parse_source
+from nedbus.sources import Record
 from nedbus_msgs import Address, VehicleLocalPosition, upgrade
+from tests.replays import open_replay
 
 
 class Flight:
     """The messages of a simulated source, each with its place in the sequence of its address."""
 
     def __init__(self, source: str = "sim:") -> None:
-        self._records: Iterator[Record] = parse_source(source).open_source(vehicle="1").open().records
+        self._records: Iterator[Record] = open_replay(source).records
         self._known: dict[tuple[Address, int], tuple[int, VehicleLocalPosition]] = {}
         self._counts: dict[Address, int] = {}
 

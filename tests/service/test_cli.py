@@ -62,7 +62,8 @@ def test_echo_json_is_the_message(run_nedbus: Start, flying: str) -> None:
     rows = [json.loads(line) for line in echo.out.splitlines()]
     assert len(rows) == 30
     for row in rows:
-        assert set(row) == {"vehicle", "topic", "instance", "received", "sent", "lost", "message"}
+        assert set(row) == {"vehicle", "topic", "instance", "received", "sent", "lost", "source", "missing", "message"}
+        assert (row["source"], row["missing"]) == ("sim", [])
         VehicleLocalPosition.model_validate_json(json.dumps(row["message"]))
     assert any(row["message"]["vxy_max"] == "Infinity" for row in rows)
 

@@ -14,9 +14,9 @@ import zenoh
 
 import nedbus
 from nedbus.session import Session
-from nedbus.sources import parse_source
-from nedbus_msgs import Address, VehicleLocalPosition, upgrade
+from nedbus_msgs import ENCODING, FIELD_TYPES, LAYOUTS, Address, Origin, VehicleLocalPosition, origin_of, upgrade
 from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, message, wait_for
+from tests.replays import open_replay
 from tests.ulogs import UlogWriter, write_log
 
 VLP = "vehicle_local_position"
@@ -69,7 +69,7 @@ def rows(text: str) -> list[list[object]]:
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
     """Return what a log holds, by address, read here by the source itself (test_ulog.py proves that against pyulog)."""
     found: dict[str, list[list[str]]] = {}
-    for record in parse_source(f"ulog:{path}").open_source(vehicle="1").open().records:
+    for record in open_replay(f"ulog:{path}").records:
         values = [repr(value) for value in upgrade(record.fields).__dict__.values()]
         found.setdefault(str(record.address), []).append(values)
     return found
@@ -127,7 +127,10 @@ def test_plain_zenoh_and_msgpack_see_every_sample(start: Start, run_nedbus: Star
     assert reader.wait(60) == 0, reader.err
     assert service.wait() == 0, service.err
     received = rows(reader.out)
-    assert {encoding for _, encoding, _ in received} == {"application/msgpack;px4_msgs/VehicleLocalPosition"}
+    missing = FIELD_TYPES.keys() - {*LAYOUTS["1.13"].fields, "hagl_max_z", "hagl_max_xy"}
+    encodings = {str(encoding) for _, encoding, _ in received}
+    assert {encoding.split(";source=")[0] for encoding in encodings} == {ENCODING}
+    assert {origin_of(encoding) for encoding in encodings} == {Origin("ulog", frozenset(missing))}
     expected = {
         f"nedbus/{address}": [["1", *(value.replace("(", "[").replace(")", "]") for value in row)] for row in values]
         for address, values in expected_rows(path).items()
@@ -440,7 +443,7 @@ def test_any_client_gets_the_last_value(run_nedbus: Start, raw: Session, endpoin
     wait_for(lambda: len(list(raw.get("nedbus/**"))) == 5, what="five answers")
     [reply] = raw.get("nedbus/1/estimator_local_position/1")
     assert reply.ok is not None
-    assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition"
+    assert str(reply.ok.encoding) == "application/msgpack;px4_msgs/VehicleLocalPosition;source=sim"
     assert reply.ok.timestamp is not None
     assert msgpack.unpackb(reply.ok.payload.to_bytes())[0] == 1
     assert Address.from_key(str(reply.ok.key_expr)).instance == 1

@@ -7,12 +7,13 @@ from collections import defaultdict
 
 import pytest
 
-from nedbus.sources import Record, parse_source
+from nedbus.sources import Record
 from nedbus_msgs import FIELD_TYPES, TOPICS, VehicleLocalPosition, encode, upgrade
+from tests.replays import open_replay
 
 
 def fly(options: str) -> list[Record]:
-    return list(parse_source(f"sim:{options}").open_source(vehicle="1").open().records)
+    return list(open_replay(f"sim:{options}").records)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
 
 def test_records_are_in_time_order_and_counted() -> None:
     """A finite flight tells how many records it has, in order of when they are due."""
-    flight = parse_source("sim:?duration=3.3").open_source(vehicle="1").open()
+    flight = open_replay("sim:?duration=3.3")
     due = [record.due for record in flight.records]
     assert due == sorted(due)
     assert len(due) == flight.total

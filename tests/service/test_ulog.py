@@ -11,9 +11,10 @@ import pytest
 from pyulog import ULog
 
 from nedbus.errors import SourceError
-from nedbus.sources import Flight, parse_source
+from nedbus.sources import Flight
 from nedbus_msgs import FIELD_TYPES, LAYOUTS, TOPICS, VehicleLocalPosition, upgrade
 from tests.conftest import LOGS, message
+from tests.replays import open_replay
 from tests.ulogs import UlogWriter, write_log
 
 VLP = "vehicle_local_position"
@@ -30,7 +31,7 @@ REAL = {
 
 
 def open_log(path: Path, options: str = "") -> Flight:
-    return parse_source(f"ulog:{path}{options}").open_source(vehicle="1").open()
+    return open_replay(f"ulog:{path}{options}")
 
 
 def read_all(flight: Flight) -> list[tuple[str, VehicleLocalPosition]]:

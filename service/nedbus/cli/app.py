@@ -11,6 +11,7 @@ import typer
 
 from nedbus import __version__
 
+from .bridge import ros2
 from .certificates import pki
 from .look import get, health, info, list_, schema
 from .options import write
@@ -34,6 +35,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "info": info,
     "health": health,
     "schema": schema,
+    "ros2": ros2,
 }
 for _name, _function in _COMMANDS.items():
     app.command(_name)(_function)

@@ -27,10 +27,12 @@ def to_line(sample: Sample) -> str:
 def to_fields(sample: Sample) -> str:
     """Return every field on a line of its own, as `ros2 topic echo` does."""
     age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
-    lines = [f"{sample.address}{age}"]
+    source = "" if sample.source is None else f", from {sample.source}"
+    lines = [f"{sample.address}{age}{source}"]
     for name, value in sample.message.model_dump().items():
         # Nine digits tell a float32 apart from all others; ref_lat and ref_lon have more.
-        lines.append(f"  {name}: {value:.9g}" if FIELD_TYPES[name] == "float32" else f"  {name}: {value}")
+        shown = f"{value:.9g}" if FIELD_TYPES[name] == "float32" else f"{value}"
+        lines.append(f"  {name}: {shown}" + (" (not provided)" if name in sample.missing else ""))
     return "\n".join([*lines, "---"])
 
 
@@ -44,6 +46,8 @@ def to_json(sample: Sample) -> str:
         "received": sample.received,
         "sent": sample.sent,
         "lost": sample.lost,
+        "source": sample.source,
+        "missing": sorted(sample.missing),
     }
     return f'{json.dumps(head)[:-1]}, "message": {sample.message.model_dump_json()}}}'
 

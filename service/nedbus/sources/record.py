@@ -1,11 +1,12 @@
-"""What a source gives: a flight of records in time order."""
+"""What a source gives: a replay has a flight of records in time order, a live source has records as they come."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
+from nedbus.session import Tls
 from nedbus_msgs import Address
 
 
@@ -13,18 +14,31 @@ from nedbus_msgs import Address
 class Record:
     """One message as a source has it, not validated yet.
 
-    `due`: seconds since the start of the flight when it was published there.
+    `due`: seconds since the start of the flight when it was published there; a live record is due when it comes.
     `fields`: by name, of any PX4 layout.
+    `lost`: messages that were lost on the way to here just before this one.
+    `restarted`: this is the first one after the vehicle started again.
     """
 
     due: float
     address: Address
     fields: Mapping[str, object]
+    lost: int = 0
+    restarted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Something that arrived and is no message; `where` it came from is told of once."""
+
+    where: str
+    reason: str
+    address: Address | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One run of a source.
+    """One run of a replay.
 
     `records`: in order of `due`, read once.
     `addresses`: every address that the records have.
@@ -39,8 +53,20 @@ class Flight:
     warnings: tuple[str, ...] = field(default=())
 
 
-class Source(Protocol):
-    """Something that can be flown, once or again and again."""
+@dataclass(frozen=True, slots=True)
+class Home:
+    """What a source may need of the service that it works for.
+
+    `vehicle`: for a source that neither names nor knows one; `routers`: where that service is reached, and with what.
+    """
+
+    vehicle: str
+    routers: tuple[str, ...] = ()
+    tls: Tls | None = None
+
+
+class Replay(Protocol):
+    """A source that can be flown, once or again and again."""
 
     @property
     def finite(self) -> bool:
@@ -65,3 +91,18 @@ class Source(Protocol):
     def open(self) -> Flight:
         """Open it; raise SourceError when it cannot be opened or has nothing to give."""
         ...
+
+
+@runtime_checkable
+class Live(Protocol):
+    """A source that is listened to, and that nobody knows beforehand what it will say."""
+
+    def listen(self) -> Iterator[Record | Refusal | None]:
+        """Listen until the iterator is closed; None says that nothing came for a moment, at least twice a second.
+
+        Raises SourceError or ConnectError when it cannot be listened to, or no more.
+        """
+        ...
+
+
+Source = Replay | Live

@@ -18,7 +18,7 @@ from typing import Final
 
 from nedbus_msgs import FIELD_TYPES, TOPICS, Address, VehicleLocalPosition
 
-from .record import Flight, Record
+from .record import Flight, Home, Record
 from .spec import SimulatorOptions
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
@@ -200,8 +200,8 @@ class SimulatorSource:
 
     loop = False
 
-    def __init__(self, options: SimulatorOptions, *, vehicle: str) -> None:
-        self._vehicle = options.vehicle or vehicle
+    def __init__(self, _: str, options: SimulatorOptions, home: Home) -> None:
+        self._vehicle = options.vehicle or home.vehicle
         self._seed = options.seed
         self._ticks = None if options.duration is None else round(options.duration / TICK)
         self.finite = options.duration is not None

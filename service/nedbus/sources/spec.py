@@ -8,12 +8,13 @@ from importlib import import_module
 from typing import Annotated, Final, Literal, cast
 from urllib.parse import parse_qsl
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from nedbus.errors import ConfigError
-from nedbus_msgs import check_vehicle
+from nedbus.session import Tls
+from nedbus_msgs import LAYOUTS, check_vehicle
 
-from .record import Source
+from .record import Home, Source
 
 
 def _vehicle(value: str) -> str:
@@ -21,25 +22,49 @@ def _vehicle(value: str) -> str:
     return value
 
 
+def _vehicles(text: object) -> object:
+    """Read `NAME:VEHICLE,NAME:VEHICLE`."""
+    if not isinstance(text, str):
+        return text
+    named = dict(part.partition(":")[::2] for part in text.split(","))
+    for vehicle in named.values():
+        check_vehicle(vehicle)
+    return named
+
+
+def _layout(name: str) -> str:
+    if name not in LAYOUTS:
+        raise ValueError(name)
+    return name
+
+
+Vehicle = Annotated[str, AfterValidator(_vehicle)]
+Vehicles = Annotated[Mapping[str, str], BeforeValidator(_vehicles)]
+
+
 class Options(BaseModel):
-    """Options of every replay."""
+    """What all options have in common."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    vehicle: Annotated[str, AfterValidator(_vehicle)] | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
+
+class ReplayOptions(Options):
+    """Options of every replay."""
+
+    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
     speed: Annotated[float, Field(ge=0.001, le=1000)] | Literal["max"] = Field(
         1.0, description="a factor from 0.001 to 1000, or max: as fast as readers take it"
     )
     wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
 
 
-class UlogOptions(Options):
+class UlogOptions(ReplayOptions):
     """Options of `ulog:`."""
 
     loop: bool = Field(False, description="1 to start again at the end, or 0")
 
 
-class SimulatorOptions(Options):
+class SimulatorOptions(ReplayOptions):
     """Options of `sim:`."""
 
     seed: int = Field(0, description="a whole number: same seed, same flight")
@@ -48,19 +73,51 @@ class SimulatorOptions(Options):
     )
 
 
+class Px4ZenohOptions(Options):
+    """Options of `px4-zenoh:`."""
+
+    domain: Annotated[int, Field(ge=0, le=232)] | None = Field(
+        None, description="a ROS domain, 0 to 232; all without it"
+    )
+    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for what has no namespace")
+    vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, with commas between them")
+    layout: Annotated[str, AfterValidator(_layout)] | None = Field(
+        None, description=f"the layout of keys without a type hash: {', '.join(LAYOUTS)}"
+    )
+
+
+class MavlinkOptions(Options):
+    """Options of `mavlink:`."""
+
+    rate: Annotated[float, Field(ge=0.1, le=200)] = Field(
+        30.0, description="positions a second to ask the vehicle for, 0.1 to 200"
+    )
+    baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(57600, description="of a serial port, 300 to 12000000")
+    vehicles: Vehicles = Field({}, description="SYSTEM_ID:VEHICLE, with commas between them")
+
+
 @dataclass(frozen=True, slots=True)
 class SourceKind:
-    """One kind of source: its options, whether it needs a target, and where the code is, imported when it is used."""
+    """One kind of source: its options, what stands after the colon, and where the code is, imported when it is used.
+
+    `target` is None if nothing stands there, and in brackets if it may be left out.
+    """
 
     options: type[Options]
     target: str | None
     module: str
     function: str
 
+    def takes(self, target: str) -> bool:
+        """Return whether this may, or may not, stand after the colon."""
+        return self.target is not None if target else self.target is None or self.target.startswith("[")
+
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "SimulatorSource"),
     "ulog": SourceKind(UlogOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
+    "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4_zenoh", "Px4ZenohSource"),
+    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink", "MavlinkSource"),
 }
 
 
@@ -73,11 +130,14 @@ class SourceSpec:
     target: str
     options: Options
 
-    def open_source(self, *, vehicle: str) -> Source:
-        """Return the source; `vehicle` is for a source that neither names nor knows one."""
+    def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
+        """Return the source, for a service with this default vehicle that is reached at these routers.
+
+        Raises ConfigError for a target that cannot be, and when what a kind needs is not installed.
+        """
         kind = SOURCE_KINDS[self.kind]
         make = cast("Callable[..., Source]", getattr(import_module(kind.module), kind.function))
-        return make(self.target, self.options, vehicle=vehicle) if kind.target else make(self.options, vehicle=vehicle)
+        return make(self.target, self.options, Home(vehicle, routers, tls))
 
 
 def parse_source(text: str) -> SourceSpec:
@@ -95,7 +155,7 @@ def parse_source(text: str) -> SourceSpec:
         )
         raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
-    if bool(target) != bool(kind.target):
+    if not kind.takes(target):
         form = f"{kind_name}:{kind.target}" if kind.target else f"{kind_name}:?OPTION=VALUE"
         raise ConfigError(f"source {text!r}", f"write it as {form}")
     try:

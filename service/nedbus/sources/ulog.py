@@ -18,7 +18,7 @@ from pyulog import ULog, ULogException
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import FIELD_TYPES, LAYOUTS, TOPICS, Address, find_layout, get_topic
 
-from .record import Flight, Record
+from .record import Flight, Home, Record
 from .spec import UlogOptions
 
 _GAP: Final = 60_000_000  # us: a longer silence in a log is a damaged timestamp, not something to wait for
@@ -52,10 +52,10 @@ class Track:
 class UlogSource:
     """A .ulg file; `open` reads its local position topics into memory."""
 
-    def __init__(self, path: str, options: UlogOptions, *, vehicle: str) -> None:
+    def __init__(self, path: str, options: UlogOptions, home: Home) -> None:
         self._path = Path(path).expanduser()
         self._vehicle = options.vehicle
-        self._default_vehicle = vehicle
+        self._default_vehicle = home.vehicle
         self.finite = not options.loop
         self.loop = options.loop
         self.speed = None if options.speed == "max" else options.speed

@@ -1,0 +1,54 @@
+"""The command that gives the data to ROS 2."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+from typing import Annotated
+
+import typer
+
+from nedbus.bus import Bus
+from nedbus.errors import ConfigError
+from nedbus.ros2 import Bridge
+from nedbus_msgs import ANY, CURRENT, LAYOUTS
+
+from .options import TopicArgument, TopicOption, VehicleOption, choose, on_bus
+
+
+@on_bus
+def ros2(
+    bus: Bus,
+    topic: TopicArgument = None,
+    *,
+    topic_option: TopicOption = ANY,
+    vehicle: VehicleOption = ANY,
+    layout: Annotated[
+        str, typer.Option(help=f"Layout of px4_msgs in the ROS 2 workspace: {', '.join(LAYOUTS)} (to main)")
+    ] = CURRENT.name,
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
+    namespace: Annotated[
+        list[str] | None,
+        typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics of a vehicle, as /NAMESPACE/fmu/out/...; repeatable"),
+    ] = None,
+    to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
+) -> None:
+    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs/msg/VehicleLocalPosition on /fmu/out/..."""
+    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=None)
+    for each in namespace or ():
+        if ":" not in each:
+            raise ConfigError("--namespace", f"{each!r} is not VEHICLE:NAMESPACE")
+    named = dict(each.partition(":")[::2] for each in namespace or ())
+    with ExitStack() as closing:
+        session = bus.join(to)
+        closing.callback(session.close)
+        bridge = Bridge(
+            bus,
+            session,
+            layout=layout,
+            domain=domain,
+            topic=wanted.topic,
+            vehicle=wanted.vehicle,
+            namespaces=named,
+        )
+        bridge.run(threading.Event())

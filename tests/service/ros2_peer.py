@@ -1,0 +1,68 @@
+"""A ROS 2 node by zenoh-ros2-sdk, in a process of its own: `talk` publishes rows, `listen` prints what it gets.
+
+It knows nothing of nedbus: the definition of the type and the rows are in the JSON file of its second argument.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+os.environ["ZENOH_CONFIG_OVERRIDE"] = (
+    # Its default is a peer, which would go round the router.
+    'mode="client";listen/endpoints=[];transport/shared_memory/enabled=false;'
+    'qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]'
+)
+
+from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk.discovery import get_topic_names_and_types
+
+TYPE = "px4_msgs/msg/VehicleLocalPosition"
+PAIRS = ("delta_xy", "delta_vxy")
+
+
+def talk(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
+    """Publish each row, once somebody subscribes."""
+    publisher = ROS2Publisher(topic=topic, msg_type=TYPE, msg_definition=definition, **options)
+    while not publisher.pub.matching_status.matching:
+        time.sleep(0.01)
+    for row in rows:
+        publisher.publish(**{name: np.array(v, np.float32) if name in PAIRS else v for name, v in row.items()})
+    threading.Event().wait()  # whoever started this ends it
+
+
+def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
+    """Print as many messages as there are rows, then the topics that ROS 2 lists."""
+    done = threading.Event()
+    left = len(rows)
+
+    def take(message: Any) -> None:
+        nonlocal left
+        fields = {name: getattr(message, name) for name in rows[0]}
+        say({name: value.tolist() if name in PAIRS else value for name, value in fields.items()})
+        left -= 1
+        if not left:
+            done.set()
+
+    subscriber = ROS2Subscriber(topic=topic, msg_type=TYPE, msg_definition=definition, callback=take, **options)
+    done.wait()
+    say(get_topic_names_and_types(**options))
+    subscriber.close()
+
+
+def say(value: object) -> None:
+    sys.stdout.write(f"{json.dumps(value)}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    role, given = sys.argv[1:]
+    {"talk": talk, "listen": listen}[role](**json.loads(Path(given).read_text()))
+    os._exit(0)  # its session is never closed, and would keep the process

@@ -1,0 +1,185 @@
+"""ROS 2 over rmw_zenoh, in both directions, against a client that no one here wrote: zenoh-ros2-sdk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from typing import cast
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.rmw_zenoh import Attachment, TopicKey, publisher_token
+from nedbus.session import Session
+from nedbus_msgs import LAYOUTS, ROS2_TYPE, VehicleLocalPosition, dds_type, downgrade, type_hash, upgrade
+from tests.conftest import DEADLINE, Process, Start, message, wait_for
+from tests.replays import open_replay
+
+VLP = "vehicle_local_position"
+PEER = str(Path(__file__).with_name("ros2_peer.py"))
+COUNT = 200
+
+Peer = Callable[..., Process]
+
+
+def flight() -> list[VehicleLocalPosition]:
+    """Return estimates of a flight: numbers of all kinds, NaN, infinities, resets."""
+    records = (record for record in open_replay("sim:?seed=3").records if record.address.topic == VLP)
+    return [upgrade(record.fields) for record in islice(records, 0, 40 * COUNT, 40)]
+
+
+def definition(layout: str) -> str:
+    """Return the message as a .msg file of px4_msgs says it."""
+    return "".join(f"{LAYOUTS[layout].type_of(name)} {name}\n" for name in LAYOUTS[layout].fields)
+
+
+@pytest.fixture
+def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
+    """Start the other side: a role, a layout, and what the role needs."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+
+    def start_peer(role: str, layout: str, **options: object) -> Process:
+        given = {"definition": definition(layout), "router_ip": host, "router_port": int(port), **options}
+        path = tmp_path / "peer.json"
+        path.write_text(json.dumps(given))
+        return start(PEER, role, str(path))
+
+    return start_peer
+
+
+def as_json(fields: dict[str, object]) -> str:
+    """Return fields so that NaN equals NaN, and pairs are lists."""
+    return json.dumps(fields, sort_keys=True)
+
+
+def wait_for_reader(raw: Session, key: str) -> None:
+    probe = raw.declare_publisher(key)
+    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
+    probe.undeclare()
+
+
+@pytest.mark.parametrize("layout", ["1.14", "1.16"])
+def test_ros_2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus, layout: str) -> None:
+    """What a ROS 2 node publishes arrives field for field, with the layout found by its hash."""
+    messages = flight()
+    rows = [downgrade(each, layout) for each in messages]
+    with bus.subscribe(mode="every") as subscription:
+        run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
+        peer("talk", layout, topic=f"/drone/{VLP}", rows=rows, domain_id=4)
+        for row in rows:
+            sample = subscription.receive(DEADLINE)
+            assert sample.message == upgrade(row)
+            assert (sample.vehicle, sample.topic, sample.source) == ("domain4-drone", VLP, "px4-zenoh")
+        assert subscription.counts.lost == 0
+
+
+@pytest.mark.parametrize("layout", ["1.14", "1.16"])
+def test_ros_2_node_receives_and_lists(
+    run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus, layout: str
+) -> None:
+    """What the bridge publishes arrives at a ROS 2 node field for field, and its topics are listed."""
+    messages = flight()
+    expected = [downgrade(each, layout) for each in messages]
+    publisher = bus.publisher(VLP, vehicle="7")
+    bus.publisher("estimator_local_position", vehicle="7", instance=1)
+    bridge = run_nedbus("ros2", "-c", endpoint, "--layout", layout, "--domain", "3")
+    topic = f"/px4_7/fmu/out/{VLP}"
+    node = peer("listen", layout, topic=topic, rows=expected, domain_id=3)
+    wait_for_reader(bus._session, f"3{topic}/{dds_type(ROS2_TYPE)}/{type_hash(layout)}")
+    wait_for(lambda: f"-> {topic}" in bridge.err, what="the bridge")
+    for each in messages:
+        publisher.publish(each)
+    assert node.wait() == 0, node.err
+    *received, listed = [json.loads(line) for line in node.out.splitlines()]
+    assert [as_json(row) for row in received] == [as_json(json.loads(json.dumps(row))) for row in expected]
+    assert [topic, [ROS2_TYPE]] in listed
+    assert ["/px4_7/fmu/out/estimator_local_position_1", [ROS2_TYPE]] in listed
+
+
+def test_bridge_writes_what_px4_writes(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """Key, payload and attachment are those of PX4's own module, so that its subscribers need not know."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    run_nedbus("ros2", "-c", endpoint)
+    key = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
+    subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(100))
+    wait_for(lambda: list(raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**")), what="the publisher's token")
+    for timestamp in (1, 2):
+        publisher.publish(message(timestamp))
+    one, two = (subscriber.handler.recv() for _ in range(2))
+    assert len(one.payload) == 220
+    first, second = (Attachment.parse(sample.attachment.to_bytes()) for sample in (one, two) if sample.attachment)
+    assert (first.sequence, second.sequence, first.gid == second.gid) == (1, 2, True)
+    assert second.time > first.time > 1_700_000_000_000_000_000
+    nodes = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/0/*/*/*/NN/**") if reply.ok]
+    assert len(nodes) == 1
+
+
+def test_topic_of_another_node_is_left_to_it(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """A PX4 that publishes a topic itself is not doubled; the same topic in another layout is a translation."""
+    key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
+    token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
+    bus.publisher(VLP, vehicle="1")
+    same = run_nedbus("ros2", "-c", endpoint, "--layout", "1.14")
+    wait_for(lambda: "node px4_0001 publishes /fmu/out/vehicle_local_position already" in same.err, what="the word")
+    assert "->" not in same.err
+    other = run_nedbus("ros2", "-c", endpoint, "--layout", "1.16")
+    wait_for(lambda: f"-> /fmu/out/{VLP}" in other.err, what="the translation")
+    token.undeclare()
+    wait_for(lambda: f"-> /fmu/out/{VLP}" in same.err, what="the topic to be taken over")
+
+
+def test_topics_come_and_go_with_their_vehicles(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session
+) -> None:
+    """ROS 2 lists what is there now."""
+
+    def topics() -> set[str]:
+        tokens = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**") if reply.ok]
+        return {token.split("/")[9] for token in tokens}
+
+    run_nedbus("ros2", "-c", endpoint, "-v", "alpha-1", "--namespace", "alpha-1:fleet/a")
+    publisher = bus.publisher(VLP, vehicle="alpha-1")
+    bus.publisher(VLP, vehicle="beta")
+    wait_for(lambda: topics() == {f"%fleet%a%fmu%out%{VLP}"}, what="the topic")
+    publisher.close()
+    wait_for(lambda: not topics(), what="the topic to go")
+
+
+def test_loop_is_refused(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A service that listens to ROS 2 does not take in what a bridge of its own network gave to ROS 2."""
+    publisher = bus.publisher(VLP, vehicle="1", source="sim")
+    with bus.subscribe(mode="every") as subscription:
+        service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:?vehicle=copy")
+        bridge = run_nedbus("ros2", "-c", endpoint)
+        wait_for(lambda: "->" in bridge.err and "listening" in service.err, what="both")
+        timestamp = 0
+
+        def is_refused() -> bool:
+            nonlocal timestamp
+            timestamp += 1
+            publisher.publish(message(timestamp))
+            return "would loop" in service.err
+
+        wait_for(is_refused, what="the refusal")
+        received = [subscription.receive(DEADLINE) for _ in range(timestamp)]
+        assert {sample.vehicle for sample in received} == {"1"}
+        assert list(bus.vehicles()) == ["1"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--layout", "1.12"], "no layout '1.12': choose from 1.13, 1.14, 1.15, V0, 1.16"),
+        (["--namespace", "1:7up"], "namespace '7up' is not valid"),
+        (["--namespace", "7up"], "VEHICLE:NAMESPACE"),
+    ],
+)
+def test_wrong_words_are_usage_errors(run_nedbus: Start, endpoint: str, arguments: list[str], word: str) -> None:
+    """What cannot be is said in one line."""
+    bridge = run_nedbus("ros2", "-c", endpoint, *arguments)
+    assert bridge.wait() in {1, 2}
+    assert word in bridge.err
+    assert len(bridge.err.splitlines()) == 1
