@@ -14,13 +14,14 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography", "pymavlink"},
+    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial"},
 }
 ONLY = {  # packages that only these files import
     "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
     "msgpack": {"wire"},
     "pyulog": {"ulog"},
     "pymavlink": {"mavlink"},
+    "serial": {"mavlink_link"},
     "numpy": {"ulog", "arrays", "batches"},
     "pydantic_settings": {"settings"},
     "typer": {"app", "bridge", "certificates", "options", "look", "watch", "serve"},

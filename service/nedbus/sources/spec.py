@@ -101,12 +101,14 @@ class SourceKind:
     """One kind of source: its options, what stands after the colon, and where the code is, imported when it is used.
 
     `target` is None if nothing stands there, and in brackets if it may be left out.
+    `extra`: what to install for it besides nedbus itself.
     """
 
     options: type[Options]
     target: str | None
     module: str
     function: str
+    extra: str | None = None
 
     def takes(self, target: str) -> bool:
         """Return whether this may, or may not, stand after the colon."""
@@ -117,7 +119,7 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "SimulatorSource"),
     "ulog": SourceKind(UlogOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4_zenoh", "Px4ZenohSource"),
-    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink", "MavlinkSource"),
+    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink", "MavlinkSource", "mavlink"),
 }
 
 
@@ -136,7 +138,12 @@ class SourceSpec:
         Raises ConfigError for a target that cannot be, and when what a kind needs is not installed.
         """
         kind = SOURCE_KINDS[self.kind]
-        make = cast("Callable[..., Source]", getattr(import_module(kind.module), kind.function))
+        try:
+            module = import_module(kind.module)
+        except ModuleNotFoundError as exc:
+            hint = f"{exc.name} is not installed: pip install 'nedbus[{kind.extra}]'"
+            raise ConfigError(f"source {self.text!r}", hint) from exc
+        make = cast("Callable[..., Source]", getattr(module, kind.function))
         return make(self.target, self.options, Home(vehicle, routers, tls))
 
 

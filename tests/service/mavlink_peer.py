@@ -1,0 +1,156 @@
+"""Be a MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
+
+Every position that really left is one JSON line on stdout with its float32 values, every command received another,
+and the last line counts: {"end": true, "sent": …, "dropped": …} for positions, "packets_*" for all messages.
+The same arguments give the same packets, in order; an answer to a command comes in between and is never dropped.
+SET_MESSAGE_INTERVAL is answered and reported; it changes no rate.
+Unlike PX4, GLOBAL_POSITION_INT (the heading) is sent without an origin too and GPS_GLOBAL_ORIGIN is repeated.
+"""
+
+import argparse
+import heapq
+import json
+import math
+import random
+import select
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+Row = dict[str, float]
+Build = Callable[[int, Row], Any]  # (ms since boot, row) to a message, or None for "nothing to say"
+Stream = tuple[float, Build]  # Hz
+NED = ("x", "y", "z", "vx", "vy", "vz")
+NAN = math.nan
+BOOT_MS = 5000  # time_boot_ms after a reboot
+
+
+def covariance(known: dict[int, float]) -> list[float]:
+    """Return the 21 numbers of an upper triangle: NaN, as PX4 sends it, but for the known ones."""
+    return [known.get(index, NAN) for index in range(21)]
+
+
+def local_position(ms: int, row: Row) -> Any:
+    return mavlink.MAVLink_local_position_ned_message(ms % 2**32, *(row[name] for name in NED))
+
+
+def attitude(ms: int, row: Row) -> Any:
+    return mavlink.MAVLink_attitude_message(ms % 2**32, 0, 0, row["heading"], 0, 0, 0)
+
+
+def global_position(ms: int, row: Row) -> Any:
+    turn = row["heading"] % math.tau
+    hdg = 65535 if math.isnan(turn) else int(math.degrees(turn) * 100) % 36000
+    lat, lon = (0 if math.isnan(row[k]) else round(row[k] * 1e7) for k in ("ref_lat", "ref_lon"))
+    return mavlink.MAVLink_global_position_int_message(ms % 2**32, lat, lon, 0, int(-row["z"] * 1000), 0, 0, 0, hdg)
+
+
+def origin(ms: int, row: Row) -> Any:
+    lat, lon, alt = row["ref_lat"], row["ref_lon"], row["ref_alt"]
+    if math.isnan(lat + lon + alt):
+        return None  # PX4 is silent while there is no origin
+    return mavlink.MAVLink_gps_global_origin_message(round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 1_000_000)
+
+
+def altitude(ms: int, row: Row) -> Any:
+    bottom = row["dist_bottom"] if row.get("dist_bottom_valid", 1) else NAN
+    return mavlink.MAVLink_altitude_message(ms * 1000, NAN, NAN, -row["z"], -row["z"], -row["z"] - bottom, bottom)
+
+
+def estimator(ms: int, row: Row) -> Any:
+    names = ("", "v_xy_valid", "v_z_valid", "xy_valid", "xy_global", "z_valid", "dist_bottom_valid")  # from bit 0
+    bits = [({"xy_global": not math.isnan(row["ref_lat"])} | row).get(name, 1) for name in names]
+    flags = sum(1 << bit for bit, is_set in enumerate(bits) if is_set)
+    return mavlink.MAVLink_estimator_status_message(ms * 1000, flags, 0, 0, 0, 0, 0, 0, row["eph"], row["epv"])
+
+
+def odometry(ms: int, row: Row) -> Any:
+    eph, epv, evh, evv = row["eph"] ** 2 / 2, row["epv"] ** 2, row.get("evh", 0.1) ** 2 / 2, row.get("evv", 0.1) ** 2
+    pose = covariance({0: eph, 6: eph, 11: epv, 15: 0.01, 18: 0.01, 20: 0.01})
+    twist, q = covariance({0: evh, 6: evh, 11: evv}), (math.cos(row["heading"] / 2), 0, 0, math.sin(row["heading"] / 2))
+    x, y, z, *speed = (row[name] for name in NED)
+    return mavlink.MAVLink_odometry_message(ms * 1000, 1, 1, x, y, z, q, *speed, 0, 0, 0, pose, twist, 0, 8, 100)
+
+
+def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
+    """Yield (seconds since boot began, builder) for ever; at equal times the position comes last."""
+    heap = [(0.0, order, 0) for order, (rate, _) in enumerate(streams) if rate > 0]
+    while True:
+        now, order, turn = heapq.heappop(heap)
+        rate, build = streams[order]
+        yield now, build
+        heapq.heappush(heap, ((turn + 1) / rate, order, turn + 1))
+
+
+def answer(link: socket.socket, mav: Any, data: bytes, sender: Any) -> None:
+    """Acknowledge and report the commands in one datagram."""
+    (reader := mavlink.MAVLink(None)).robust_parsing = True  # a fresh one: half a message must not reach the next
+    for message in reader.parse_buffer(data) or []:
+        if message.get_type() != "COMMAND_LONG" or message.target_system not in (0, mav.srcSystem):
+            continue
+        number, wanted = message.command, int(message.param1) if math.isfinite(message.param1) else -1
+        result = mavlink.MAV_RESULT_ACCEPTED if wanted in mavlink.mavlink_map else mavlink.MAV_RESULT_FAILED
+        if number not in (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE):
+            result = mavlink.MAV_RESULT_UNSUPPORTED
+        source = (message.get_srcSystem(), message.get_srcComponent())
+        link.sendto(mavlink.MAVLink_command_ack_message(number, result, 0, 0, *source).pack(mav), sender)
+        mav.seq = (mav.seq + 1) % 256
+        facts = {"command": number, "message_id": wanted, "interval_us": message.param2, "result": result}
+        say(facts | {"from": source})
+
+
+def say(facts: dict[str, Any]) -> None:
+    """Print a line, at once."""
+    sys.stdout.write(f"{json.dumps(facts)}\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--to", required=True, metavar="HOST:PORT")
+    parser.add_argument("--values", required=True, type=Path)
+    numbers = {"system": 1, "seed": 1, "start-ms": BOOT_MS, "count": 0, "reboot-after": 0}
+    for name, number in (numbers | {"rate": 30.0, "attitude": 50.0, "drop": 0.0, "speed": 1.0}).items():
+        parser.add_argument(f"--{name}", type=type(number), default=number)
+    args = parser.parse_args()
+    host, port = args.to.rsplit(":", 1)
+    rows: list[Row] = json.loads(args.values.read_text())
+    alive = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    streams: list[Stream] = [(1, lambda ms, row: alive), (1, origin), (2, estimator), (10, global_position)]
+    streams += [(10, altitude), (10, odometry), (args.attitude, attitude), (args.rate, local_position)]
+    link, chance = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), random.Random(args.seed)
+    mav, base_ms = mavlink.MAVLink(None, args.system, 1), args.start_ms
+    plan, began = schedule(streams), time.monotonic()
+    total = turn = sent = packets = dropped = 0
+    while not args.count or total < args.count:
+        now, build = next(plan)
+        while select.select([link], [], [], max(0.0, began + now / args.speed - time.monotonic()))[0]:
+            answer(link, mav, *link.recvfrom(2048))
+        if (message := build(base_ms + round(now * 1000), rows[turn % len(rows)])) is None:
+            continue
+        data, mav.seq = message.pack(mav), (mav.seq + 1) % 256
+        gone = chance.random() < args.drop
+        packets, dropped = packets + (not gone), dropped + gone
+        if not gone:
+            link.sendto(data, (host, int(port)))
+        if build is local_position:
+            total, turn, sent = total + 1, turn + 1, sent + (not gone)
+            if not gone:
+                values = struct.unpack("<6f", struct.pack("<6f", *(getattr(message, name) for name in NED)))
+                facts = {"time_boot_ms": message.time_boot_ms} | dict(zip(NED, values, strict=True))
+                say(facts)
+            if total == args.reboot_after:
+                plan, began = schedule(streams), time.monotonic()
+                mav.seq, base_ms, turn = 0, BOOT_MS, 0
+    end = {"end": True, "sent": sent, "dropped": total - sent, "packets_sent": packets, "packets_dropped": dropped}
+    say(end)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,378 @@
+"""Vehicles that speak MAVLink, each a process of its own: pymavlink encodes what a real flight's estimates were."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import random
+import socket
+import sys
+import time
+import tty
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+import nedbus
+from nedbus.errors import ConfigError
+from nedbus.sources import parse_source
+from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, OutOfOrderError, Vehicle
+from nedbus_msgs import upgrade
+from tests.conftest import DEADLINE, LOGS, Process, Start, wait_for
+from tests.replays import open_replay
+
+PEER = str(Path(__file__).with_name("mavlink_peer.py"))
+VLP = "vehicle_local_position"
+NED = ("x", "y", "z", "vx", "vy", "vz")
+ROW = {
+    "x": 1.5, "y": -2.25, "z": -10.0, "vx": 0.5, "vy": -0.25, "vz": 0.125, "heading": -1.0, "eph": 0.5, "epv": 0.75,
+    "ref_lat": 47.3977418, "ref_lon": 8.5455939, "ref_alt": 487.957, "dist_bottom": 10.5, "evh": 0.25, "evv": 0.125,
+}  # fmt: skip
+
+Fly = Callable[..., Process]
+
+
+@pytest.fixture
+def port() -> int:
+    """Return a UDP port that nobody uses now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return cast("int", probe.getsockname()[1])
+
+
+@pytest.fixture
+def service(run_nedbus: Start, endpoint: str, port: int) -> Process:
+    """Run a service that listens to UDP."""
+    service = run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}?rate=50")
+    wait_for(lambda: is_taken(port), what="the service to listen")
+    return service
+
+
+@pytest.fixture
+def fly(start: Start, port: int, tmp_path: Path) -> Fly:
+    """Start a vehicle."""
+
+    def fly(*arguments: object, rows: list[dict[str, float]] | None = None) -> Process:
+        values = tmp_path / "values.json"
+        values.write_text(json.dumps(rows or [ROW]))
+        return start(PEER, "--to", f"127.0.0.1:{port}", "--values", str(values), *map(str, arguments))
+
+    return fly
+
+
+@pytest.fixture
+def every(bus: nedbus.Bus) -> Iterator[nedbus.Subscription]:
+    """Read everything that the service publishes."""
+    with bus.subscribe(mode="every") as subscription:
+        yield subscription
+
+
+def is_taken(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError:
+            return True
+    return False
+
+
+def status(bus: nedbus.Bus) -> dict[str, Any]:
+    """Return what the service says of its one source."""
+    services = cast("list[dict[str, Any]]", bus.services())
+    return services[0]["sources"][0] if services else {}
+
+
+def are_refused(bus: nedbus.Bus, count: float) -> bool:
+    return bool(status(bus)["rejected"] >= count)
+
+
+def said(vehicle: Process) -> list[dict[str, Any]]:
+    """Return the lines that a vehicle printed."""
+    return [json.loads(line) for line in vehicle.out.splitlines()]
+
+
+def flight() -> list[dict[str, float]]:
+    """Return the estimates of a real flight, or of a simulated one where the log is not here."""
+    log = LOGS / "sitl_1.15_events.ulg"
+    records = open_replay(f"ulog:{log}" if log.exists() else "sim:").records
+    chosen = islice((record for record in records if record.address.topic == VLP), 300)
+    messages = [upgrade(record.fields) for record in chosen]
+    flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dist_bottom_valid", "xy_global")
+    return [{name: getattr(message, name) for name in (*ROW, *flags)} for message in messages]
+
+
+def test_a_flight_with_loss_and_a_reboot(
+    service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """30 Hz of positions, 50 Hz of attitude, a tenth of all packets gone, a reboot: all that came is published."""
+    vehicle = fly("--system", 7, "--drop", 0.1, "--count", 300, "--reboot-after", 150, "--speed", 10, rows=flight())
+    assert vehicle.wait() == 0, vehicle.err
+    *lines, end = said(vehicle)
+    sent = [line for line in lines if "x" in line]
+    assert 200 < len(sent) < 300
+    for line in sent:
+        sample = every.receive(DEADLINE)
+        assert (sample.vehicle, sample.topic, sample.source) == ("7", VLP, "mavlink")
+        assert sample.message.timestamp == line["time_boot_ms"] * 1000
+        assert [getattr(sample.message, name) for name in NED] == [line[name] for name in NED]
+        assert "heading" in sample.missing or abs(sample.message.heading) <= math.pi + 1e-6
+    now = status(bus)
+    assert (now["published"], now["rejected"], now["reboots"], now["restarts"]) == (len(sent), 0, 1, 0)
+    # What was lost before the first packet, around the reboot and after the last position nobody can know.
+    assert 0 < now["lost"] <= end["packets_dropped"]
+    assert "7/vehicle_local_position: started again" in service.err
+
+
+@pytest.mark.usefixtures("service")
+def test_fields_are_those_that_mavlink_has(fly: Fly, every: nedbus.Subscription) -> None:
+    """What the messages say is in the estimate, in PX4's units; all the rest is marked as not provided."""
+    fly("--speed", 10)
+    expected = {**ROW, "xy_valid": True, "z_valid": True, "v_xy_valid": True, "v_z_valid": True, "xy_global": True}
+    expected |= {"z_global": True, "dist_bottom_valid": True, "ref_timestamp": 1_000_000}
+    sample = every.receive(DEADLINE)
+    while not sample.message.xy_global or "evh" in sample.missing or "dist_bottom" in sample.missing:
+        sample = every.receive(DEADLINE)
+    for name, value in expected.items():
+        assert getattr(sample.message, name) == pytest.approx(value, abs=1e-4 if name == "heading" else 1e-6), name
+    assert sample.message.ref_lat == 47.3977418
+    provided = sample.message.model_fields_set - sample.missing
+    assert provided == {*expected, "timestamp"}
+    assert not sample.message.dead_reckoning
+    assert math.isnan(sample.message.delta_z)
+
+
+@pytest.mark.usefixtures("service")
+def test_vehicles_on_one_port(fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """Each system id is a vehicle of its own, and each is asked for its streams at its own address."""
+    fleet = {system: fly("--system", system, "--speed", 5) for system in (3, 250)}
+    wanted = {*STREAMS, ORIGIN}
+
+    def asked(vehicle: Process) -> dict[int, float]:
+        return {line["message_id"]: line["interval_us"] for line in said(vehicle) if "message_id" in line}
+
+    wait_for(lambda: all(asked(vehicle).keys() == wanted for vehicle in fleet.values()), what="all requests")
+    assert all(asked(vehicle)[32] == 20_000 for vehicle in fleet.values())
+    seen = {every.receive(DEADLINE).vehicle for _ in range(200)}
+    assert seen == {"3", "250"}
+    assert sorted(bus.vehicles()) == ["250", "3"]
+
+
+def test_lost_link_is_seen_and_recovers(
+    service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """Within about 3 s of silence a vehicle is silent in the status and not listed; when it is back, so is its data."""
+    fly("--system", 7, "--count", 30, "--speed", 10).wait()
+    wait_for(lambda: status(bus)["published"] == 30, what="the flight")
+    heard = time.monotonic()
+    assert status(bus)["state"] == "running"
+    wait_for(lambda: status(bus)["silent"] == [f"7/{VLP}"], what="the silence")
+    assert time.monotonic() - heard < 6.0
+    assert status(bus)["state"] == "waiting"
+    assert bus.vehicles() == {}
+    assert "is silent: nothing came for 3 s" in service.err
+    fly("--system", 7, "--start-ms", 60_000, "--speed", 10)
+    wait_for(lambda: status(bus)["silent"] == [], what="the vehicle to be back")
+    assert list(bus.vehicles()) == ["7"]
+    assert [every.receive(DEADLINE).message.timestamp for _ in range(31)][-1] == 60_000_000
+
+
+@pytest.mark.usefixtures("service")
+def test_time_goes_on_when_its_counter_wraps(fly: Fly, every: nedbus.Subscription, bus: nedbus.Bus) -> None:
+    """time_boot_ms starts again after 49.7 days; the timestamp does not."""
+    fly("--start-ms", 2**32 - 500, "--count", 40, "--speed", 10)
+    times = [every.receive(DEADLINE).message.timestamp for _ in range(40)]
+    assert times == sorted(times)
+    assert times[0] == (2**32 - 500) * 1000
+    assert times[-1] > 2**32 * 1000
+    assert status(bus)["reboots"] == 0
+
+
+def test_hostile_datagrams_are_counted(
+    service: Process, port: int, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """10,000 datagrams of anything: counted, named once, nothing published, and a vehicle beside them is read."""
+    rng = random.Random(0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attacker:
+        for each in range(1, 10_001):
+            start = (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00")[each % 4]
+            attacker.sendto(start + rng.randbytes(rng.randrange(1, 300)), ("127.0.0.1", port))
+            if each % 100 == 0:  # the kernel drops what is not read in time
+                wait_for(partial(are_refused, bus, 0.9 * each), what=f"{each} refusals")
+    assert status(bus)["published"] == 0
+    assert sum("refused" in line for line in service.err.splitlines()) == 1
+    fly("--count", 10, "--speed", 10)
+    assert len({every.receive(DEADLINE).message.timestamp for _ in range(10)}) == 10
+
+
+def test_broken_estimates_are_rejected(
+    service: Process, port: int, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """What the model refuses is reported, as from any source; a late datagram is not published after newer ones."""
+    us = dialect.MAVLink(None, 9, 1)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+
+        def send(message: Any) -> None:
+            vehicle.sendto(message.pack(us), ("127.0.0.1", port))
+
+        send(dialect.MAVLink_estimator_status_message(0, 127, 0, 0, 0, 0, 0, 0, -1.0, 1.0))
+        send(dialect.MAVLink_local_position_ned_message(1000, *range(6)))
+        send(dialect.MAVLink_estimator_status_message(0, 127, 0, 0, 0, 0, 0, 0, 1.0, 1.0))
+        send(dialect.MAVLink_local_position_ned_message(2000, math.nan, *range(5)))
+        send(dialect.MAVLink_local_position_ned_message(1500, *range(6)))
+        us.srcComponent = 100  # a camera may say much, but not where the vehicle is
+        send(dialect.MAVLink_local_position_ned_message(3000, *range(6)))
+        us.srcSystem = 0
+        send(dialect.MAVLink_local_position_ned_message(3000, *range(6)))
+    sample = every.receive(DEADLINE)
+    assert (sample.vehicle, sample.message.timestamp) == ("9", 2_000_000)
+    assert not sample.message.xy_valid
+    assert sample.message.v_xy_valid
+    wait_for(lambda: status(bus)["rejected"] == 2, what="both")
+    assert "eph: must not be negative" in service.err
+    assert "out of order: time_boot_ms 1500 after 2000" in service.err
+
+
+def test_tcp_that_breaks_is_opened_again(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """A link that ends is an error in the status, and tried again; what came in pieces is put together."""
+    us = dialect.MAVLink(None, 5, 1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:tcp:127.0.0.1:{port}?vehicles=5:boat")
+        for ms in (1000, 2000):
+            server.settimeout(DEADLINE)
+            connection, _ = server.accept()
+            data = dialect.MAVLink_local_position_ned_message(ms, *range(6)).pack(us)
+            connection.sendall(b"noise" + data[:7])
+            connection.sendall(data[7:])
+            sample = every.receive(DEADLINE)
+            assert (sample.vehicle, sample.message.timestamp) == ("boat", ms * 1000)
+            connection.settimeout(DEADLINE)
+            assert connection.recv(1)[0] == dialect.PROTOCOL_MARKER_V2  # a heartbeat, or a request
+            connection.close()
+            wait_for(lambda: status(bus)["state"] != "running", what="the break to be seen")
+    wait_for(lambda: "cannot be opened (connection refused)" in str(status(bus)["error"]), what="the reason")
+
+
+def test_serial_port(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """A telemetry radio on a serial port; a port that vanishes is an error, not the end."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:serial:{os.ttyname(theirs)}?baud=115200")
+    assert os.read(ours, 1)[0] == dialect.PROTOCOL_MARKER_V2
+    os.write(ours, dialect.MAVLink_local_position_ned_message(1000, *range(6)).pack(dialect.MAVLink(None, 5, 1)))
+    assert every.receive(DEADLINE).message.y == 1.0
+    os.close(ours)
+    os.close(theirs)
+    wait_for(lambda: status(bus)["state"] == "retrying", what="the port to be missed")
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("mavlink:", "write it as mavlink:LINK"),
+        ("mavlink:14550", "write udpin:0.0.0.0:14550"),
+        ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14550"),
+        ("mavlink:udpin:0.0.0.0:14550?rate=0", "positions a second"),
+        ("mavlink:udpin:0.0.0.0:14550?vehicles=1:a b", "SYSTEM_ID:VEHICLE"),
+        ("px4-zenoh:?domain=500", "a ROS domain, 0 to 232"),
+        ("px4-zenoh:?layout=1.12", "the layout of keys without a type hash"),
+        ("px4-zenoh:here", "'here' is no endpoint"),
+    ],
+)
+def test_wrong_words_are_refused(text: str, word: str) -> None:
+    """A source that cannot be says how to write it."""
+    with pytest.raises(ConfigError, match=word):
+        parse_source(text).open_source(vehicle="1")
+
+
+def test_missing_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pymavlink one line says what to do."""
+    monkeypatch.delitem(sys.modules, "nedbus.sources.mavlink", raising=False)
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    with pytest.raises(ConfigError, match=r"is not installed: pip install 'nedbus\[mavlink\]'"):
+        parse_source("mavlink:udpin:0.0.0.0:14550").open_source(vehicle="1")
+
+
+def test_port_that_is_taken_is_an_error(run_nedbus: Start, endpoint: str, port: int) -> None:
+    """Two programs cannot share a port: the second one says so."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", port))
+        service = run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}")
+        wait_for(lambda: "cannot be opened (address already in use)" in service.err, what="the error")
+
+
+def position(ms: int) -> SimpleNamespace:
+    values = dict.fromkeys(NED, 0.0)
+    return SimpleNamespace(get_type=lambda: "LOCAL_POSITION_NED", time_boot_ms=ms, **values)
+
+
+def test_requests_are_repeated_and_given_up() -> None:
+    """Each stream is asked for up to five times a second apart, then the next; the origin again and again."""
+    vehicle = Vehicle(30.0)
+    asked: list[int] = []
+    for tick in range(200):
+        now = 100.0 + tick / 2
+        vehicle.count(1, tick % 256, now)
+        asked += [number for number, _ in vehicle.requests(now)]
+    for number in STREAMS:
+        assert asked.count(number) == 5
+    assert asked.count(ORIGIN) > 10
+
+
+def test_answers_move_requests_on() -> None:
+    """An answer of any kind ends the waiting; once all is asked for and the origin is known, nothing is asked."""
+    vehicle = Vehicle(30.0)
+    asked: list[tuple[int, float]] = []
+    for tick in range(20):
+        now = 100.0 + tick
+        vehicle.count(1, tick, now)
+        for request in list(vehicle.requests(now)):
+            asked.append(request)
+            assert vehicle.answered(now) == request[0]
+        if tick == 10:
+            origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
+            assert vehicle.take(origin, now) is None
+    assert [number for number, _ in asked[:6]] == [*STREAMS, ORIGIN]
+    assert asked[0] == (32, 30.0)
+    assert len(asked) < 9
+    assert vehicle.answered(1000.0) is None
+
+
+def test_old_values_are_no_part_of_an_estimate() -> None:
+    """A heading that is not repeated is not provided after 2 s; an origin stays until a reboot."""
+    vehicle = Vehicle(30.0)
+    vehicle.take(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
+    vehicle.take(dialect.MAVLink_gps_global_origin_message(473977418, 85455939, 488000), 100.0)
+    first = vehicle.take(position(1000), 101.0)
+    later = vehicle.take(position(4000), 104.0)
+    assert first is not None
+    assert later is not None
+    assert first["heading"] == pytest.approx(math.pi / 2)
+    assert "heading" not in later
+    assert later["ref_lat"] == 47.3977418
+    assert "ref_timestamp" not in later
+    again = vehicle.take(position(500), 105.0)
+    assert again is not None
+    assert "ref_lat" not in again
+    assert vehicle.restarted
+    with pytest.raises(OutOfOrderError):
+        vehicle.take(position(499), 105.0)
+
+
+def test_attitude_stands_in_for_the_heading() -> None:
+    """Without a global position PX4 sends no GLOBAL_POSITION_INT: then the yaw of its attitude is the heading."""
+    vehicle = Vehicle(30.0)
+    vehicle.take(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
+    vehicle.take(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
+    fields = vehicle.take(position(1), 100.0)
+    assert fields is not None
+    assert fields["heading"] == pytest.approx(1.25)
