@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 os.environ["ZENOH_CONFIG_OVERRIDE"] = (
-    # Its default is a peer, which would go round the router.
-    'mode="client";listen/endpoints=[];transport/shared_memory/enabled=false;'
-    'qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]'
+    # A peer, as every ROS 2 node by rmw_zenoh; it must not lose what this test sends without a pause.
+    'transport/shared_memory/enabled=false;qos/publication=[{key_exprs: ["**"], config: {congestion_control: "block"}}]'
 )
 
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
