@@ -53,7 +53,9 @@ class Daemon:
 
     def __init__(self, settings: Settings, *, version: str) -> None:
         if not settings.source:
-            raise ConfigError("source", "nothing to publish: give --source sim: or --source ulog:FILE, or several")
+            raise ConfigError(
+                "source", "nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"
+            )
         self._settings = settings
         self._version = version
         self._sources = [(text, self._open_source(text)) for text in settings.source]

@@ -44,6 +44,8 @@ def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: A
 
     def take(message: Any) -> None:
         nonlocal left
+        if not left:
+            return
         fields = {name: getattr(message, name) for name in rows[0]}
         say({name: value.tolist() if name in PAIRS else value for name, value in fields.items()})
         left -= 1

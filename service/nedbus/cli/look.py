@@ -82,7 +82,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {service.get('service')}, nedbus {service.get('version')}, as {service.get('role')}")
         rows = [_source_row(source) for source in _sources(service)]
         if rows:
-            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "RESTARTS", "ERROR"], rows))
+            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "RESTARTS", "REMARK"], rows))
     if not services:
         tell("no nedbus service answers here")
 
@@ -125,5 +125,7 @@ def _published(source: dict[str, object]) -> int:
 
 
 def _source_row(source: dict[str, object]) -> list[str]:
-    keys = ("source", "state", "published", "rejected", "restarts")
-    return [*(str(source.get(key)) for key in keys), str(source.get("error") or "-")]
+    keys = ("source", "state", "published", "rejected", "lost", "restarts")
+    silent = source.get("silent")
+    remark = f"silent: {', '.join(map(str, silent))}" if silent and isinstance(silent, list) else "-"
+    return [*(str(source.get(key, "-")) for key in keys), str(source.get("error") or remark)]

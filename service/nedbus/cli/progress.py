@@ -112,7 +112,9 @@ class Display:
     def _numbers(self, worker: WorkerStatus) -> str:
         count = f"{worker.done} of {worker.total}" if worker.total else f"{worker.published}"
         rejected = f", {worker.rejected} rejected" if worker.rejected else ""
-        return f"{count} messages, {self._rate(worker):.0f}/s{rejected}"
+        lost = f", {worker.lost} lost" if worker.lost else ""
+        silent = f", silent: {', '.join(worker.silent)}" if worker.silent else ""
+        return f"{count} messages, {self._rate(worker):.0f}/s{rejected}{lost}{silent}"
 
     def _rate(self, worker: WorkerStatus) -> float:
         """Return messages a second, as an average that follows within about a second."""

@@ -37,7 +37,12 @@ def serve(
     *,
     source: Annotated[
         list[str] | None,
-        typer.Option("--source", "-s", metavar="SOURCE", help="sim: or ulog:FILE, with ?OPTION=VALUE&...; repeatable"),
+        typer.Option(
+            "--source",
+            "-s",
+            metavar="SOURCE",
+            help="sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, with ?OPTION=VALUE&...; repeatable",
+        ),
     ] = None,
     connect: Annotated[
         list[str] | None,
