@@ -2,9 +2,26 @@
 
 from .cdr import decode_cdr, encode_cdr
 from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
+from .frames import (
+    GlobalPosition,
+    MapProjection,
+    NoOrigin,
+    enu_to_ned,
+    flu_to_frd,
+    frd_to_flu,
+    ned_to_enu,
+    to_global,
+    to_local,
+    variances_enu_to_ned,
+    variances_ned_to_enu,
+    wrap,
+    yaw_enu_to_ned,
+    yaw_ned_to_enu,
+)
 from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
 from .origin import Origin, encoding_of, origin_of
 from .position import FIELD_TYPES, VehicleLocalPosition
+from .resets import Continuous, ResetTracker
 from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, type_hash
 from .rows import Row
 from .schema import json_schema, layout_table
@@ -41,12 +58,17 @@ __all__ = [
     "WIRE_LAYOUTS",
     "Address",
     "AddressError",
+    "Continuous",
     "DecodeError",
     "EncodeError",
+    "GlobalPosition",
     "Layout",
     "LayoutError",
+    "MapProjection",
     "NedbusError",
+    "NoOrigin",
     "Origin",
+    "ResetTracker",
     "Row",
     "Topic",
     "UnknownLayoutError",
@@ -66,15 +88,26 @@ __all__ = [
     "encode_fields",
     "encode_row",
     "encoding_of",
+    "enu_to_ned",
     "find_layout",
+    "flu_to_frd",
+    "frd_to_flu",
     "get_topic",
     "json_schema",
     "layout_of_type_hash",
     "layout_table",
+    "ned_to_enu",
     "origin_of",
     "schema_key",
     "selection",
     "status_key",
+    "to_global",
+    "to_local",
     "type_hash",
     "upgrade",
+    "variances_enu_to_ned",
+    "variances_ned_to_enu",
+    "wrap",
+    "yaw_enu_to_ned",
+    "yaw_ned_to_enu",
 ]

@@ -16,7 +16,7 @@ from itertools import count
 from random import Random
 from typing import Final
 
-from nedbus_msgs import FIELD_TYPES, TOPICS, Address, VehicleLocalPosition
+from nedbus_msgs import FIELD_TYPES, TOPICS, Address, VehicleLocalPosition, wrap
 
 from .record import Flight, Home, Record
 from .spec import SimulatorOptions
@@ -265,11 +265,6 @@ def true_fields(time: float, truth: Truth) -> dict[str, object]:
         **_origin(known=True),
         **_ground(truth.position[2]),
     }
-
-
-def wrap(angle: float) -> float:
-    """Return the same angle within [-pi, pi]."""
-    return math.remainder(angle, math.tau)
 
 
 def _stamps(time: float) -> dict[str, object]:

@@ -1,0 +1,198 @@
+"""Tracks without jumps: rules by hand, real logs with resets, and a simulated flight whose truth is known."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from itertools import pairwise
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from nedbus_msgs import Continuous, MapProjection, ResetTracker, VehicleLocalPosition, upgrade
+from tests.replays import open_replay
+
+LOGS = Path(__file__).parents[3] / "shared" / "data" / "ulog"
+VLP = "vehicle_local_position"
+PLAIN: dict[str, object] = {
+    "x": 0.0, "y": 0.0, "z": 0.0, "vx": 0.0, "vy": 0.0, "vz": 0.0, "heading": 0.0, "dist_bottom": 1.0,
+    "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
+}  # fmt: skip
+
+
+def at(seconds: float, **fields: object) -> VehicleLocalPosition:
+    return VehicleLocalPosition.model_validate({"timestamp": round(seconds * 1e6), **PLAIN, **fields})
+
+
+def track(*messages: VehicleLocalPosition) -> list[Continuous]:
+    tracker = ResetTracker()
+    return [tracker.add(message) for message in messages]
+
+
+def test_complete_delta_is_taken_out() -> None:
+    """A counter that rose by one says that the delta is the jump."""
+    first, second, third = track(
+        at(1, x=1.0, y=1.0),
+        at(2, x=11.5, y=-3.5, xy_reset_counter=1, delta_xy=(10.0, -5.0)),
+        at(3, x=12.0, y=-3.0, xy_reset_counter=1, delta_xy=(10.0, -5.0)),
+    )
+    assert (first.x, first.y) == (1.0, 1.0)
+    assert (second.x, second.y) == (1.5, 1.5)
+    assert (third.x, third.y) == (2.0, 2.0)
+    assert second.reset == {"xy"}
+    assert not second.lost
+    assert not third.reset
+    assert third.resets["xy"] == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "delta", "counter", "jump"),
+    [
+        (("z",), "delta_z", "z_reset_counter", -4.0),
+        (("vz",), "delta_vz", "vz_reset_counter", 0.5),
+        (("heading",), "delta_heading", "heading_reset_counter", 0.25),
+        (("dist_bottom",), "delta_dist_bottom", "dist_bottom_reset_counter", 2.0),
+        (("vx", "vy"), "delta_vxy", "vxy_reset_counter", (0.5, -0.5)),
+    ],
+)
+def test_every_quantity_has_its_own_delta(
+    values: tuple[str, ...], delta: str, counter: str, jump: float | tuple[float, float]
+) -> None:
+    """Each counter belongs to its delta, and to nothing else."""
+    steps = jump if isinstance(jump, tuple) else (jump,)
+    jumped = {name: cast("float", PLAIN[name]) + step for name, step in zip(values, steps, strict=True)}
+    first, second = track(at(1), at(2, **jumped, **{delta: jump, counter: 1}))
+    for name in PLAIN:
+        if not name.startswith("delta"):
+            assert getattr(second, name) == getattr(first, name), name
+
+
+def test_counter_wraps() -> None:
+    """255 to 0 is one reset."""
+    _, second = track(at(1, z_reset_counter=255), at(2, z=5.0, z_reset_counter=0, delta_z=5.0))
+    assert second.z == 0.0
+    assert second.resets["z"] == 1
+
+
+def test_incomplete_delta_is_not_used() -> None:
+    """Two resets between two messages: the delta is that of the last one, so the track begins anew and says so."""
+    _, second, third = track(
+        at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
+    )
+    assert second.lost == {"z"}
+    assert (second.z, third.z) == (50.0, 51.0)
+    assert second.resets["z"] == 2
+    assert not third.lost
+
+
+def test_delta_that_is_not_provided_is_not_used() -> None:
+    """A layout or a source without deltas cannot explain a jump."""
+    _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
+    assert second.lost == {"heading"}
+
+
+def test_time_that_goes_back_is_a_new_track() -> None:
+    """A vehicle that started again has nothing to do with what was before."""
+    _, second, third = track(
+        at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
+    )
+    assert second.x == 5.0
+    assert third.lost == {"xy", "z", "vxy", "vz", "heading", "dist_bottom"}
+    assert third.x == 0.5
+
+
+def test_origin_that_is_set_moves_nothing() -> None:
+    """The origin's altitude becomes known, delta_z says -179.5 m, and z moved by 2 mm: what came is believed."""
+    first, second = track(
+        at(21.574, z=-0.2),
+        at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362),
+    )
+    assert second.origin_changed
+    assert second.reset == {"z"}
+    assert not second.lost
+    assert second.z == pytest.approx(first.z + 0.002)
+
+
+@pytest.mark.parametrize("counted", [0, 1])
+def test_origin_that_moves_takes_the_frame_along(counted: int) -> None:
+    """A new origin elsewhere shifts all coordinates, by the way from origin to origin, counted as a reset or not."""
+    old, new = (47.0, 8.0, 400.0), (47.001, 8.002, 410.0)
+    north, east = MapProjection(new[0], new[1]).project(old[0], old[1])
+
+    def origin(place: tuple[float, float, float]) -> dict[str, object]:
+        latitude, longitude, altitude = place
+        return {"xy_global": True, "z_global": True, "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
+
+    first, second = track(
+        at(1.0, x=3.0, vx=1.0, **origin(old)),
+        at(
+            1.1, x=3.1 + north, y=east, z=10.0, vx=1.0, xy_reset_counter=counted, z_reset_counter=counted, **origin(new)
+        ),
+    )
+    assert second.origin_changed
+    assert not second.lost
+    assert (second.x, second.y, second.z) == pytest.approx((first.x + 0.1, 0.0, 0.0), abs=1e-3)
+
+
+def test_origin_with_an_unexplained_jump_is_a_new_track() -> None:
+    """A jump that neither the delta nor the origins explain is not made up for."""
+    _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
+    assert second.lost == {"xy"}
+    assert second.x == 500.0
+
+
+def test_simulated_truth_is_followed() -> None:
+    """Through GPS outages and resets of a simulated flight the track moves as the vehicle really did."""
+    truth: dict[int, VehicleLocalPosition] = {}
+    tracker = ResetTracker()
+    estimates: list[tuple[VehicleLocalPosition, Continuous]] = []
+    for record in open_replay("sim:?duration=260").records:
+        if record.address.topic == "vehicle_local_position_groundtruth":
+            truth[int(str(record.fields["timestamp"]))] = upgrade(record.fields)
+        elif record.address.topic == VLP:
+            message = upgrade(record.fields)
+            estimates.append((message, tracker.add(message)))
+    resets = raw_worst = worst = 0.0
+    for (before, smooth), (after, smooth_after) in pairwise(estimates[::2]):
+        then, now = truth[before.timestamp], truth[after.timestamp]
+        real = (now.x - then.x, now.y - then.y, now.z - then.z)
+        raw = (after.x - before.x, after.y - before.y, after.z - before.z)
+        came = (smooth_after.x - smooth.x, smooth_after.y - smooth.y, smooth_after.z - smooth.z)
+        raw_worst, worst = max(raw_worst, math.dist(raw, real)), max(worst, math.dist(came, real))
+        resets = max(resets, sum(smooth_after.resets.values()))
+    assert resets >= 8
+    assert raw_worst > 1.0
+    assert worst < 0.2
+    assert not any(smooth.lost for _, smooth in estimates)
+
+
+@pytest.mark.logs
+@pytest.mark.parametrize(
+    ("name", "raw", "smooth"),
+    [("fmuv6c_1.17_selector_whipsaw.ulg", 130.0, 3.0), ("nxp_v0_ekf_failure.ulg", 25.0, 6.0)],
+)
+def test_real_resets_are_taken_out(name: str, raw: float, smooth: float) -> None:
+    """Steps that velocity does not explain: in the raw track those are the resets, in ours motion between messages."""
+    if not (LOGS / name).exists():
+        pytest.skip(f"the real logs are not here: {LOGS}")
+    worst: dict[str, float] = defaultdict(float)
+    tracker = ResetTracker()
+    last: tuple[VehicleLocalPosition, Continuous] | None = None
+    for record in open_replay(f"ulog:{LOGS / name}").records:
+        if record.address.topic != VLP:
+            continue
+        message = upgrade(record.fields)
+        track = tracker.add(message)
+        assert not track.lost
+        if last is not None:
+            before, smooth_before = last
+            seconds = (message.timestamp - before.timestamp) / 1e6
+            moved = (before.vx * seconds, before.vy * seconds, before.vz * seconds)
+            step = (message.x - before.x, message.y - before.y, message.z - before.z)
+            came = (track.x - smooth_before.x, track.y - smooth_before.y, track.z - smooth_before.z)
+            worst["raw"] = max(worst["raw"], math.dist(step, moved))
+            worst["smooth"] = max(worst["smooth"], math.dist(came, moved))
+        last = message, track
+    assert worst["raw"] > raw
+    assert worst["smooth"] < smooth
