@@ -29,7 +29,7 @@ ONLY = {  # packages that only these files import
     "cryptography": {"pki", "certificates"},
 }
 ORDER = [  # each may import those before it only
-    "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "rates",
+    "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health",
     "bus", "rmw_zenoh", "sources", "worker", "daemon", "ros2",
     "cli",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nedbus_msgs import Address, Row, VehicleLocalPosition
+    from nedbus_msgs import Address, ResetTracker, Row, VehicleLocalPosition, to_global
 
     from .bus import AsyncBus, Bus, connect, connect_async
     from .errors import (
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         SourceError,
         UnknownLayoutError,
     )
+    from .health import Health, Monitor
     from .intake import Counts, Sample
     from .publisher import Publisher
     from .subscriber import AsyncSubscription, Subscription
@@ -49,11 +50,14 @@ __all__ = [
     "Counts",
     "DecodeError",
     "EncodeError",
+    "Health",
     "LayoutError",
     "ListenError",
+    "Monitor",
     "NedbusError",
     "NoDataError",
     "Publisher",
+    "ResetTracker",
     "Row",
     "Sample",
     "SourceError",
@@ -62,6 +66,7 @@ __all__ = [
     "VehicleLocalPosition",
     "connect",
     "connect_async",
+    "to_global",
 ]
 
 
@@ -71,8 +76,8 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import nedbus_msgs
 
-    from . import bus, errors, intake, publisher, subscriber
+    from . import bus, errors, health, intake, publisher, subscriber
 
-    for module in (nedbus_msgs, bus, errors, intake, publisher, subscriber):
+    for module in (nedbus_msgs, bus, errors, health, intake, publisher, subscriber):
         globals().update({each: vars(module)[each] for each in __all__ if each in vars(module)})
     return globals()[name]

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from nedbus_msgs import Address, describe, upgrade
 
 from .errors import AddressInUseError, ClosedError, NedbusError
+from .health import Health, StreamHealth
 from .publisher import Outbox, Publisher
 from .sources import Flight, Live, Record, Refusal, Replay, Source
 
@@ -32,7 +33,16 @@ _REJECTS_LOGGED: Final = 5  # rejected messages that the log tells of, for each 
 _SILENCE: Final = 3.0  # s without a word after which a live address is no longer published
 _LOOK: Final = 0.5  # s between two looks for silence
 _ADDRESSES: Final = 1000  # that one live source may have
+_STREAMS: Final = 100  # that a status tells of: it must fit a message
 _PLACES: Final = 100  # whose refusals are told of
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatus:
+    """How one stream is that is published."""
+
+    address: str
+    health: Health
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +52,7 @@ class WorkerStatus:
     `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
     `lost`: messages that did not reach a live source, as far as it can tell; `reboots` of its vehicles.
     `silent`: addresses that a live source published, until nothing came for 3 s.
+    `streams`: how each stream is that is published, of up to 100 of them.
     """
 
     source: str
@@ -58,6 +69,7 @@ class WorkerStatus:
     summary: str
     warnings: tuple[str, ...]
     error: str | None
+    streams: tuple[StreamStatus, ...]
 
     @property
     def ended(self) -> bool:
@@ -91,6 +103,7 @@ class Worker:
         self._error: str | None = None
         self._rejected = self._done = self._restarts = self._published = self._lost = self._reboots = 0
         self._kind = text.partition(":")[0]
+        self._streams: dict[Address, StreamHealth] = {}
         self._heard: dict[Address, float] = {}  # when each live address was heard last
         self._refused: dict[str, str] = {}  # why, by where it came from
 
@@ -113,6 +126,9 @@ class Worker:
             summary=flight.summary if flight else "",
             warnings=flight.warnings if flight else tuple(self._refused.values()),
             error=self._error,
+            streams=tuple(
+                StreamStatus(str(address), stream.tell()) for address, stream in list(self._streams.items())[:_STREAMS]
+            ),
         )
 
     def run(self) -> None:
@@ -186,6 +202,7 @@ class Worker:
         if self._outbox.is_alive(address):
             _log.warning("%s: %s is published by somebody else too: readers get both", self._name, address)
         self._publishers[address] = self._outbox.publisher(address, lossless=lossless, source=self._kind)
+        self._streams.setdefault(address, StreamHealth(address.topic))
 
     def _keep(self, addresses: Iterable[Address]) -> None:
         """Close the publishers of all other addresses."""
@@ -279,6 +296,7 @@ class Worker:
         else:
             self._publishers[record.address].publish(message)
             self._published += 1
+            self._streams[record.address].add(message, received=time.time_ns(), lost=record.lost)
 
     def _reject(self, record: Record, reason: str) -> None:
         self._rejected += 1

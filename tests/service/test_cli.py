@@ -83,12 +83,14 @@ def test_hz_measures(run_nedbus: Start, flying: str) -> None:
     hz = run_nedbus("hz", "-c", flying, "--duration", "3")
     assert hz.wait() == 0, hz.err
     lines = hz.out.splitlines()
-    assert lines[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST"]
+    assert lines[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"]
     machine = run_nedbus("hz", "-c", flying, "-d", "2.5", "--json", "-t", VLP)
     assert machine.wait() == 0
     rows = [json.loads(line) for line in machine.out.splitlines()]
     assert {row["topic"] for row in rows} == {VLP}
-    assert all(set(row) >= {"rate", "jitter", "latency", "latency_max", "lost"} for row in rows)
+    assert all(
+        set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "restarts"} for row in rows
+    )
     assert any(row["rate"] is not None and 20 < row["rate"] < 500 for row in rows)
     assert rows[-1]["lost"] == 0
 

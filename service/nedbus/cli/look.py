@@ -11,6 +11,7 @@ import typer
 
 from nedbus.bus import Bus
 from nedbus.errors import NedbusError
+from nedbus.health import Health
 from nedbus_msgs import ANY, json_schema, layout_table
 
 from .options import (
@@ -25,7 +26,7 @@ from .options import (
     tell,
     write,
 )
-from .text import doubts, to_age, to_fields, to_json, to_table
+from .text import doubts, to_age, to_fields, to_json, to_state, to_table
 
 
 @on_bus
@@ -83,6 +84,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         rows = [_source_row(source) for source in _sources(service)]
         if rows:
             write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "RESTARTS", "REMARK"], rows))
+        streams = [row for source in _sources(service) for row in _stream_rows(source)]
+        if streams:
+            write("\n" + to_table(["VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE"], streams))
     if not services:
         tell("no nedbus service answers here")
 
@@ -129,3 +133,18 @@ def _source_row(source: dict[str, object]) -> list[str]:
     silent = source.get("silent")
     remark = f"silent: {', '.join(map(str, silent))}" if silent and isinstance(silent, list) else "-"
     return [*(str(source.get(key, "-")) for key in keys), str(source.get("error") or remark)]
+
+
+def _stream_rows(source: dict[str, object]) -> list[list[str]]:
+    """Return how a source's streams are, as far as this can be read; the status comes from the network."""
+    streams = source.get("streams")
+    rows = []
+    for stream in streams if isinstance(streams, list) else ():
+        try:
+            health = Health(**stream["health"])
+            rate = "-" if health.rate is None else f"{health.rate:.1f}"
+            age = "-" if health.age is None else to_age(health.age)
+            rows.append([stream["address"], rate, f"{health.nominal:g}", age, str(health.messages), to_state(health)])
+        except (TypeError, KeyError, AttributeError, ValueError):
+            continue  # another version's
+    return rows

@@ -5,9 +5,17 @@ from __future__ import annotations
 import json
 import math
 
+from nedbus.health import Health
 from nedbus.intake import Sample
 from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
 
+_DOUBTS = {
+    "xy_valid": "xy invalid",
+    "z_valid": "z invalid",
+    "v_xy_valid": "vxy invalid",
+    "v_z_valid": "vz invalid",
+    "dead_reckoning": "dead reckoning",
+}
 _OLD = 1.0  # s of latency that a line tells of: the last value of a stream that ended, or a recovered one
 
 
@@ -64,6 +72,32 @@ def doubts(message: VehicleLocalPosition) -> str:
     words = [f"{' '.join(invalid)} invalid"] if invalid else []
     if message.dead_reckoning:
         words.append("dead reckoning")
+    return ", ".join(words) or "ok"
+
+
+def to_cells(health: Health) -> list[str]:
+    """Return rate, jitter, latency, greatest latency, loss and remarks, each as a cell of a table."""
+    return [
+        f"{health.rate:.1f}" if health.rate is not None else "-",
+        f"{health.jitter * 1e3:.1f} ms" if health.jitter is not None else "-",
+        to_age(health.latency) if health.latency is not None else "-",
+        to_age(health.latency_max) if health.latency_max is not None else "-",
+        f"{health.lost}",
+        to_state(health),
+    ]
+
+
+def to_state(health: Health) -> str:
+    """Return what should be doubted of a stream: flags, with their share where they came and went, and its order."""
+    words = []
+    flags = health.flags or {}
+    for flag, word in _DOUBTS.items():
+        share = flags.get(flag, 0.0) if flag == "dead_reckoning" else 1.0 - flags.get(flag, 1.0)
+        if share:
+            words.append(word if share == 1.0 else f"{word} {max(1, round(100 * share))} %")
+    for count, word in ((health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.restarts, "restarts")):
+        if count:
+            words.append(f"{count} {word}")
     return ", ".join(words) or "ok"
 
 

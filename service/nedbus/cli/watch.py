@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
 
 from nedbus.bus import Bus
 from nedbus.errors import NoDataError
+from nedbus.health import Monitor
 from nedbus.intake import Mode, Sample
-from nedbus.rates import Rates
 from nedbus.subscriber import Subscription
 from nedbus_msgs import ANY, Address
 
@@ -29,7 +30,7 @@ from .options import (
     tell,
     write,
 )
-from .text import to_age, to_fields, to_json, to_line, to_table
+from .text import to_cells, to_fields, to_json, to_line, to_table
 
 _PATIENCE = 2.0  # s of silence after which a person is told that nothing comes
 
@@ -83,16 +84,16 @@ def hz(
     count: CountOption = None,
     duration: DurationOption = None,
 ) -> None:
-    """Measure rate, jitter, latency and loss of each vehicle and topic, every second."""
-    rates = Rates()
+    """Measure rate, jitter, latency, loss and validity of each vehicle and topic, every second."""
+    monitor = Monitor()
     wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     with bus.subscribe(wanted.topic, vehicle=wanted.vehicle, instance=wanted.instance, mode="every") as subscription:
         _watch(
             subscription,
-            rates.add,
+            monitor.add,
             count=count,
             duration=duration,
-            each_second=lambda: _show_rates(rates, json_output=json_output),
+            each_second=lambda: _show_health(monitor, json_output=json_output),
         )
 
 
@@ -129,27 +130,16 @@ def _watch(
         raise NoDataError(subscription.name, duration or 0.0)
 
 
-def _show_rates(rates: Rates, *, json_output: bool) -> None:
+def _show_health(monitor: Monitor, *, json_output: bool) -> None:
     rows = []
-    for address, rate in rates.take():
+    for address, health in monitor.tell().items():
         if json_output:
-            write(
-                json.dumps({"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance, **rate})
-            )
-            continue
-        hertz, jitter, latency, worst = (rate[key] for key in ("rate", "jitter", "latency", "latency_max"))
-        rows.append(
-            [
-                str(address),
-                f"{hertz:.1f}" if hertz is not None else "-",
-                f"{jitter * 1e3:.1f} ms" if jitter is not None else "-",
-                to_age(latency) if latency is not None else "-",
-                to_age(worst) if worst is not None else "-",
-                f"{rate['lost']:.0f}",
-            ]
-        )
+            where = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
+            write(json.dumps({**where, **asdict(health)}))
+        else:
+            rows.append([str(address), *to_cells(health)])
     if rows:
-        write(to_table(["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST"], rows))
+        write(to_table(["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"], rows))
 
 
 def _tell_counts(subscription: Subscription) -> None:
