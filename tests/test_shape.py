@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial"},
+    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard"},
 }
 ONLY = {  # packages that only these files import
     "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
@@ -22,15 +22,17 @@ ONLY = {  # packages that only these files import
     "pyulog": {"ulog"},
     "pymavlink": {"mavlink"},
     "serial": {"mavlink_link"},
-    "numpy": {"ulog", "arrays", "batches"},
+    "mcap": {"recording", "playback"},
+    "zstandard": {"playback"},
+    "numpy": {"ulog", "arrays", "batches", "recorder"},
     "pydantic_settings": {"settings"},
-    "typer": {"app", "bridge", "certificates", "options", "look", "watch", "serve"},
-    "rich": {"progress"},
+    "typer": {"app", "bridge", "records", "certificates", "options", "look", "watch", "serve"},
+    "rich": {"progress", "records"},
     "cryptography": {"pki", "certificates"},
 }
 ORDER = [  # each may import those before it only
-    "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health",
-    "bus", "rmw_zenoh", "sources", "worker", "daemon", "ros2",
+    "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health", "recording",
+    "bus", "rmw_zenoh", "playback", "sources", "worker", "daemon", "ros2", "recorder",
     "cli",
 ]  # fmt: skip
 

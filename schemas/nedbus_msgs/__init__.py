@@ -22,7 +22,7 @@ from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_lay
 from .origin import Origin, encoding_of, origin_of
 from .position import FIELD_TYPES, VehicleLocalPosition
 from .resets import Continuous, ResetTracker
-from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, type_hash
+from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, message_definition, type_hash
 from .rows import Row
 from .schema import json_schema, layout_table
 from .topics import (
@@ -96,6 +96,7 @@ __all__ = [
     "json_schema",
     "layout_of_type_hash",
     "layout_table",
+    "message_definition",
     "ned_to_enu",
     "origin_of",
     "schema_key",

@@ -12,6 +12,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from .cdr import places_in_cdr
+from .layouts import CURRENT
 from .position import FIELD_TYPES, VehicleLocalPosition
 from .px4_types import TypeName
 from .rules import FLAGGED, NOT_NEGATIVE, WITHIN
@@ -38,6 +40,15 @@ _WIRE: Final = np.dtype(
         "formats": [">" + _ON_WIRE[FIELD_TYPES[name]] for name, _, _ in _PARTS],
         "offsets": [offset for _, _, offset in _PARTS],
         "itemsize": PAYLOAD_SIZE,
+    }
+)
+_CDR_PLACES, _NOTHING_IN_CDR = places_in_cdr(CURRENT.name)
+_CDR: Final = np.dtype(
+    {
+        "names": list(FIELD_TYPES),
+        "formats": ["<" + _NATIVE[kind] if kind != "float32[2]" else "2<f4" for kind in FIELD_TYPES.values()],
+        "offsets": [_CDR_PLACES[name] for name in FIELD_TYPES],
+        "itemsize": len(_NOTHING_IN_CDR),
     }
 )
 _WORDS: Final = PAYLOAD_SIZE // 4
@@ -74,6 +85,19 @@ def write_records(records: Records) -> bytes:
         else:
             wire[f"{name}.{part}"] = records[name]
     return wire.tobytes()
+
+
+def write_cdr_records(records: Records) -> npt.NDArray[np.void]:
+    """Return the CDR payloads of messages, in the current layout, as an array with one payload a record."""
+    payloads = np.frombuffer(bytearray(_NOTHING_IN_CDR * len(records)), _CDR)
+    for name in FIELD_TYPES:
+        payloads[name] = records[name]
+    return payloads
+
+
+def read_cdr_records(payloads: bytes) -> Records:
+    """Return the messages of CDR payloads of the current layout, one after the other; rules are not looked at."""
+    return np.frombuffer(payloads, _CDR).astype(DTYPE)
 
 
 def find_sound(records: Records) -> npt.NDArray[np.bool_]:

@@ -33,10 +33,11 @@ _LARGEST: Final[Mapping[TypeName, int]] = {"uint64": 2**64 - 1, "uint8": 2**8 - 
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """One layout in CDR: its body, and the most bytes that a payload of it can have."""
+    """One layout in CDR: its body, where each field stands in a payload, and the most bytes that it can have."""
 
     body: struct.Struct
     types: tuple[tuple[str, TypeName], ...]
+    places: tuple[int, ...]
     limit: int
 
 
@@ -78,6 +79,13 @@ def encode_cdr(fields: Mapping[str, object], *, layout: str) -> bytes:
         raise EncodeError(f"{large}: {fields[large]!r:.40} is beyond {dict(form.types)[large]}") from None
 
 
+def places_in_cdr(layout: str) -> tuple[Mapping[str, int], bytes]:
+    """Return where each field stands in a payload of a layout, and that payload with nothing but zeros."""
+    form = _form(_get_layout(layout))
+    names = (name for name, _ in form.types)
+    return dict(zip(names, form.places, strict=True)), _HEAD + bytes(form.body.size)
+
+
 def _get_layout(name: str) -> Layout:
     return get_layout(layout_of_type_hash(name) or name)
 
@@ -87,14 +95,17 @@ def _form(layout: Layout) -> _Form:
     """Lay the fields of a layout out: each at the next multiple of its alignment."""
     letters, size, unpadded = "<", 0, 0
     types = tuple((name, layout.type_of(name)) for name in layout.fields)
+    places = []
     for _, kind in types:
         form, alignment = _FORMS[kind]
         gap = -size % alignment
         letters += f"{gap}x{form}" if gap else form
+        places.append(len(_HEAD) + size + gap)
         size += gap + struct.calcsize("<" + form)
         unpadded += struct.calcsize("<" + form)
     px4_struct = unpadded + -unpadded % 8
-    return _Form(struct.Struct(letters), types, len(_HEAD) + max(size, px4_struct + _PX4_EXTRA))
+    limit = len(_HEAD) + max(size, px4_struct + _PX4_EXTRA)
+    return _Form(struct.Struct(letters), types, tuple(places), limit)
 
 
 def _take(form: _Form, values: tuple[object, ...]) -> Iterator[tuple[str, object]]:

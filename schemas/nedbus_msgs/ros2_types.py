@@ -8,6 +8,7 @@ from hashlib import sha256
 from typing import Final
 
 from .layouts import LAYOUTS, Layout, get_layout
+from .position import VehicleLocalPosition
 from .px4_types import TypeName
 
 ROS2_TYPE: Final = "px4_msgs/msg/VehicleLocalPosition"
@@ -40,6 +41,19 @@ def type_hash(layout: str, *, ros2_type: str = ROS2_TYPE) -> str:
     Raises LayoutError for the name of no layout.
     """
     return _hash(get_layout(layout), ros2_type)
+
+
+def message_definition(layout: str) -> str:
+    """Return a layout as a .msg file of ROS 2, with unit and meaning of each field.
+
+    Raises LayoutError for the name of no layout.
+    """
+    described = VehicleLocalPosition.model_fields
+    rows = []
+    for name in get_layout(layout).fields:
+        meaning = described[name].description if name in described else "Greatest height above ground [m]"
+        rows.append(f"{get_layout(layout).type_of(name)} {name}  # {meaning}\n")
+    return "".join(rows)
 
 
 def layout_of_type_hash(text: str) -> str | None:

@@ -7,7 +7,8 @@
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
     │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
-    │   └── PkiError                         a key or certificate that cannot be made
+    │   ├── PkiError                         a key or certificate that cannot be made
+    │   └── RecordError (OSError)            a recording that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
@@ -23,6 +24,7 @@ A message that breaks the model's rules raises pydantic.ValidationError where it
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -49,6 +51,7 @@ __all__ = [
     "NedbusError",
     "NoDataError",
     "PkiError",
+    "RecordError",
     "SourceError",
     "UnknownLayoutError",
 ]
@@ -116,6 +119,19 @@ class NoDataError(NedbusError, TimeoutError):
 
 class PkiError(NedbusError):
     """Raise when a key or a certificate cannot be made, or would replace one."""
+
+
+class RecordError(NedbusError, OSError):
+    """Raise when a recording cannot be written; what was flushed before can be read."""
+
+    def __init__(self, path: Path, error: OSError) -> None:
+        hints = {
+            errno.EEXIST: "choose another name, or remove it",
+            errno.ENOSPC: "free some space or record elsewhere; what was written before can be read",
+        }
+        hint = hints.get(error.errno or 0, "check the place that it names")
+        super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")
+        self.path = path
 
 
 class ClosedError(NedbusError, RuntimeError):

@@ -10,11 +10,12 @@ Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatib
 from __future__ import annotations
 
 import os
+import re
 import struct
 from dataclasses import dataclass
 from typing import Final, Self
 
-from nedbus_msgs import DecodeError
+from nedbus_msgs import TOPICS, AddressError, DecodeError
 
 NO_HASH: Final = "TypeHashNotSupported"
 """What PX4 built for ROS 2 Humble has in place of a type's hash."""
@@ -22,6 +23,7 @@ NO_HASH: Final = "TypeHashNotSupported"
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: what PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
+_TOPIC = re.compile(rf"({'|'.join(sorted(TOPICS, key=len, reverse=True))})(?:_v\d+)?(?:_?(\d{{1,3}}))?")
 _OURS: Final = b"nedbus"
 _DOMAINS: Final = 10**9
 
@@ -71,6 +73,26 @@ class Attachment:
 
     def __bytes__(self) -> bytes:
         return _ATTACHMENT.pack(self.sequence, self.time, _GID, self.gid)
+
+
+def split_topic(topic: str) -> tuple[str, str, int | None]:
+    """Return the namespace, the uORB topic and the instance that the name of a ROS 2 topic stands for.
+
+    `px4_1/fmu/out/estimator_local_position_0` is namespace `px4_1` and instance 0.
+    The `_v1` of a versioned topic is ignored.
+
+    Raises AddressError for a name that is none of the four topics.
+    """
+    *path, name = topic.strip("/").split("/")
+    found = _TOPIC.fullmatch(name)
+    if found is None:
+        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}, perhaps with _0, _1 ... for its instance")
+    instance = None if found[2] is None else int(found[2])
+    if instance is None and TOPICS[found[1]].instances:
+        instance = 0
+    if path[-2:] == ["fmu", "out"]:
+        path = path[:-2]
+    return "/".join(path), found[1], instance
 
 
 def make_gid() -> bytes:

@@ -109,15 +109,11 @@ class Subscription:
 
         Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
         """
-        deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
-        while True:
-            if self._intake.ended:
-                raise ClosedError
-            sample = self._intake.pop()
-            if sample is not None:
-                return sample
-            if not self._intake.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
-                raise NoDataError(self.name, timeout or 0.0)
+        return self._next(self._intake.pop, timeout)
+
+    def receive_batch(self, timeout: float | None = None) -> Batch:
+        """Wait for something, and return all that has arrived, as one array; errors are those of `receive`."""
+        return self._next(self._intake.pop_batch, timeout)
 
     def rows(self) -> Iterator[Sample]:
         """Iterate over the same samples with a Row, a named tuple, as `message`: faster, with the same checks."""
@@ -145,6 +141,17 @@ class Subscription:
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+    def _next(self, pop: Callable[[], _T | None], timeout: float | None) -> _T:
+        deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
+        while True:
+            if self._intake.ended:
+                raise ClosedError
+            item = pop()
+            if item is not None:
+                return item
+            if not self._intake.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
+                raise NoDataError(self.name, timeout or 0.0)
 
     def _each(self, pop: Callable[[], _T | None]) -> Iterator[_T]:
         while not self._intake.ended:
@@ -183,6 +190,10 @@ class AsyncSubscription:
         Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
         """
         return await self._next(self._intake.pop, timeout)
+
+    async def receive_batch(self, timeout: float | None = None) -> Batch:
+        """Wait for something, and return all that has arrived, as one array; errors are those of `receive`."""
+        return await self._next(self._intake.pop_batch, timeout)
 
     async def rows(self) -> AsyncIterator[Sample]:
         """Iterate over the same samples with a Row, a named tuple, as `message`: faster, with the same checks."""

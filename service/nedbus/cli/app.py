@@ -15,6 +15,7 @@ from .bridge import ros2
 from .certificates import pki
 from .look import get, health, info, list_, schema
 from .options import write
+from .records import convert, record
 from .serve import router, serve
 from .watch import echo, hz
 
@@ -36,6 +37,8 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "health": health,
     "schema": schema,
     "ros2": ros2,
+    "record": record,
+    "convert": convert,
 }
 for _name, _function in _COMMANDS.items():
     app.command(_name)(_function)

@@ -74,7 +74,7 @@ def serve(
     )
     daemon = Daemon(settings, version=__version__)
     with Display(daemon) as display:
-        ends = _run_until_signal(daemon.run, daemon.stop, beside=display.update)
+        ends = run_until_signal(daemon.run, daemon.stop, beside=display.update)
     if ends is not None:
         raise typer.Exit(ends)
 
@@ -106,12 +106,12 @@ def router(
         session.close()
         return True
 
-    ends = _run_until_signal(run, stop.set, beside=lambda: None)
+    ends = run_until_signal(run, stop.set, beside=lambda: None)
     if ends is not None:
         raise typer.Exit(ends)
 
 
-def _run_until_signal(
+def run_until_signal(
     run: Callable[[], bool], stop: Callable[[], object], *, beside: Callable[[], object]
 ) -> int | None:
     """Run something in a thread until it ends or a signal comes; return the exit code, None for success.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import queue
-import re
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,9 +12,9 @@ from typing import Final
 import zenoh
 
 from nedbus.errors import AddressError, DecodeError, SourceError
-from nedbus.rmw_zenoh import NO_HASH, Attachment, TopicKey, is_ours
+from nedbus.rmw_zenoh import NO_HASH, Attachment, TopicKey, is_ours, split_topic
 from nedbus.session import check_endpoints, open_client, while_open
-from nedbus_msgs import ROS2_TYPES, TOPICS, Address, dds_type, decode_cdr, layout_of_type_hash
+from nedbus_msgs import ROS2_TYPES, Address, dds_type, decode_cdr, layout_of_type_hash
 
 from .record import Home, Record, Refusal
 from .spec import Px4ZenohOptions
@@ -27,7 +26,6 @@ _TICK: Final = 0.25  # s
 _KEYS: Final = 1000  # keys that are listened to; a vehicle has a handful
 _PAYLOAD_LIMIT: Final = 1024  # bytes that are looked at
 _LEFT: Final = 3.0  # s of silence after which another key may speak for the same vehicle and topic
-_TOPIC = re.compile(rf"({'|'.join(sorted(TOPICS, key=len, reverse=True))})(?:_v\d+)?(?:_?(\d{{1,3}}))?")
 
 
 @dataclass(slots=True, eq=False)
@@ -122,16 +120,8 @@ class Px4ZenohSource:
         return stream
 
     def _address(self, key: TopicKey) -> Address:
-        *path, name = key.topic.split("/")
-        found = _TOPIC.fullmatch(name)
-        if found is None:
-            raise AddressError("topic", name, f"one of {', '.join(TOPICS)}, perhaps with _0, _1 ... for its instance")
-        topic, instance = found.groups()
-        if instance is None and TOPICS[topic].instances:
-            instance = "0"
-        if path[-2:] == ["fmu", "out"]:
-            path = path[:-2]
-        return Address(self._vehicle_of(key.domain, "/".join(path)), topic, None if instance is None else int(instance))
+        namespace, topic, instance = split_topic(key.topic)
+        return Address(self._vehicle_of(key.domain, namespace), topic, instance)
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the vehicle that is mapped, else one named by namespace and by any domain but the expected one."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import PurePath
 from typing import Annotated, Final, Literal, cast
 from urllib.parse import parse_qsl
 
@@ -58,8 +59,8 @@ class ReplayOptions(Options):
     wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
 
 
-class UlogOptions(ReplayOptions):
-    """Options of `ulog:`."""
+class RecordedOptions(ReplayOptions):
+    """Options of `ulog:` and `mcap:`."""
 
     loop: bool = Field(False, description="1 to start again at the end, or 0")
 
@@ -117,10 +118,14 @@ class SourceKind:
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "SimulatorSource"),
-    "ulog": SourceKind(UlogOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
+    "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
+    "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "McapSource", "mcap"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4_zenoh", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink", "MavlinkSource", "mavlink"),
 }
+
+
+_SUFFIXES: Final = {".ulg": "ulog", ".mcap": "mcap"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +161,8 @@ def parse_source(text: str) -> SourceSpec:
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
         hint = (
-            f"write ulog:{text}"
-            if text.partition("?")[0].endswith(".ulg")
+            f"write {_SUFFIXES[suffix]}:{text}"
+            if (suffix := PurePath(text.partition("?")[0]).suffix) in _SUFFIXES
             else f"choose from {', '.join(SOURCE_KINDS)}"
         )
         raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")

@@ -19,7 +19,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import FIELD_TYPES, LAYOUTS, TOPICS, Address, find_layout, get_topic
 
 from .record import Flight, Home, Record
-from .spec import UlogOptions
+from .spec import RecordedOptions
 
 _GAP: Final = 60_000_000  # us: a longer silence in a log is a damaged timestamp, not something to wait for
 
@@ -52,7 +52,7 @@ class Track:
 class UlogSource:
     """A .ulg file; `open` reads its local position topics into memory."""
 
-    def __init__(self, path: str, options: UlogOptions, home: Home) -> None:
+    def __init__(self, path: str, options: RecordedOptions, home: Home) -> None:
         self._path = Path(path).expanduser()
         self._vehicle = options.vehicle
         self._default_vehicle = home.vehicle

@@ -1,0 +1,111 @@
+"""Fill recordings: from what arrives on a bus, and from flight logs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from pydantic import ValidationError
+
+from nedbus_msgs import Address, Origin, VehicleLocalPosition, upgrade
+from nedbus_msgs.arrays import to_records
+
+from .batches import Batch
+from .errors import ClosedError, NoDataError
+from .recording import Recording
+from .sources import Flight
+from .subscriber import Subscription
+
+_FLUSH: Final = 1.0  # s: what a power cut costs at most
+_LOOK: Final = 0.2  # s between two looks at whether to end
+_AT_ONCE: Final = 1024  # messages of a flight that are written together
+
+
+class Recorder:
+    """Write what a subscription of mode "every" gives to a new MCAP file.
+
+    Raises RecordError when the file is there already or cannot be written.
+    """
+
+    def __init__(self, subscription: Subscription, path: Path) -> None:
+        self._subscription = subscription
+        self._recording = Recording(path)
+
+    @property
+    def status(self) -> str:
+        """What was recorded so far, in one line."""
+        counts = self._subscription.counts
+        trouble = ", ".join(
+            f"{count} {word}" for count, word in ((counts.lost, "lost"), (counts.invalid, "invalid")) if count
+        )
+        return f"{self._recording.messages} messages" + (f", {trouble}" if trouble else "")
+
+    def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
+        """Record until `stop` is set, for so many seconds, or until the subscription is closed."""
+        now = time.monotonic()
+        end = float("inf") if duration is None else now + duration
+        flush = now + _FLUSH
+        with self._recording:
+            while not stop.is_set() and now < end:
+                try:
+                    self._write(self._subscription.receive_batch(min(_LOOK, end - now)))
+                except NoDataError:
+                    pass
+                except ClosedError:
+                    return
+                now = time.monotonic()
+                if now >= flush:
+                    self._recording.flush()
+                    flush = now + _FLUSH
+
+    def _write(self, batch: Batch) -> None:
+        origins = batch.origins
+        sent, sequence = batch.sent, batch.sequence
+        for place, address in enumerate(batch.addresses):
+            of_address = (batch.which == place).nonzero()[0]
+            for origin in {origins[row] for row in of_address.tolist()}:
+                rows = [row for row in of_address.tolist() if origins[row] == origin]
+                self._recording.write(
+                    address,
+                    batch.messages[rows],
+                    logged=[batch.received] * len(rows),
+                    published=[time if time > 0 else batch.received for time in sent[rows].tolist()],
+                    sequence=sequence[rows].tolist(),
+                    origin=origin,
+                )
+
+
+def convert(flight: Flight, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
+    """Write a flight, validated, to a new MCAP file, with PX4's own times; return in one line what became of it.
+
+    Raises RecordError when the file is there already or cannot be written.
+    """
+    waiting: dict[tuple[Address, Origin], list[VehicleLocalPosition]] = {}
+    rejected = done = held = 0
+    with Recording(path) as recording:
+
+        def write() -> None:
+            for (address, origin), messages in waiting.items():
+                times = [message.timestamp * 1000 for message in messages]
+                recording.write(address, to_records(messages), logged=times, published=times, origin=origin)
+            waiting.clear()
+
+        for record in flight.records:
+            done += 1
+            try:
+                message = upgrade(record.fields)
+            except ValidationError:
+                rejected += 1
+                continue
+            missing = frozenset(VehicleLocalPosition.model_fields.keys() - message.model_fields_set)
+            waiting.setdefault((record.address, Origin(source, missing)), []).append(message)
+            held += 1
+            if held >= _AT_ONCE:
+                held = 0
+                write()
+                on_progress(done)
+        write()
+    return f"{recording.messages} messages" + (f", {rejected} rejected" if rejected else "")

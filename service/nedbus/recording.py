@@ -1,0 +1,170 @@
+"""Recordings as MCAP files that Foxglove, PlotJuggler and any reader of MCAP open: CDR, with its definition inside.
+
+A file is complete after every flush: its end is written behind the last chunk, and overwritten by the next one.
+So a power cut costs what came since the last flush, and never the file.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self, cast
+
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from nedbus_msgs import CURRENT, ROS2_TYPE, Address, Origin, message_definition
+from nedbus_msgs.arrays import Records, write_cdr_records
+
+from .errors import RecordError
+
+_CHUNK: Final = 2**23  # bytes; a flush every second makes smaller ones
+_HELD: Final = 2**24  # bytes that wait for a flush
+_END: Final = (
+    struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
+)
+
+
+class Recording:
+    """Write messages to a new MCAP file; a context manager that finishes it.
+
+    The file is in the layout of PX4 1.16 to main, one channel for each address and origin.
+
+    Raises RecordError when the file is there already, or cannot be written: then what was flushed can still be read.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.messages = 0
+        try:
+            self._file = _File(self.path)
+        except OSError as exc:
+            raise RecordError(self.path, exc) from exc
+        # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
+        self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=_CHUNK)
+        self._writer.start(profile="ros2", library="nedbus")
+        self._schema = self._writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(CURRENT.name).encode())
+        self._channels: dict[tuple[Address, Origin], int] = {}
+
+    def write(
+        self,
+        address: Address,
+        records: Records,
+        *,
+        logged: Sequence[int],
+        published: Sequence[int],
+        sequence: Sequence[int] | None = None,
+        origin: Origin | None = None,
+    ) -> None:
+        """Write messages of one address, with the times [ns] when each was recorded and published."""
+        channel = self._channel(address, origin or Origin())
+        payloads = write_cdr_records(records).tobytes()
+        size = len(payloads) // max(1, len(records))
+        try:
+            for place in range(len(records)):
+                self._writer.add_message(
+                    channel,
+                    log_time=logged[place],
+                    data=payloads[place * size : (place + 1) * size],
+                    publish_time=published[place],
+                    sequence=0 if sequence is None else max(0, sequence[place]) % 2**32,
+                )
+                self.messages += 1
+        except OSError as exc:
+            raise RecordError(self.path, exc) from exc
+
+    def flush(self) -> None:
+        """Put everything on the disk, so that a power cut from now on costs nothing of it."""
+        try:
+            self._writer.flush()
+            self._file.sync()
+        except OSError as exc:
+            raise RecordError(self.path, exc) from exc
+
+    def close(self) -> None:
+        """Finish the file; a second call does nothing."""
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()
+            self._file.sync(end=b"")
+        except OSError as exc:
+            raise RecordError(self.path, exc) from exc
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, RecordError):
+            self._file.close()  # it failed already
+        else:
+            self.close()
+
+    def _channel(self, address: Address, origin: Origin) -> int:
+        known = self._channels.get((address, origin))
+        if known is not None:
+            return known
+        # Without this key a file is none of ROS 2's.
+        facts = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
+        if address.instance is not None:
+            facts["instance"] = str(address.instance)
+        if origin.source is not None:
+            facts["source"] = origin.source
+        if origin.missing:
+            facts["missing"] = " ".join(sorted(origin.missing))
+        topic = f"/{address}"
+        channel = self._writer.register_channel(topic, "cdr", self._schema, facts)
+        self._channels[address, origin] = channel
+        return channel
+
+
+class _File:
+    """A file as MCAP's writer wants one, with an end behind whatever was flushed."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self._pending = bytearray()
+        self._at = 0
+        self.closed = False
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        if len(self._pending) > _HELD:
+            self.sync()
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at + len(self._pending)
+
+    def flush(self) -> None:
+        """Do nothing: `sync` is what puts it on the disk."""
+
+    def sync(self, end: bytes = _END) -> None:
+        """Put what is pending on the disk, and an end behind it; what was there before stays whole if that fails."""
+        pending = bytes(self._pending)
+        self._pending.clear()
+        try:
+            self._put(pending + end)
+            self._file.truncate(self._at + len(pending) + len(end))
+        except OSError:
+            self._file.truncate(self._at)
+            self._put(_END)
+            raise
+        os.fsync(self._file.fileno())
+        self._at += len(pending)
+
+    def _put(self, data: bytes) -> None:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.pwrite(self._file.fileno(), rest, self._at + len(data) - len(rest)) :]
+
+    def close(self) -> None:
+        self.closed = True
+        self._file.close()
