@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard"},
+    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard", "pandas", "polars", "matplotlib"},
 }
 ONLY = {  # packages that only these files import
     "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
@@ -24,15 +24,19 @@ ONLY = {  # packages that only these files import
     "serial": {"mavlink_link"},
     "mcap": {"recording", "playback"},
     "zstandard": {"playback"},
-    "numpy": {"ulog", "arrays", "batches", "recorder"},
+    "pandas": {"reading"},
+    "polars": {"reading"},
+    "numpy": {"ulog", "arrays", "batches", "recorder", "reading", "picture"},
+    "matplotlib": {"picture"},
     "pydantic_settings": {"settings"},
     "typer": {"app", "bridge", "records", "certificates", "options", "look", "watch", "serve"},
     "rich": {"progress", "records"},
     "cryptography": {"pki", "certificates"},
 }
 ORDER = [  # each may import those before it only
-    "errors", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health", "recording",
-    "bus", "rmw_zenoh", "playback", "sources", "worker", "daemon", "ros2", "recorder",
+    "errors", "extras", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health",
+    "recording", "bus", "rmw_zenoh", "playback", "sources", "worker", "daemon", "ros2", "recorder", "reading",
+    "picture",
     "cli",
 ]  # fmt: skip
 

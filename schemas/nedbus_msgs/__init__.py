@@ -18,7 +18,7 @@ from .frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade
+from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade, upgraded_names
 from .origin import Origin, encoding_of, origin_of
 from .position import FIELD_TYPES, VehicleLocalPosition
 from .resets import Continuous, ResetTracker
@@ -106,6 +106,7 @@ __all__ = [
     "to_local",
     "type_hash",
     "upgrade",
+    "upgraded_names",
     "variances_enu_to_ned",
     "variances_ned_to_enu",
     "wrap",

@@ -98,11 +98,16 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleL
     """
     if layout is not None:
         require_fields(fields, get_layout(layout))
-    known = {_RENAMED.get(name, name): value for name, value in fields.items()}
+    return VehicleLocalPosition.model_validate({name: fields[old] for name, old in upgraded_names(fields).items()})
+
+
+def upgraded_names(names: Iterable[str]) -> Mapping[str, str]:
+    """Return the fields of a message that can be made of fields with these names, and which of them makes each."""
+    known = {_RENAMED.get(name, name): name for name in names}
     if "hagl_max" in known:
         known.setdefault("hagl_max_z", known["hagl_max"])
         known.setdefault("hagl_max_xy", known["hagl_max"])
-    return VehicleLocalPosition.model_validate({name: known[name] for name in FIELD_TYPES if name in known})
+    return {name: known[name] for name in FIELD_TYPES if name in known}
 
 
 def downgrade(message: VehicleLocalPosition, layout: str) -> dict[str, object]:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .health import Health, Monitor
     from .intake import Counts, Sample
     from .publisher import Publisher
+    from .reading import addresses_of, read
     from .subscriber import AsyncSubscription, Subscription
 
 __version__ = "0.1.0"
@@ -64,8 +65,10 @@ __all__ = [
     "Subscription",
     "UnknownLayoutError",
     "VehicleLocalPosition",
+    "addresses_of",
     "connect",
     "connect_async",
+    "read",
     "to_global",
 ]
 
@@ -74,6 +77,10 @@ def __getattr__(name: str) -> object:
     """Load everything when the first thing is asked for, and nothing before: `nedbus --version` needs nothing."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in {"addresses_of", "read"}:  # NumPy takes longer to load than all the rest
+        from . import reading
+
+        return vars(reading)[name]
     import nedbus_msgs
 
     from . import bus, errors, health, intake, publisher, subscriber

@@ -56,6 +56,7 @@ class Playback:
         self._vehicle = vehicle
         self._complete = True
         self._streams: dict[int, Stream | None] = {}
+        self._named: dict[str, Stream] = {}  # by the topic of its channel
         try:
             self._file = self.path.open("rb")
         except OSError as exc:
@@ -71,12 +72,13 @@ class Playback:
         """How many messages there are of each stream."""
         return self._counts
 
-    def messages(self) -> Iterator[Played]:
-        """Yield all messages of local position topics, in the order of the file."""
+    def messages(self, only: Address | None = None) -> Iterator[Played]:
+        """Yield all messages of local position topics, or of one address, in the order of the file."""
+        topics = None if only is None else [name for name, stream in self._named.items() if stream.address == only]
         try:
-            for schema, channel, message in self._reader().iter_messages(log_time_order=False):
+            for schema, channel, message in self._reader().iter_messages(topics=topics, log_time_order=False):
                 stream = self._stream(schema, channel)
-                if stream is not None:
+                if stream is not None and only in (None, stream.address):
                     yield Played(stream, message.data, message.publish_time, message.log_time)
         except _BROKEN:
             self._warn("cut: it ends in the middle of something; all before that is read")
@@ -120,7 +122,9 @@ class Playback:
 
     def _stream(self, schema: Schema | None, channel: Channel) -> Stream | None:
         if channel.id not in self._streams:
-            self._streams[channel.id] = self._learn(schema, channel)
+            stream = self._streams[channel.id] = self._learn(schema, channel)
+            if stream is not None:
+                self._named[channel.topic] = stream
         return self._streams[channel.id]
 
     def _learn(self, schema: Schema | None, channel: Channel) -> Stream | None:

@@ -298,7 +298,7 @@ def test_missing_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> 
     """Without pymavlink one line says what to do."""
     monkeypatch.delitem(sys.modules, "nedbus.sources.mavlink", raising=False)
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
-    with pytest.raises(ConfigError, match=r"is not installed: pip install 'nedbus\[mavlink\]'"):
+    with pytest.raises(ConfigError, match=r"pymavlink: this is not installed: pip install 'nedbus\[mavlink\]'"):
         parse_source("mavlink:udpin:0.0.0.0:14550").open_source(vehicle="1")
 
 

@@ -15,7 +15,7 @@ from .bridge import ros2
 from .certificates import pki
 from .look import get, health, info, list_, schema
 from .options import write
-from .records import convert, record
+from .records import convert, plot, record
 from .serve import router, serve
 from .watch import echo, hz
 
@@ -39,6 +39,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "ros2": ros2,
     "record": record,
     "convert": convert,
+    "plot": plot,
 }
 for _name, _function in _COMMANDS.items():
     app.command(_name)(_function)

@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
@@ -72,14 +71,6 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(1) from None
 
     return run
-
-
-def needs(extra: str, module: str) -> Any:
-    """Return a module that needs an extra; raise ConfigError, which says what to install, when that is missing."""
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as exc:
-        raise ConfigError("this command", f"{exc.name} is not installed: pip install 'nedbus[{extra}]'") from exc
 
 
 def on_bus(function: Callable[..., None]) -> Callable[..., None]:

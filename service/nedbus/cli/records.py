@@ -1,4 +1,4 @@
-"""Commands that write recordings: record, convert."""
+"""Commands about files: record, convert, plot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from nedbus.bus import Bus
-from nedbus.errors import ConfigError
+from nedbus.errors import AddressError, ConfigError
+from nedbus.extras import needs
 from nedbus.sources import Live, parse_source
 from nedbus_msgs import ANY
 
@@ -24,9 +25,9 @@ from .options import (
     VehicleOption,
     choose,
     command,
-    needs,
     on_bus,
     tell,
+    write,
 )
 from .serve import run_until_signal
 
@@ -103,3 +104,36 @@ def _progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("", total=None)
         yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)
+
+
+@command
+def plot(
+    source: Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)],
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.png", help="The picture (default: beside the flight)")
+    ] = None,
+    topic: TopicOption = "vehicle_local_position",
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+) -> None:
+    """Draw a flight: track, altitude, speed, what was valid when, and resets of the estimator."""
+    picture = needs("plot", "nedbus.picture")
+    reading = needs("mcap", "nedbus.reading")
+    meant = [
+        address
+        for address in reading.addresses_of(source)
+        if topic in (ANY, address.topic) and vehicle in (ANY, address.vehicle) and instance in (None, address.instance)
+    ]
+    if not meant:
+        raise AddressError("topic", topic, f"one of {', '.join(map(str, reading.addresses_of(source)))}")
+    if len(meant) > picture.STREAMS:
+        tell(f"{source}: {len(meant)} streams, of which the first {picture.STREAMS} are drawn: choose with -v, -t, -i")
+    streams = []
+    for address in meant[: picture.STREAMS]:
+        records = reading.read(source, address.topic, vehicle=address.vehicle, instance=address.instance)
+        if len(records):
+            streams.append((address, records))
+    target = output or source.with_suffix(".png")
+    picture.draw(streams, target, title=source.name)
+    write(str(target))

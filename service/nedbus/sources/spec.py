@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import PurePath
 from typing import Annotated, Final, Literal, cast
 from urllib.parse import parse_qsl
@@ -12,6 +11,7 @@ from urllib.parse import parse_qsl
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from nedbus.errors import ConfigError
+from nedbus.extras import needs
 from nedbus.session import Tls
 from nedbus_msgs import LAYOUTS, check_vehicle
 
@@ -109,7 +109,7 @@ class SourceKind:
     target: str | None
     module: str
     function: str
-    extra: str | None = None
+    extra: str = ""
 
     def takes(self, target: str) -> bool:
         """Return whether this may, or may not, stand after the colon."""
@@ -143,12 +143,7 @@ class SourceSpec:
         Raises ConfigError for a target that cannot be, and when what a kind needs is not installed.
         """
         kind = SOURCE_KINDS[self.kind]
-        try:
-            module = import_module(kind.module)
-        except ModuleNotFoundError as exc:
-            hint = f"{exc.name} is not installed: pip install 'nedbus[{kind.extra}]'"
-            raise ConfigError(f"source {self.text!r}", hint) from exc
-        make = cast("Callable[..., Source]", getattr(module, kind.function))
+        make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.function))
         return make(self.target, self.options, Home(vehicle, routers, tls))
 
 

@@ -32,6 +32,10 @@ _KNOWN: Final = frozenset(name for layout in LAYOUTS.values() for name in layout
 _BOOL: Final = {0: False, 1: True}  # what a log may hold in a bool; anything else is left for the model to refuse
 
 
+Columns = Mapping[str, npt.NDArray[np.generic]]
+"""One topic of a log: PX4's field names, and the values of all messages; delta_xy and delta_vxy have two columns."""
+
+
 @dataclass(frozen=True, slots=True)
 class Track:
     """One topic of a log: its address, its columns by PX4's field name, and when each row is due."""
@@ -63,21 +67,8 @@ class UlogSource:
 
     def open(self) -> Flight:
         """Read the log; raise SourceError when it is no ULog, or has none of the topics."""
-        log, warnings = _read(self._path)
-        vehicle = self._vehicle or _system_id(log) or self._default_vehicle
-        found: list[tuple[Address, dict[str, npt.NDArray[np.generic]]]] = []
-        for data in log.data_list:
-            try:
-                address = Address(vehicle, data.name, data.multi_id if get_topic(data.name).instances else None)
-            except AddressError as exc:
-                warnings.append(f"{data.name} is left out: {exc}")
-                continue
-            if any(address == other for other, _ in found) or "timestamp" not in data.data:
-                warnings.append(f"{data.name} [{data.multi_id}] is left out: a second one, or without timestamps")
-                continue
-            found.append((address, _columns(data.data)))
-        if not found:
-            raise SourceError(str(self._path), "no message of the local position topics is in this log")
+        found, warnings = read_columns(self._path, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        vehicle = found[0][0].vehicle
         clocks = [_order(columns["timestamp"]) for _, columns in found]
         for (address, columns), clock in zip(found, clocks, strict=True):
             strays = int(np.count_nonzero(clock != columns["timestamp"]))
@@ -100,6 +91,33 @@ class UlogSource:
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
         )
+
+
+def read_columns(
+    path: Path, *, vehicle: str | None = None, default_vehicle: str = "1"
+) -> tuple[list[tuple[Address, Columns]], list[str]]:
+    """Return each local position topic of a log with its columns by PX4's field names, and what is wrong with it.
+
+    `vehicle` is that of the log's MAV_SYS_ID unless it is given.
+
+    Raises SourceError when it is no ULog, or has none of the topics.
+    """
+    log, warnings = _read(path)
+    vehicle = vehicle or _system_id(log) or default_vehicle
+    found: list[tuple[Address, Columns]] = []
+    for data in log.data_list:
+        try:
+            address = Address(vehicle, data.name, data.multi_id if get_topic(data.name).instances else None)
+        except AddressError as exc:
+            warnings.append(f"{data.name} is left out: {exc}")
+            continue
+        if any(address == other for other, _ in found) or "timestamp" not in data.data:
+            warnings.append(f"{data.name} [{data.multi_id}] is left out: a second one, or without timestamps")
+            continue
+        found.append((address, _columns(data.data)))
+    if not found:
+        raise SourceError(str(path), "no message of the local position topics is in this log")
+    return found, warnings
 
 
 class _Watched:
