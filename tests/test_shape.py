@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {  # who may import whom, beside itself and the standard library
     "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
     "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard", "pandas", "polars", "matplotlib"},
+    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard", "pandas", "polars"}
+    | {"matplotlib", "foxglove"},
 }
 ONLY = {  # packages that only these files import
     "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
@@ -28,6 +29,7 @@ ONLY = {  # packages that only these files import
     "polars": {"reading"},
     "numpy": {"ulog", "arrays", "batches", "recorder", "reading", "picture"},
     "matplotlib": {"picture"},
+    "foxglove": {"foxglove_view"},
     "pydantic_settings": {"settings"},
     "typer": {"app", "bridge", "records", "certificates", "options", "look", "watch", "serve"},
     "rich": {"progress", "records"},
@@ -36,7 +38,7 @@ ONLY = {  # packages that only these files import
 ORDER = [  # each may import those before it only
     "errors", "extras", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health",
     "recording", "bus", "rmw_zenoh", "playback", "sources", "worker", "daemon", "ros2", "recorder", "reading",
-    "picture",
+    "picture", "foxglove_view",
     "cli",
 ]  # fmt: skip
 

@@ -102,11 +102,14 @@ class ConnectError(NedbusError, ConnectionError):
 class ListenError(NedbusError, OSError):
     """Raise when an endpoint cannot be listened on."""
 
-    def __init__(self, endpoints: Sequence[str], reason: str) -> None:
-        super().__init__(
-            f"cannot listen on {' and '.join(endpoints)} ({reason}): choose another endpoint with --listen, or join the"
-            " router that runs there with --connect"
-        )
+    def __init__(
+        self,
+        endpoints: Sequence[str],
+        reason: str,
+        *,
+        hint: str = "choose another endpoint with --listen, or join the router that runs there with --connect",
+    ) -> None:
+        super().__init__(f"cannot listen on {' and '.join(endpoints)} ({reason}): {hint}")
         self.endpoints = tuple(endpoints)
 
 

@@ -11,7 +11,7 @@ import typer
 
 from nedbus import __version__
 
-from .bridge import ros2
+from .bridge import foxglove, ros2
 from .certificates import pki
 from .look import get, health, info, list_, schema
 from .options import write
@@ -37,6 +37,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "health": health,
     "schema": schema,
     "ros2": ros2,
+    "foxglove": foxglove,
     "record": record,
     "convert": convert,
     "plot": plot,

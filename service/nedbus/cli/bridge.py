@@ -1,4 +1,4 @@
-"""The command that gives the data to ROS 2."""
+"""Commands that give the data to others while it comes: ros2, foxglove."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import typer
 
 from nedbus.bus import Bus
 from nedbus.errors import ConfigError
+from nedbus.extras import needs
 from nedbus.ros2 import Bridge
 from nedbus_msgs import ANY, CURRENT, LAYOUTS
 
-from .options import TopicArgument, TopicOption, VehicleOption, choose, on_bus
+from .options import TopicArgument, TopicOption, VehicleOption, choose, on_bus, tell
 
 
 @on_bus
@@ -52,3 +53,18 @@ def ros2(
             namespaces=named,
         )
         bridge.run(threading.Event())
+
+
+@on_bus
+def foxglove(
+    bus: Bus,
+    *,
+    vehicle: VehicleOption = ANY,
+    host: Annotated[str, typer.Option(help="Where to listen; 0.0.0.0 lets other hosts in")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port, 0 for any")] = 8765,
+) -> None:
+    """Serve live vehicles to Foxglove, until Ctrl-C: plots of every field, poses in 3D, places on the map."""
+    view_module = needs("foxglove", "nedbus.foxglove_view")
+    with view_module.FoxgloveView(bus, host=host, port=port) as view:
+        tell(f"open {view.url} in Foxglove: Open connection, Foxglove WebSocket")
+        view.run(threading.Event(), vehicle=vehicle)
