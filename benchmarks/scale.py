@@ -35,7 +35,7 @@ with nedbus.connect(endpoint) as bus:
             time.sleep(wait)
         payload = encode_row((tick + 1, *rest))  # once: this process stands for as many hosts as there are vehicles
         for publisher in publishers:
-            publisher._put(payload)
+            publisher._put(payload, FIELDS)
     print(f"{late:.3f}", flush=True)
     sys.stdin.readline()
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from itertools import repeat
 from pathlib import Path
 from typing import Final
 
@@ -62,20 +63,14 @@ class Recorder:
                     flush = now + _FLUSH
 
     def _write(self, batch: Batch) -> None:
-        origins = batch.origins
-        sent, sequence = batch.sent, batch.sequence
-        for place, address in enumerate(batch.addresses):
-            of_address = (batch.which == place).nonzero()[0]
-            for origin in {origins[row] for row in of_address.tolist()}:
-                rows = [row for row in of_address.tolist() if origins[row] == origin]
-                self._recording.write(
-                    address,
-                    batch.messages[rows],
-                    logged=[batch.received] * len(rows),
-                    published=[time if time > 0 else batch.received for time in sent[rows].tolist()],
-                    sequence=sequence[rows].tolist(),
-                    origin=origin,
-                )
+        received = batch.received
+        self._recording.write(
+            batch.messages,
+            zip((batch.addresses[place] for place in batch.which.tolist()), batch.origins, strict=True),
+            logged=repeat(received),
+            published=[time if time > 0 else received for time in batch.sent.tolist()],
+            sequence=batch.sequence.tolist(),
+        )
 
 
 def convert(flight: Flight, path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
@@ -83,28 +78,25 @@ def convert(flight: Flight, path: Path, *, source: str, on_progress: Callable[[i
 
     Raises RecordError when the file is there already or cannot be written.
     """
-    waiting: dict[tuple[Address, Origin], list[VehicleLocalPosition]] = {}
-    rejected = done = held = 0
+    waiting: list[tuple[Address, Origin, VehicleLocalPosition]] = []
+    rejected = 0
     with Recording(path) as recording:
 
         def write() -> None:
-            for (address, origin), messages in waiting.items():
-                times = [message.timestamp * 1000 for message in messages]
-                recording.write(address, to_records(messages), logged=times, published=times, origin=origin)
+            times = [message.timestamp * 1000 for *_, message in waiting]
+            streams = ((address, origin) for address, origin, _ in waiting)
+            recording.write(to_records([each for *_, each in waiting]), streams, logged=times, published=times)
             waiting.clear()
 
-        for record in flight.records:
-            done += 1
+        for done, record in enumerate(flight.records, 1):
             try:
                 message = upgrade(record.fields)
             except ValidationError:
                 rejected += 1
                 continue
             missing = frozenset(VehicleLocalPosition.model_fields.keys() - message.model_fields_set)
-            waiting.setdefault((record.address, Origin(source, missing)), []).append(message)
-            held += 1
-            if held >= _AT_ONCE:
-                held = 0
+            waiting.append((record.address, Origin(source, missing), message))
+            if len(waiting) >= _AT_ONCE:
                 write()
                 on_progress(done)
         write()

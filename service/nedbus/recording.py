@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Final, Self, cast
@@ -51,30 +52,28 @@ class Recording:
 
     def write(
         self,
-        address: Address,
         records: Records,
+        streams: Iterable[tuple[Address, Origin]],
         *,
-        logged: Sequence[int],
-        published: Sequence[int],
-        sequence: Sequence[int] | None = None,
-        origin: Origin | None = None,
+        logged: Iterable[int],
+        published: Iterable[int],
+        sequence: Iterable[int] = repeat(0),
     ) -> None:
-        """Write messages of one address, with the times [ns] when each was recorded and published."""
-        channel = self._channel(address, origin or Origin())
-        payloads = write_cdr_records(records).tobytes()
-        size = len(payloads) // max(1, len(records))
+        """Write messages: for each its address and origin, and when it was recorded and published [ns]."""
+        payloads = write_cdr_records(records)
+        size = payloads.itemsize
+        data = payloads.tobytes()
+        starts = range(0, len(data), size)
+        add = self._writer.add_message
         try:
-            for place in range(len(records)):
-                self._writer.add_message(
-                    channel,
-                    log_time=logged[place],
-                    data=payloads[place * size : (place + 1) * size],
-                    publish_time=published[place],
-                    sequence=0 if sequence is None else max(0, sequence[place]) % 2**32,
-                )
-                self.messages += 1
+            for start, stream, log_time, time, number in zip(
+                starts, streams, logged, published, sequence, strict=False
+            ):
+                channel = self._channels.get(stream) or self._open_channel(*stream)
+                add(channel, log_time, data[start : start + size], time, max(0, number) % 2**32)
         except OSError as exc:
             raise RecordError(self.path, exc) from exc
+        self.messages += len(records)
 
     def flush(self) -> None:
         """Put everything on the disk, so that a power cut from now on costs nothing of it."""
@@ -107,10 +106,7 @@ class Recording:
         else:
             self.close()
 
-    def _channel(self, address: Address, origin: Origin) -> int:
-        known = self._channels.get((address, origin))
-        if known is not None:
-            return known
+    def _open_channel(self, address: Address, origin: Origin) -> int:
         # Without this key a file is none of ROS 2's.
         facts = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:

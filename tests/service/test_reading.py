@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import tracemalloc
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ import nedbus
 from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus.recorder import convert
 from nedbus.recording import Recording
-from nedbus_msgs import FIELD_TYPES, Address, VehicleLocalPosition, upgrade
+from nedbus_msgs import FIELD_TYPES, Address, Origin, VehicleLocalPosition, upgrade
 from nedbus_msgs.arrays import DTYPE, to_message, to_records
 from tests.conftest import LOGS, Start, message
 from tests.replays import open_replay
@@ -77,7 +78,7 @@ def test_broken_messages_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureF
     records = to_records([message(1), message(2), message(3)])
     records["xy_valid"][1] = True
     with Recording(path) as recording:
-        recording.write(Address("1", VLP), records, logged=[1, 2, 3], published=[1, 2, 3])
+        recording.write(records, repeat((Address("1", VLP), Origin())), logged=[1, 2, 3], published=[1, 2, 3])
     assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
     assert "1 of 3 messages break the rules" in caplog.text
 
@@ -105,7 +106,7 @@ def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
             times = list(range(1000))
             for vehicle in ("1", "2"):
                 rows = noise if vehicle == "1" else noise[:10]
-                recording.write(Address(vehicle, VLP), rows, logged=times, published=times)
+                recording.write(rows, repeat((Address(vehicle, VLP), Origin())), logged=times, published=times)
             recording.flush()
     assert path.stat().st_size > 2_000_000
     nedbus.read(path, vehicle="2")

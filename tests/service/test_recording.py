@@ -6,6 +6,7 @@ import math
 import resource
 import signal
 import threading
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def read_plainly(path: Path) -> list[tuple[str, int, int, Any]]:
 def write(path: Path, *messages: VehicleLocalPosition, origin: Origin | None = None) -> None:
     with Recording(path) as recording:
         times = [each.timestamp * 1000 for each in messages]
-        recording.write(HERE, to_records(messages), logged=times, published=times, origin=origin)
+        recording.write(to_records(messages), repeat((HERE, origin or Origin())), logged=times, published=times)
 
 
 def test_plain_readers_see_named_fields(tmp_path: Path) -> None:
@@ -131,7 +132,7 @@ def test_file_ends_properly_after_every_flush(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recording(path) as recording:
         for count in range(1, 6):
-            recording.write(HERE, to_records([message(count)]), logged=[count], published=[count])
+            recording.write(to_records([message(count)]), [(HERE, Origin())], logged=[count], published=[count])
             assert len(read_plainly(path) if count > 1 else []) == count - 1
             recording.flush()
             assert [each.timestamp for *_, each in read_plainly(path)] == list(range(1, count + 1))
@@ -147,7 +148,7 @@ def test_torn_file_is_read_up_to_the_tear(tmp_path: Path) -> None:
     path, torn = tmp_path / "a.mcap", tmp_path / "torn.mcap"
     with Recording(path) as recording:
         for count in range(1, 11):
-            recording.write(HERE, to_records([message(count)]), logged=[count], published=[count])
+            recording.write(to_records([message(count)]), [(HERE, Origin())], logged=[count], published=[count])
             recording.flush()
     data = path.read_bytes()
     counts = []
@@ -238,7 +239,7 @@ def test_full_disk_ends_cleanly(tmp_path: Path) -> None:
         with Recording(path) as recording:
             for count in range(100_000):
                 noise = message(count, x=math.sin(count), y=math.cos(count), z=math.tan(count), vx=math.sin(count * 7))
-                recording.write(HERE, to_records([noise]), logged=[count], published=[count])
+                recording.write(to_records([noise]), [(HERE, Origin())], logged=[count], published=[count])
                 if count % 100 == 99:
                     recording.flush()
                     flushed = count + 1
