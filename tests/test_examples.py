@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 import nedbus
+from nedbus.recorder import convert
 from tests.conftest import Process, Start, wait_for
+from tests.replays import open_replay
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 SAYS = {
@@ -17,6 +19,7 @@ SAYS = {
     "compare_estimators.py": "estimator 1: ",
     "batches.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
+    "health.py": "1/vehicle_local_position: ",
 }
 
 
@@ -37,7 +40,7 @@ def run_example(start: Start, name: str, endpoint: str, where: Path) -> Process:
 
 def test_all_examples_are_tested() -> None:
     """No example without a test."""
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {*SAYS, "publish.py"}
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {*SAYS, "publish.py", "resets.py"}
 
 
 @pytest.mark.parametrize("name", SAYS)
@@ -57,3 +60,13 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
     assert second.timestamp > first.timestamp
     assert (first.x, first.y) != (second.x, second.y)
     assert process.popen.poll() is None
+
+
+def test_resets_are_drawn(start: Start, tmp_path: Path) -> None:
+    """examples/resets.py finds the reset at the end of the simulated outage, and draws both tracks."""
+    flight, picture = tmp_path / "flight.mcap", tmp_path / "resets.png"
+    convert(open_replay("sim:?duration=80"), flight, source="sim", on_progress=lambda _: None)
+    process = start(str(EXAMPLES / "resets.py"), str(flight), str(picture), MPLBACKEND="agg")
+    assert process.wait(60) == 0, process.err
+    assert process.out.count("xy reset by") == 1
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,21 @@
+"""Watch how the streams are: say when one is slow, old, lossy or not to be trusted."""
+
+import time
+
+import nedbus
+
+with nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
+    monitor = nedbus.Monitor()
+    told = time.monotonic()
+    for sample in subscription:
+        monitor.add(sample)
+        if time.monotonic() - told < 2.0:
+            continue
+        told = time.monotonic()
+        for address, health in monitor.tell().items():
+            flags = health.flags or {}
+            print(
+                f"{address}: {health.rate or 0.0:.1f} of {health.nominal:g} Hz, {health.lost} lost, {health.gaps} gaps,"
+                f" xy valid {flags.get('xy_valid', 0.0):.0%}, dead reckoning {flags.get('dead_reckoning', 0.0):.0%}",
+                flush=True,
+            )
