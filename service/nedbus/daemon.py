@@ -16,8 +16,8 @@ from nedbus_msgs import decode, origin_of, status_key
 from .errors import ConfigError, ConnectError
 from .intake import Sample
 from .publisher import HEARTBEAT, Outbox
-from .session import DEFAULT_ENDPOINT, Session, open_client, open_router
-from .settings import Settings
+from .session import DEFAULT_ENDPOINT, Session, listened_by, open_client, open_router
+from .settings import Settings, dialled
 from .sources import Live, Source, parse_source
 from .worker import Worker, WorkerStatus
 
@@ -58,9 +58,6 @@ class Daemon:
             )
         self._settings = settings
         self._version = version
-        self._sources = [(text, self._open_source(text)) for text in settings.source]
-        if settings.until_done and not any(_is_finite(source) for _, source in self._sources):
-            raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
         self._started = time.time()
         self._stop = threading.Event()
         self._changed = threading.Event()
@@ -72,6 +69,9 @@ class Daemon:
         own = settings.listen or (settings.router_config and (str(settings.router_config),))
         self.role: Literal["router", "client"] = "client" if settings.connect and not own else "router"
         self.endpoints = settings.connect if self.role == "client" else own or (DEFAULT_ENDPOINT,)
+        self._sources = [(text, self._open_source(text)) for text in settings.source]
+        if settings.until_done and not any(_is_finite(source) for _, source in self._sources):
+            raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
 
     @property
     def until_done(self) -> bool:
@@ -149,7 +149,13 @@ class Daemon:
 
     def _open_source(self, text: str) -> Source:
         settings = self._settings
-        return parse_source(text).open_source(vehicle=settings.vehicle, routers=settings.routers, tls=settings.tls)
+        routers = settings.connect
+        if self.role == "router":
+            file = settings.router_config
+            routers = settings.listen or (listened_by(file) if file else ()) or (DEFAULT_ENDPOINT,)
+        return parse_source(text).open_source(
+            vehicle=settings.vehicle, routers=tuple(map(dialled, routers)), tls=settings.tls
+        )
 
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router for as long as it takes."""

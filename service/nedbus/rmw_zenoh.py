@@ -26,6 +26,7 @@ _GID: Final = 16
 _TOPIC = re.compile(rf"({'|'.join(sorted(TOPICS, key=len, reverse=True))})(?:_v\d+)?(?:_?(\d{{1,3}}))?")
 _OURS: Final = b"nedbus"
 _DOMAINS: Final = 10**9
+_LENGTH: Final = 512  # characters of a key; PX4 and ROS 2 have half as many
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,8 @@ class TopicKey:
     def parse(cls, key: str) -> Self:
         """Return what a key names; raise DecodeError for any other key."""
         domain, *topic, dds_type, type_hash = [*key.split("/"), "", "", ""][: max(4, key.count("/") + 1)]
+        if len(key) > _LENGTH:
+            raise DecodeError(f"a key of {len(key)} characters")
         digits = domain.isascii() and domain.isdigit() and len(domain) < len(str(_DOMAINS))
         if not digits or not all(topic) or "*" in key or not type_hash:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")

@@ -135,6 +135,12 @@ def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), conf
         raise ListenError(listen, _first_sentence(exc)) from exc
 
 
+def listened_by(config_file: Path) -> tuple[str, ...]:
+    """Return the endpoints that a router of this file listens on; raise ConfigError for a malformed file."""
+    found = json.loads(_read_config(config_file).get_json("listen/endpoints"))
+    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ())
+
+
 def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
     """Raise ConfigError unless each of these is a Zenoh endpoint."""
     for endpoint in endpoints:

@@ -49,7 +49,7 @@ def _vehicle(value: str) -> str:
     return value
 
 
-def _dialled(endpoint: str) -> str:
+def dialled(endpoint: str) -> str:
     """Return where a client of this host reaches a router that listens here, on all interfaces perhaps."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
@@ -93,7 +93,7 @@ class Settings(BaseSettings):
     @property
     def routers(self) -> tuple[str, ...]:
         """The endpoints that a client joins: `connect`, else the router that these settings start on this host."""
-        return self.connect or tuple(map(_dialled, self.listen)) or (DEFAULT_ENDPOINT,)
+        return self.connect or tuple(map(dialled, self.listen)) or (DEFAULT_ENDPOINT,)
 
     @property
     def tls(self) -> Tls | None:

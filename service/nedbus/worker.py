@@ -34,7 +34,8 @@ _SILENCE: Final = 3.0  # s without a word after which a live address is no longe
 _LOOK: Final = 0.5  # s between two looks for silence
 _ADDRESSES: Final = 1000  # that one live source may have
 _STREAMS: Final = 100  # that a status tells of: it must fit a message
-_PLACES: Final = 100  # whose refusals are told of
+_PLACES: Final = 50  # whose refusals are told of
+_WORDS: Final = 300  # characters of a refusal that are told: it may be anybody's
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,13 +233,14 @@ class Worker:
 
     def _listen(self, source: Live) -> None:
         """Publish what a live source says, for as long as it says something."""
-        self._state, self._error = "waiting", None
-        _log.info("%s: listening", self._name)
         with ExitStack() as closing:
             items = source.listen()
             closing.callback(getattr(items, "close", lambda: None))
             look = 0.0
-            for item in items:
+            for number, item in enumerate(items):
+                if not number:
+                    self._state, self._error = "waiting", None
+                    _log.info("%s: listening", self._name)
                 if self._stop.is_set():
                     return
                 now = time.monotonic()
@@ -280,12 +282,13 @@ class Worker:
 
     def _refuse(self, refusal: Refusal) -> None:
         """Count something that is no message; tell of each place once."""
-        self._rejected += 1
-        if refusal.where not in self._refused and len(self._refused) < _PLACES:
-            self._refused[refusal.where] = f"{refusal.where}: {refusal.reason}"
-            _log.warning("%s: %s: refused: %s", self._name, refusal.where, refusal.reason)
+        self._rejected += refusal.count
+        where, reason = refusal.where[:_WORDS], refusal.reason[:_WORDS]
+        if where not in self._refused and len(self._refused) < _PLACES:
+            self._refused[where] = f"{where}: {reason}"
+            _log.warning("%s: %s: refused: %s", self._name, where, reason)
         if refusal.address is not None:
-            report = {"source": self.text, "where": refusal.where, "reason": refusal.reason}
+            report = {"source": self.text, "where": where, "reason": reason}
             self._outbox.reject(refusal.address, report)
 
     def _publish(self, record: Record) -> None:

@@ -54,6 +54,7 @@ def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: A
 
     subscriber = ROS2Subscriber(topic=topic, msg_type=TYPE, msg_definition=definition, callback=take, **options)
     done.wait()
+    options.pop("type_hash", None)
     say(get_topic_names_and_types(**options))
     subscriber.close()
 

@@ -283,6 +283,9 @@ def test_serial_port(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: n
         ("mavlink:udpin:0.0.0.0:99999", "write udpin:0.0.0.0:14550"),
         ("mavlink:udpin:0.0.0.0:14550?rate=0", "positions a second"),
         ("mavlink:udpin:0.0.0.0:14550?vehicles=1:a b", "SYSTEM_ID:VEHICLE"),
+        ("mavlink:udpin:0.0.0.0:14550?vehicles=wing:1", "SYSTEM_ID:VEHICLE"),
+        ("mavlink:udpin:0.0.0.0:14550?vehicles=1:wing,2:wing", "each vehicle once"),
+        ("px4-zenoh:?vehicles=px4_1:a,px4_1:b", "NAMESPACE:VEHICLE"),
         ("px4-zenoh:?domain=500", "a ROS domain, 0 to 232"),
         ("px4-zenoh:?layout=1.12", "the layout of keys without a type hash"),
         ("px4-zenoh:here", "'here' is no endpoint"),
@@ -335,6 +338,7 @@ def test_answers_move_requests_on() -> None:
     for tick in range(20):
         now = 100.0 + tick
         vehicle.count(1, tick, now)
+        vehicle.take(position(1000 * tick), now)
         for request in list(vehicle.requests(now)):
             asked.append(request)
             assert vehicle.answered(now) == request[0]
@@ -345,6 +349,30 @@ def test_answers_move_requests_on() -> None:
     assert asked[0] == (32, 30.0)
     assert len(asked) < 9
     assert vehicle.answered(1000.0) is None
+
+
+def test_overtaken_and_doubled_messages_are_not_lost() -> None:
+    """Datagrams that change places, or come twice, are no loss."""
+    vehicle = Vehicle(30.0)
+    for sequence in (10, 12, 11, 13, 13, 14, 100, 200, 0):
+        vehicle.count(1, sequence, 100.0)
+    assert vehicle.lost == 85 + 99 + 55
+
+
+def test_positions_that_stop_are_asked_for_again() -> None:
+    """A vehicle that talks, but not of where it is, is asked again for its streams."""
+    vehicle = Vehicle(30.0)
+    asked: list[int] = []
+    for tick in range(400):
+        now = 100.0 + tick / 10
+        vehicle.count(1, tick % 256, now)
+        if now < 110:
+            vehicle.take(position(tick * 100), now)
+        for number, _ in list(vehicle.requests(now)):
+            vehicle.answered(now)
+            if now >= 110:
+                asked.append(number)
+    assert asked.count(32) >= 3
 
 
 def test_old_values_are_no_part_of_an_estimate() -> None:

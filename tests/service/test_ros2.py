@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
@@ -123,12 +124,15 @@ def test_topic_of_another_node_is_left_to_it(run_nedbus: Start, endpoint: str, b
     token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
     same = run_nedbus("ros2", "-c", endpoint, "--layout", "1.14")
-    wait_for(lambda: "node px4_0001 publishes /fmu/out/vehicle_local_position already" in same.err, what="the word")
+    wait_for(lambda: "node px4_0001 publishes /fmu/out/vehicle_local_position, it is left" in same.err, what="the word")
     assert "->" not in same.err
     other = run_nedbus("ros2", "-c", endpoint, "--layout", "1.16")
     wait_for(lambda: f"-> /fmu/out/{VLP}" in other.err, what="the translation")
     token.undeclare()
     wait_for(lambda: f"-> /fmu/out/{VLP}" in same.err, what="the topic to be taken over")
+    back = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
+    wait_for(lambda: same.err.count("it is left") == 2, what="the topic to be given back")
+    back.undeclare()
 
 
 def test_topics_come_and_go_with_their_vehicles(
@@ -169,9 +173,26 @@ def test_loop_is_refused(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> N
         assert list(bus.vehicles()) == ["1"]
 
 
+def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
+    """One instance alone, on the keys of ROS 2 Humble, and two vehicles that would have one topic."""
+    publishers = [bus.publisher("estimator_local_position", vehicle="a-b", instance=number) for number in (0, 1)]
+    bus.publisher("estimator_local_position", vehicle="a_b", instance=0)
+    key = f"0/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
+    subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
+    bridge = run_nedbus("ros2", "-c", endpoint, "--humble", "-t", "estimator_local_position", "-i", "0")
+    wait_for(lambda: "give one a --namespace" in bridge.err, what="both")
+    for publisher in publishers:
+        publisher.publish(message(7))
+    assert len(subscriber.handler.recv().payload) == 220
+    assert "estimator_local_position_1" not in bridge.err
+    bridge.signal(signal.SIGTERM)
+    assert bridge.wait() == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
+        (["--to", "tcp/127.0.0.1:1"], "nothing answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
         (["--layout", "1.12"], "no layout '1.12': choose from 1.13, 1.14, 1.15, V0, 1.16"),
         (["--namespace", "1:7up"], "namespace '7up' is not valid"),
         (["--namespace", "7up"], "VEHICLE:NAMESPACE"),

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Annotated
 
 import typer
 
 from nedbus.bus import Bus
-from nedbus.errors import ConfigError
+from nedbus.errors import ConfigError, ConnectError, NedbusError
 from nedbus.extras import needs
 from nedbus.ros2 import Bridge
 from nedbus_msgs import ANY, CURRENT, LAYOUTS
 
-from .options import TopicArgument, TopicOption, VehicleOption, choose, on_bus, tell
+from .options import InstanceOption, TopicArgument, TopicOption, VehicleOption, choose, on_bus, tell
+from .serve import run_until_signal
 
 
 @on_bus
@@ -24,6 +27,8 @@ def ros2(
     *,
     topic_option: TopicOption = ANY,
     vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
     layout: Annotated[
         str, typer.Option(help=f"Layout of px4_msgs in the ROS 2 workspace: {', '.join(LAYOUTS)} (to main)")
     ] = CURRENT.name,
@@ -35,13 +40,16 @@ def ros2(
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
 ) -> None:
     """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs/msg/VehicleLocalPosition on /fmu/out/..."""
-    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=None)
+    wanted = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     for each in namespace or ():
         if ":" not in each:
             raise ConfigError("--namespace", f"{each!r} is not VEHICLE:NAMESPACE")
     named = dict(each.partition(":")[::2] for each in namespace or ())
     with ExitStack() as closing:
-        session = bus.join(to)
+        try:
+            session = bus.join(to)
+        except ConnectError as exc:
+            raise NedbusError(f"nothing answers at {to}: start the router of ROS 2 there, or correct --to") from exc
         closing.callback(session.close)
         bridge = Bridge(
             bus,
@@ -50,9 +58,11 @@ def ros2(
             domain=domain,
             topic=wanted.topic,
             vehicle=wanted.vehicle,
+            instance=wanted.instance,
+            hashed=not humble,
             namespaces=named,
         )
-        bridge.run(threading.Event())
+        _run(bridge.run)
 
 
 @on_bus
@@ -67,4 +77,17 @@ def foxglove(
     view_module = needs("foxglove", "nedbus.foxglove_view")
     with view_module.FoxgloveView(bus, host=host, port=port) as view:
         tell(f"open {view.url} in Foxglove: Open connection, Foxglove WebSocket")
-        view.run(threading.Event(), vehicle=vehicle)
+        _run(partial(view.run, vehicle=vehicle))
+
+
+def _run(body: Callable[[threading.Event], object]) -> None:
+    """Run something until Ctrl-C or SIGTERM, also as the first process of a container."""
+    stop = threading.Event()
+
+    def run() -> bool:
+        body(stop)
+        return True
+
+    ends = run_until_signal(run, stop.set, beside=lambda: None)
+    if ends is not None:
+        raise typer.Exit(ends)

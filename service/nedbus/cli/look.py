@@ -83,7 +83,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {service.get('service')}, nedbus {service.get('version')}, as {service.get('role')}")
         rows = [_source_row(source) for source in _sources(service)]
         if rows:
-            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "RESTARTS", "REMARK"], rows))
+            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK"], rows))
         streams = [row for source in _sources(service) for row in _stream_rows(source)]
         if streams:
             write("\n" + to_table(["VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE"], streams))
@@ -129,7 +129,7 @@ def _published(source: dict[str, object]) -> int:
 
 
 def _source_row(source: dict[str, object]) -> list[str]:
-    keys = ("source", "state", "published", "rejected", "lost", "restarts")
+    keys = ("source", "state", "published", "rejected", "lost", "reboots", "restarts")
     silent = source.get("silent")
     remark = f"silent: {', '.join(map(str, silent))}" if silent and isinstance(silent, list) else "-"
     return [*(str(source.get(key, "-")) for key in keys), str(source.get("error") or remark)]

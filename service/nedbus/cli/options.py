@@ -16,7 +16,7 @@ import typer
 
 from nedbus.bus import Bus
 from nedbus.bus import connect as nedbus_connect
-from nedbus.errors import AddressError, ConfigError, ConnectError, NedbusError
+from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus_msgs import ANY, TOPICS
 
 P = ParamSpec("P")
@@ -54,7 +54,7 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
         try:
             function(*args, **kwargs)
-        except (ConfigError, AddressError) as exc:
+        except (ConfigError, AddressError, LayoutError) as exc:
             raise _fail(exc, 2) from exc
         except NedbusError as exc:
             raise _fail(exc, 1) from exc

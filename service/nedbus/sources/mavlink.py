@@ -102,7 +102,7 @@ class _Conversation:
             vehicle = self._vehicles[system] = Vehicle(self._options.rate)
         self._peers[system] = peer
         vehicle.count(component, sequence, now)
-        address = Address(self._options.vehicles.get(str(system), str(system)), _TOPIC)
+        address = Address(self._vehicle_of(system), _TOPIC)
         if message.get_type() == "COMMAND_ACK":
             self._take_answer(vehicle, message, address, now)
             return None
@@ -117,6 +117,11 @@ class _Conversation:
         if restarted:
             _log.warning("%s: started again", address)
         return Record(0.0, address, fields, lost, restarted)
+
+    def _vehicle_of(self, system: int) -> str:
+        named = self._options.vehicles
+        plain = f"system{system}" if str(system) in named.values() else str(system)
+        return named.get(str(system), plain)
 
     def _is_autopilot(self, message: Any, system: int, component: int) -> bool:
         """Return whether this may tell where the vehicle is: a camera, a gimbal or a ground station may not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import select
 import socket
@@ -57,8 +58,10 @@ def open_link(text: str, *, baud: int) -> Link:
         if kind == "tcp":
             return _Tcp(host, port)
         return _Udp(host, port, listens=kind != "udpout")
-    except OSError as exc:
-        raise SourceError(f"mavlink:{text}", f"cannot be opened ({(exc.strerror or str(exc)).lower()})") from exc
+    except (OSError, UnicodeError) as exc:
+        number = exc.errno if isinstance(exc, OSError) else None
+        reason = os.strerror(number).lower() if number and number > 0 else str(exc)
+        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
 
 
 def _split(text: str) -> tuple[str, str, int]:
@@ -87,7 +90,7 @@ class _Udp:
                 raise
 
     def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if not select.select([self._socket], [], [], seconds)[0]:
+        if not _is_ready(self._socket, seconds):
             return
         with suppress(BlockingIOError, ConnectionError):  # nobody listens at the other side, yet
             for _ in range(_AT_ONCE):
@@ -109,7 +112,7 @@ class _Tcp:
         self.peer: Peer = (host, port)
 
     def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if select.select([self._socket], [], [], seconds)[0]:
+        if _is_ready(self._socket, seconds):
             data = self._socket.recv(_DATAGRAM)
             if not data:
                 raise ConnectionResetError(None, "the other side closed the connection")
@@ -132,7 +135,7 @@ class _Serial:
         self.peer: Peer = device
 
     def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if select.select([self._port], [], [], seconds)[0]:
+        if _is_ready(self._port, seconds):
             yield self._port.read(_DATAGRAM), self.peer
 
     def send(self, data: bytes, peer: Peer) -> None:
@@ -140,3 +143,10 @@ class _Serial:
 
     def close(self) -> None:
         self._port.close()
+
+
+def _is_ready(file: Any, seconds: float) -> bool:
+    """Wait until something can be read, or the other side is gone; unlike select, for any number of open files."""
+    poll = select.poll()
+    poll.register(file, select.POLLIN)
+    return bool(poll.poll(seconds * 1000))

@@ -17,7 +17,7 @@ _FLAGS_FRESH: Final = 5.0  # s, as PX4 says it less often
 _SILENCE: Final = 3.0  # s after which nothing is taken for granted any more
 _PATIENCE: Final = 1.0  # s until something is asked for again
 _TRIES: Final = 5
-_ORIGIN_AGAIN: Final = 5.0  # s until an origin that nobody told is asked for again
+_AGAIN: Final = 5.0  # s until an origin that nobody told, or positions that do not come, are asked for again
 _HOME_LAP: Final = 36000  # 0.01 deg
 _UNKNOWN_HEADING: Final = 65535
 
@@ -50,6 +50,7 @@ class Vehicle:
         self._last_ms: int | None = None
         self._wraps = 0
         self.heard = 0.0
+        self._placed = 0.0  # when it told its position last
         self.lost = 0
         self.restarted = False
         self._forget(0.0)
@@ -69,14 +70,19 @@ class Vehicle:
             self._forget(now)
         self.heard = now
         last = self._sequences.get(component)
-        if last is not None:
-            self.lost += (sequence - last - 1) % 256
-        self._sequences[component] = sequence
+        step = 1 if last is None else (sequence - last) % 256
+        if step > 128:  # it was overtaken, and taken for lost
+            self.lost = max(0, self.lost - 1)
+        elif step:  # else it came twice
+            self.lost += step - 1
+            self._sequences[component] = sequence
 
     def requests(self, now: float) -> Iterator[tuple[int, float]]:
         """Yield what to ask for now: a message's number, and at what rate [Hz]; 0 stands for once."""
         if now < self._ask_at or now - self.heard > _SILENCE:
             return
+        if not self._wanted and now - self._placed > _SILENCE:
+            self._wanted, self._tries = [*self._rates], 0  # it talks, but not of where it is
         if self._tries >= _TRIES:
             self._wanted, self._tries = self._wanted[1:], 0
         if self._wanted:
@@ -84,7 +90,7 @@ class Vehicle:
             self._ask_at = now + _PATIENCE
             yield self._wanted[0], self._rates.get(self._wanted[0], 0.0)
         elif not self._origin:
-            self._wanted, self._ask_at = [ORIGIN], now + _ORIGIN_AGAIN
+            self._wanted, self._ask_at = [ORIGIN], now + _AGAIN
 
     def answered(self, now: float) -> int | None:
         """Take note that it answered the last request, whatever the answer; return which that was."""
@@ -92,7 +98,7 @@ class Vehicle:
             return None
         number, *self._wanted = self._wanted
         self._tries = 0
-        self._ask_at = now if self._wanted else now + _ORIGIN_AGAIN
+        self._ask_at = now if self._wanted else now + _AGAIN
         return number
 
     def take(self, message: Any, now: float) -> dict[str, object] | None:
@@ -140,6 +146,7 @@ class Vehicle:
 
     def _estimate(self, message: Any, now: float) -> dict[str, object]:
         self._follow_time(message.time_boot_ms, now)
+        self._placed = now
         place = {name: getattr(message, name) for name in ("x", "y", "z", "vx", "vy", "vz")}
         fields: dict[str, object] = {
             "timestamp": (self._wraps * _WRAP + message.time_boot_ms) * 1000,

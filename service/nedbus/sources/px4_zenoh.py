@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import zenoh
 
-from nedbus.errors import AddressError, DecodeError, SourceError
+from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
 from nedbus.rmw_zenoh import NO_HASH, Attachment, TopicKey, is_ours, split_topic
-from nedbus.session import check_endpoints, open_client, while_open
+from nedbus.session import Session, check_endpoints, open_client, while_open
 from nedbus_msgs import ROS2_TYPES, Address, dds_type, decode_cdr, layout_of_type_hash
 
 from .record import Home, Record, Refusal
@@ -25,6 +27,8 @@ _WAITING: Final = 4096  # samples that wait to be read
 _TICK: Final = 0.25  # s
 _KEYS: Final = 1000  # keys that are listened to; a vehicle has a handful
 _PAYLOAD_LIMIT: Final = 1024  # bytes that are looked at
+_GAP: Final = 1_000_000  # messages that can have been lost at once; more is no gap
+_APART: Final = "give each a namespace or a domain of its own"
 _LEFT: Final = 3.0  # s of silence after which another key may speak for the same vehicle and topic
 
 
@@ -35,8 +39,11 @@ class _Stream:
     key: str
     address: Address
     layout: str
+    gid: bytes | None = None
     sequence: int | None = None
-    heard: float = 0.0
+    heard: float = -math.inf
+    stepped_back: float = -math.inf
+    ours: bool = False
 
 
 class Px4ZenohSource:
@@ -53,39 +60,52 @@ class Px4ZenohSource:
         self._speakers: dict[Address, _Stream] = {}
 
     def listen(self) -> Iterator[Record | Refusal | None]:
-        """Listen; raise ConnectError when no router answers, SourceError when it goes away for good."""
+        """Listen; raise SourceError when no router answers, or the connection is closed."""
         self._streams.clear()
         self._speakers.clear()
-        waiting: queue.Queue[zenoh.Sample] = queue.Queue(_WAITING)
-        dropped = 0
+        waiting: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        dropped = told = 0
 
         def hand_over(sample: zenoh.Sample) -> None:
             nonlocal dropped
-            try:
-                waiting.put_nowait(sample)
-            except queue.Full:  # the sequence numbers tell the same where there are any
+            if waiting.qsize() >= _WAITING:
+                with suppress(queue.Empty):
+                    waiting.get_nowait()
                 dropped += 1
+            waiting.put(sample)
 
-        session = open_client(self._endpoints, timeout=1.0, tls=self._tls)
+        session = self._open()
         try:
             with while_open(session):
                 domain = "*" if self._options.domain is None else self._options.domain
                 for name in ROS2_TYPES:
                     callback = zenoh.handlers.Callback(hand_over, indirect=False)
                     session.declare_subscriber(f"{domain}/**/{dds_type(name)}/*", callback)
+            yield None
             while not session.is_closed():
-                if dropped:
-                    yield Refusal("reader", f"{dropped} messages came faster than they can be read")
-                    dropped = 0
+                if dropped > told:
+                    yield Refusal("reader", "messages came faster than they can be read", count=dropped - told)
+                    told = dropped
                 try:
                     sample = waiting.get(timeout=_TICK)
                 except queue.Empty:
                     yield None
                 else:
                     yield self._read(sample)
-            raise SourceError(" or ".join(self._endpoints), "the connection was closed")
+            raise SourceError(self._name, "the connection was closed")
         finally:
             session.close()
+
+    @property
+    def _name(self) -> str:
+        return f"px4-zenoh:{' or '.join(self._endpoints)}"
+
+    def _open(self) -> Session:
+        try:
+            return open_client(self._endpoints, timeout=0.5, tls=self._tls)
+        except ConnectError as exc:
+            reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
+            raise SourceError(self._name, reason) from exc
 
     def _read(self, sample: zenoh.Sample) -> Record | Refusal | None:
         key = str(sample.key_expr)
@@ -95,10 +115,15 @@ class Px4ZenohSource:
                 return None
             if stream is None:
                 stream = self._learn(key)
-            lost, restarted = self._follow(stream, sample.attachment)
+            attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
+            if attachment is not None and is_ours(attachment.gid):
+                self._tell_of_loop(stream)
+                return None
+            self._let_speak(stream, attachment)
             if len(sample.payload) > _PAYLOAD_LIMIT:
                 raise DecodeError(f"{len(sample.payload)} bytes")
             fields = decode_cdr(sample.payload.to_bytes(), layout=stream.layout)
+            lost, restarted = self._follow(stream, attachment)
         except (AddressError, DecodeError) as exc:
             return Refusal(key, str(exc), stream.address if stream else None)
         return Record(0.0, stream.address, fields, lost, restarted)
@@ -125,33 +150,51 @@ class Px4ZenohSource:
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the vehicle that is mapped, else one named by namespace and by any domain but the expected one."""
-        for name in (namespace, str(domain)):
-            if name in self._options.vehicles:
-                return self._options.vehicles[name]
-        names = [namespace.replace("/", "-")] if namespace else []
-        if domain != (self._options.domain or 0):
-            names.insert(0, f"domain{domain}")
-        return "-".join(names) or self._vehicle
+        vehicles = self._options.vehicles
+        if namespace in vehicles:
+            return vehicles[namespace]
+        expected = domain == (self._options.domain or 0)
+        of_domain = vehicles.get(str(domain), "" if expected else f"domain{domain}")
+        return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
 
-    def _follow(self, stream: _Stream, attachment: zenoh.ZBytes | None) -> tuple[int, bool]:
-        """Return how many messages were lost just before this one, and whether its vehicle started again."""
-        lost, restarted = 0, False
+    def _tell_of_loop(self, stream: _Stream) -> None:
+        if not stream.ours:
+            stream.ours = True
+            _log.info("%s is what nedbus ros2 gave to ROS 2: it is left out, as it would loop", stream.key)
+
+    def _let_speak(self, stream: _Stream, attachment: Attachment | None) -> None:
+        """Raise DecodeError while somebody else speaks for the same address: another key, or another publisher."""
         now = time.monotonic()
+        speaker = self._speakers.setdefault(stream.address, stream)
+        if speaker is not stream:
+            if now - speaker.heard < _LEFT:
+                raise DecodeError(f"{speaker.key} is {stream.address} already: name one of them with vehicles=")
+            self._speakers[stream.address] = stream
+        if attachment is not None and attachment.gid != stream.gid:
+            if stream.gid is not None and now - stream.heard < _LEFT:
+                raise DecodeError(f"two publishers share this key: {_APART}")
+            stream.gid, stream.sequence = attachment.gid, None
+
+    def _follow(self, stream: _Stream, attachment: Attachment | None) -> tuple[int, bool]:
+        """Return how many messages were lost just before this one, and whether its vehicle started again.
+
+        Raises DecodeError for a message that came twice, and for a second vehicle that has the first one's id.
+        """
+        now = time.monotonic()
+        lost, restarted = 0, False
         if attachment is not None:
-            found = Attachment.parse(attachment.to_bytes())
-            if is_ours(found.gid):
-                raise DecodeError("nedbus itself published this to ROS 2 (nedbus ros2): taking it in again would loop")
-            if stream.sequence is not None:
-                if found.sequence == stream.sequence:
-                    raise DecodeError(f"number {found.sequence} came twice")
-                restarted = found.sequence < stream.sequence
-                lost = max(0, found.sequence - stream.sequence - 1)
-            stream.sequence = found.sequence
-        speaker = self._speakers.get(stream.address)
-        if speaker is not None and speaker is not stream and now - speaker.heard < _LEFT:
-            raise DecodeError(f"{speaker.key} is {stream.address} already: name one of them with vehicles=")
-        self._speakers[stream.address] = stream
+            step = 1 if stream.sequence is None else attachment.sequence - stream.sequence
+            if step == 0:
+                raise DecodeError(f"number {attachment.sequence} came twice")
+            if step < 0:
+                again = now - stream.stepped_back < _LEFT
+                stream.stepped_back = now
+                if again:
+                    raise DecodeError(f"its sequence goes back and forth, as if two vehicles shared this key: {_APART}")
+                restarted = True
+                _log.warning("%s: its sequence goes back: the vehicle started again", stream.key)
+            elif step <= _GAP:
+                lost = step - 1
+            stream.sequence = attachment.sequence
         stream.heard = now
-        if restarted:
-            _log.warning("%s: its sequence goes back: the vehicle started again, or two share this key", stream.key)
         return lost, restarted

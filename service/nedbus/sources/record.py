@@ -29,11 +29,12 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Something that arrived and is no message; `where` it came from is told of once."""
+    """Something that arrived and is no message, or several of it; `where` it came from is told of once."""
 
     where: str
     reason: str
     address: Address | None = None
+    count: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class Live(Protocol):
     def listen(self) -> Iterator[Record | Refusal | None]:
         """Listen until the iterator is closed; None says that nothing came for a moment, at least twice a second.
 
-        Raises SourceError or ConnectError when it cannot be listened to, or no more.
+        Raises SourceError when it cannot be listened to, or no more.
         """
         ...
 

@@ -27,9 +27,19 @@ def _vehicles(text: object) -> object:
     """Read `NAME:VEHICLE,NAME:VEHICLE`."""
     if not isinstance(text, str):
         return text
-    named = dict(part.partition(":")[::2] for part in text.split(","))
+    parts = [part.strip().rpartition(":") for part in text.split(",")]
+    named = {name.strip("/"): vehicle for name, _, vehicle in parts}
     for vehicle in named.values():
         check_vehicle(vehicle)
+    if "" in named or len(named) < len(parts):
+        raise ValueError(text)
+    return named
+
+
+def _systems(named: Mapping[str, str]) -> Mapping[str, str]:
+    """Let pass what names each system once, and gives no two of them the same vehicle."""
+    if not all(name.isdecimal() and 0 < int(name) < 256 for name in named) or len(set(named.values())) < len(named):
+        raise ValueError(named)
     return named
 
 
@@ -94,7 +104,9 @@ class MavlinkOptions(Options):
         30.0, description="positions a second to ask the vehicle for, 0.1 to 200"
     )
     baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(57600, description="of a serial port, 300 to 12000000")
-    vehicles: Vehicles = Field({}, description="SYSTEM_ID:VEHICLE, with commas between them")
+    vehicles: Annotated[Vehicles, AfterValidator(_systems)] = Field(
+        {}, description="SYSTEM_ID:VEHICLE, with commas between them, each id and each vehicle once"
+    )
 
 
 @dataclass(frozen=True, slots=True)
