@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from .cdr import places_in_cdr
 from .layouts import CURRENT
-from .position import FIELD_TYPES, VehicleLocalPosition
+from .position import FIELD_TYPES, NAMES, Values, VehicleLocalPosition
 from .px4_types import TypeName
 from .rules import FLAGGED, NOT_NEGATIVE, WITHIN
 from .wire import NO_VALUES, PAYLOAD_SIZE, TAGS, places_on_the_wire
@@ -33,6 +33,7 @@ DTYPE: Final = np.dtype([(name, _NATIVE[kind]) for name, kind in FIELD_TYPES.ite
 FEW: Final = 8
 """Messages below which whole columns cost more than one by one."""
 
+_PAIRS: Final = [place for place, kind in enumerate(FIELD_TYPES.values()) if kind == "float32[2]"]
 _PARTS: Final = list(places_on_the_wire())
 _WIRE: Final = np.dtype(
     {
@@ -118,8 +119,15 @@ def to_records(messages: Sequence[VehicleLocalPosition]) -> Records:
     return np.array([tuple(message.__dict__.values()) for message in messages], DTYPE)
 
 
+def to_row(record: np.void) -> Values:
+    """Return the values of one record in PX4's order, `delta_xy` and `delta_vxy` as tuples."""
+    values = list(record.item())
+    for place in _PAIRS:
+        values[place] = tuple(values[place].tolist())
+    return tuple(values)
+
+
 def to_message(record: np.void) -> VehicleLocalPosition:
     """Return one record as a message; raise pydantic.ValidationError for what the model refuses."""
-    values = (tuple(value.tolist()) if isinstance(value, np.ndarray) else value for value in record.item())
-    fields: dict[str, Any] = dict(zip(FIELD_TYPES, values, strict=True))
+    fields: dict[str, Any] = dict(zip(NAMES, to_row(record), strict=True))
     return VehicleLocalPosition(**fields)

@@ -120,13 +120,13 @@ class Publisher:
 
         Raises TypeError for another dtype, pydantic.ValidationError for the first message that the model refuses.
         """
-        from nedbus_msgs.arrays import DTYPE, FEW, find_sound, to_message, write_records
+        from nedbus_msgs.arrays import DTYPE, FEW, find_sound, to_message, to_row, write_records
 
         if records.dtype != DTYPE:
             raise TypeError("records have the dtype nedbus_msgs.arrays.DTYPE: convert with astype")
         if len(records) < FEW:
-            for message in [to_message(record) for record in records]:
-                self.publish(message)
+            for payload in [encode_row(to_row(record)) for record in records]:
+                self._put(payload, FIELD_TYPES)
             return
         for record in records[~find_sound(records)]:
             to_message(record)  # says what is wrong
