@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import zenoh
 
-from nedbus_msgs import PAYLOAD_SIZE, Address, Origin, VehicleLocalPosition, origin_of
-from nedbus_msgs.arrays import FEW, Records, read_records, to_records
+from nedbus_msgs import PAYLOAD_SIZE, Address, Origin, Row, origin_of
+from nedbus_msgs.arrays import DTYPE, FEW, Records, read_records
 
 
 @dataclass(eq=False)
@@ -66,16 +66,16 @@ def make_batch(
     *,
     received: int,
     lost: int,
-    judge: Callable[[zenoh.Sample], VehicleLocalPosition | None],
+    judge: Callable[[zenoh.Sample], Row | None],
 ) -> Batch:
     """Return the batch of what arrived on these keys, of which some may have no address.
 
-    `judge` gives the message of one that needs a closer look, None if it is invalid.
+    `judge` gives the row of one that needs a closer look, None if it is invalid.
     """
     if len(raw) < FEW:
         judged = list(map(judge, raw))
-        messages = to_records([message for message in judged if message is not None])
-        valid = np.array([message is not None for message in judged])
+        messages = np.array([row for row in judged if row is not None], DTYPE)
+        valid = np.array([row is not None for row in judged])
     else:
         messages, valid = _read(raw, keys, addresses, judge)
     if not valid.all():
@@ -90,7 +90,7 @@ def _read(
     raw: Sequence[zenoh.Sample],
     keys: Sequence[str],
     addresses: Mapping[str, Address],
-    judge: Callable[[zenoh.Sample], VehicleLocalPosition | None],
+    judge: Callable[[zenoh.Sample], Row | None],
 ) -> tuple[Records, npt.NDArray[np.bool_]]:
     """Return the valid messages, and which of all were valid."""
     payloads = [sample.payload.to_bytes() for sample in raw]
@@ -102,8 +102,8 @@ def _read(
     if valid.all():
         return messages, valid
     for place in np.flatnonzero(~valid).tolist():
-        message = judge(raw[place])
-        if message is not None:
-            messages[place : place + 1] = to_records([message])
+        row = judge(raw[place])
+        if row is not None:
+            messages[place] = row
             valid[place] = True
     return messages[valid], valid

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Final, Literal, cast, get_args
 
 import zenoh
 
@@ -25,9 +25,11 @@ from nedbus_msgs import (
     AddressError,
     DecodeError,
     Origin,
+    Row,
     UnknownLayoutError,
     VehicleLocalPosition,
     decode,
+    decode_row,
     origin_of,
 )
 
@@ -257,10 +259,10 @@ class Intake:
         self._received += len(batch)
         return batch if len(batch) else None
 
-    def _judge(self, raw: zenoh.Sample) -> VehicleLocalPosition | None:
-        """Return the message of one that is not in our own encoding, or is invalid; then it is counted."""
-        sample = self.read(raw)
-        return None if sample is None else sample.message
+    def _judge(self, raw: zenoh.Sample) -> Row | None:
+        """Return the row of one that is among few, not in our own encoding, or invalid; then it is counted."""
+        sample = self.read(raw, decode_row)
+        return None if sample is None else cast("Row", sample.message)
 
     def read(
         self, raw: zenoh.Sample, read: Callable[..., VehicleLocalPosition] = decode, *, follow: bool = False
