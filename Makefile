@@ -37,6 +37,7 @@ bench: $(READY)  ## measure: beside the peers, with many vehicles, pacing of a r
 	$(BIN)/python -m benchmarks.picture
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.load
+	$(BIN)/python -m benchmarks.record 60
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 

@@ -170,3 +170,42 @@ def test_async_rows_and_batches(bus: nedbus.Bus, endpoint: str) -> None:
             return stamps, count
 
     assert asyncio.run(read()) == (list(range(1, 101)), 200)
+
+
+def test_batch_is_waited_for_so_long(bus: nedbus.Bus, endpoint: str) -> None:
+    """A batch can be waited for with a timeout, from either client; where each comes from is known of all."""
+    publisher = bus.publisher(VLP, vehicle="1", source="test")
+
+    async def receive() -> tuple[int, bool]:
+        async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            batch = await subscription.receive_batch(10)
+            try:
+                await subscription.receive_batch(0.01)
+            except nedbus.NoDataError:
+                return len(batch), True
+            return len(batch), False
+
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        with pytest.raises(nedbus.NoDataError):
+            subscription.receive_batch(0.01)
+        publisher.publish({"timestamp": 7, "x": 1.0})
+        batch = subscription.receive_batch(10)
+        assert batch.messages["timestamp"].tolist() == [7]
+        [origin] = batch.origins
+        assert (origin.source, "x" in origin.missing, "y" in origin.missing) == ("test", False, True)
+    assert asyncio.run(receive()) == (1, True)
+
+
+def test_sample_tells_where_it_comes_from(bus: nedbus.Bus, endpoint: str) -> None:
+    """Source and missing fields follow each message, also into the last value, and cost a publisher nothing to say."""
+    publisher = bus.publisher(VLP, vehicle="1", source="mine")
+    whole = dict(VehicleLocalPosition(timestamp=1).model_dump())
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        for fields in (whole, {"timestamp": 2, "x": 1.0}, {"timestamp": 3}, whole):
+            publisher.publish(fields)
+        publisher.publish(VehicleLocalPosition(timestamp=4, y=2.0))
+        missing = [subscription.receive(10).missing for _ in range(5)]
+        [last] = other.latest(VLP)
+    assert [len(each) for each in missing] == [0, 51, 52, 0, 51]
+    assert "y" not in missing[4]
+    assert (last.source, last.missing) == ("mine", missing[4])
