@@ -367,7 +367,7 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ([], "source: nothing to publish: give --source sim: or --source ulog:FILE, or several"),
+        ([], "source: nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"),
         (["-s", "foo:x"], "source 'foo:x': there is no kind 'foo': choose from sim, ulog"),
         (["-s", "ulog:"], "source 'ulog:': write it as ulog:FILE"),
         (["-s", "sim:x"], "source 'sim:x': write it as sim:?OPTION=VALUE"),

@@ -121,7 +121,7 @@ for sample in subscription:
 
 def test_signal_ends_a_script_that_waits_for_a_router(start: Start) -> None:
     """Ctrl-C ends the wait for a router that is not there."""
-    code = 'print("ready", flush=True); import nedbus; nedbus.connect("tcp/127.0.0.1:1", timeout=600)'
+    code = 'import nedbus; nedbus.connect; print("ready", flush=True); nedbus.connect("tcp/127.0.0.1:1", timeout=600)'
     process = start("-c", code, measured=False)
     wait_for(lambda: "ready" in process.out, what="the script")
     process.signal(signal.SIGINT)
