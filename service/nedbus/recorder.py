@@ -22,6 +22,7 @@ from .subscriber import Subscription
 
 _FLUSH: Final = 1.0  # s: what a power cut costs at most
 _LOOK: Final = 0.2  # s between two looks at whether to end
+_LATEST: Final = 2**64 - 1  # ns: a damaged log may say anything
 _AT_ONCE: Final = 1024  # messages of a flight that are written together
 
 
@@ -83,7 +84,7 @@ def convert(flight: Flight, path: Path, *, source: str, on_progress: Callable[[i
     with Recording(path) as recording:
 
         def write() -> None:
-            times = [message.timestamp * 1000 for *_, message in waiting]
+            times = [min(message.timestamp * 1000, _LATEST) for *_, message in waiting]
             streams = ((address, origin) for address, origin, _ in waiting)
             recording.write(to_records([each for *_, each in waiting]), streams, logged=times, published=times)
             waiting.clear()

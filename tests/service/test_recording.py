@@ -18,8 +18,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import nedbus
 from nedbus.errors import RecordError, SourceError
 from nedbus.playback import Playback
-from nedbus.recorder import Recorder
+from nedbus.recorder import Recorder, convert
 from nedbus.recording import Recording
+from nedbus.sources import Flight, Record
 from nedbus_msgs import (
     LAYOUTS,
     ROS2_TYPE,
@@ -287,9 +288,9 @@ def log() -> Path:
 def test_log_is_converted_whole(run_nedbus: Start, tmp_path: Path, log: Path) -> None:
     """A real log as a recording has the same messages, and what its release did not have."""
     path = tmp_path / "flight.mcap"
-    convert = run_nedbus("convert", str(log), str(path))
-    assert convert.wait() == 0, convert.err
-    assert "1871 messages" in convert.err
+    converter = run_nedbus("convert", str(log), str(path))
+    assert converter.wait() == 0, converter.err
+    assert "1871 messages" in converter.err
 
     def messages(source: str) -> dict[str, list[VehicleLocalPosition]]:
         found: dict[str, list[VehicleLocalPosition]] = {}
@@ -303,13 +304,22 @@ def test_log_is_converted_whole(run_nedbus: Start, tmp_path: Path, log: Path) ->
     assert len(read_plainly(path)) == 1871
 
 
+def test_damaged_times_are_converted(tmp_path: Path) -> None:
+    """A timestamp that no clock has is kept in the message; the file's own time goes as far as it can."""
+    path = tmp_path / "a.mcap"
+    records = [Record(0.0, HERE, {"timestamp": each}) for each in (1, 2**64 - 1)]
+    flight = Flight(iter(records), (HERE,), 2, "")
+    assert convert(flight, path, source="ulog", on_progress=lambda _: None) == "2 messages"
+    assert [each.timestamp for *_, each in read_plainly(path)] == [1, 2**64 - 1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [(["flight.txt", "a.mcap"], "a flight is one of .ulg, .mcap"), (["flight.ulg", "a.mcap"], "no such file")],
 )
 def test_wrong_words_are_said(run_nedbus: Start, arguments: list[str], word: str) -> None:
     """What cannot be converted is said in one line."""
-    convert = run_nedbus("convert", *arguments)
-    assert convert.wait() in {1, 2}
-    assert word in convert.err
-    assert len(convert.err.splitlines()) == 1
+    converter = run_nedbus("convert", *arguments)
+    assert converter.wait() in {1, 2}
+    assert word in converter.err
+    assert len(converter.err.splitlines()) == 1
