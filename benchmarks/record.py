@@ -6,6 +6,7 @@ The values are those of a flight with noise in them, so that the file is not com
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tempfile
 import time
@@ -59,7 +60,9 @@ def main() -> None:
         path = Path(folder) / "fleet.mcap"
         router = start("-m", "nedbus", "router", "--listen", ENDPOINT)
         time.sleep(1.0)
-        recorder = start("-m", "nedbus", "record", "-c", ENDPOINT, "-o", str(path))
+        said = (Path(folder) / "said").open("w+")
+        command = [sys.executable, "-m", "nedbus", "record", "-c", ENDPOINT, "-o", str(path)]
+        recorder = subprocess.Popen(command, stderr=said)
         publisher = start("-c", PUBLISHER, str(VEHICLES), str(seconds), ENDPOINT)
         expect(publisher)
         time.sleep(1.0)
@@ -86,6 +89,8 @@ def main() -> None:
             f" recorder {used / sent * 1e6:.1f} us a message, {memory[0]:.0f} to {memory[-1]:.0f} MB;"
             f" publisher at most {late} s late"
         )
+        said.seek(0)
+        print(f"it says: {said.read().strip()}")
         for process in (publisher, router):
             process.kill()
             process.wait()
