@@ -15,7 +15,7 @@ from nedbus.batches import Batch
 from nedbus.session import Session
 from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
 from nedbus_msgs.arrays import DTYPE, to_message, to_records
-from tests.conftest import message
+from tests.conftest import DEADLINE, message
 
 VLP = "vehicle_local_position"
 COUNT = 5000
@@ -178,18 +178,18 @@ def test_batch_is_waited_for_so_long(bus: nedbus.Bus, endpoint: str) -> None:
 
     async def receive() -> tuple[int, bool]:
         async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
-            batch = await subscription.receive_batch(10)
+            batch = await subscription.receive_batch(DEADLINE)
             try:
                 await subscription.receive_batch(0.01)
             except nedbus.NoDataError:
                 return len(batch), True
             return len(batch), False
 
+    publisher.publish({"timestamp": 7, "x": 1.0})
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        batch = subscription.receive_batch(DEADLINE)
         with pytest.raises(nedbus.NoDataError):
             subscription.receive_batch(0.01)
-        publisher.publish({"timestamp": 7, "x": 1.0})
-        batch = subscription.receive_batch(10)
         assert batch.messages["timestamp"].tolist() == [7]
         [origin] = batch.origins
         assert (origin.source, "x" in origin.missing, "y" in origin.missing) == ("test", False, True)
@@ -200,11 +200,13 @@ def test_sample_tells_where_it_comes_from(bus: nedbus.Bus, endpoint: str) -> Non
     """Source and missing fields follow each message, also into the last value, and cost a publisher nothing to say."""
     publisher = bus.publisher(VLP, vehicle="1", source="mine")
     whole = dict(VehicleLocalPosition(timestamp=1).model_dump())
+    publisher.publish(whole)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
-        for fields in (whole, {"timestamp": 2, "x": 1.0}, {"timestamp": 3}, whole):
+        missing = [subscription.receive(DEADLINE).missing]  # the last value: from here on it is known to listen
+        for fields in ({"timestamp": 2, "x": 1.0}, {"timestamp": 3}, whole):
             publisher.publish(fields)
         publisher.publish(VehicleLocalPosition(timestamp=4, y=2.0))
-        missing = [subscription.receive(10).missing for _ in range(5)]
+        missing += [subscription.receive(DEADLINE).missing for _ in range(4)]
         [last] = other.latest(VLP)
     assert [len(each) for each in missing] == [0, 51, 52, 0, 51]
     assert "y" not in missing[4]
