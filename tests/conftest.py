@@ -11,9 +11,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast
 
 import pytest
+import zenoh
 
 import nedbus
 from nedbus.session import Session, open_router
@@ -36,6 +37,13 @@ def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEA
     while not condition():
         assert time.monotonic() < end, f"waited {seconds} s in vain for {what}"
         time.sleep(0.01)
+
+
+def wait_for_reader(raw: Session, key: str) -> None:
+    """Wait until a session knows of a subscriber of this key: what it publishes before goes nowhere."""
+    probe = raw.declare_publisher(key)
+    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
+    probe.undeclare()
 
 
 def free_endpoint() -> str:

@@ -40,6 +40,7 @@ from .topics import (
     schema_key,
     selection,
     status_key,
+    taken_key,
 )
 from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, decode_row, describe, encode, encode_fields, encode_row
 
@@ -102,6 +103,7 @@ __all__ = [
     "schema_key",
     "selection",
     "status_key",
+    "taken_key",
     "to_global",
     "to_local",
     "type_hash",

@@ -143,6 +143,11 @@ def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
     return f"{prefix}/@service/{service}/status"
 
 
+def taken_key(key_expr: str) -> str:
+    """Return the key on which readers of a key, or of a key expression, answer when they have what came before."""
+    return f"{key_expr}/@taken"
+
+
 def get_topic(name: object) -> Topic:
     """Return a row of TOPICS; raise AddressError for a name that has none."""
     if not isinstance(name, str) or name not in TOPICS:

@@ -7,7 +7,7 @@ import json
 import logging
 import weakref
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final, Self
 
@@ -161,8 +161,8 @@ class Bus:
     ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
-        `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, and a stuck one
-        holds up all others for 5 s, until it is cut off.
+        `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, `close` until
+        they have all of it, and a stuck one holds up all others for 5 s, until it is cut off.
         `source` says where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
         """
         self._require_open()
@@ -179,14 +179,23 @@ class Bus:
         return [status for raw in answers if isinstance(status := _read_json(raw), dict)]
 
     def close(self) -> None:
-        """Close the bus, its subscriptions and its publishers; a second call does nothing."""
+        """Close the bus, its subscriptions and its publishers; a second call does nothing.
+
+        Publishers that lose nothing flush before.
+        """
+        if self._finalizer.alive:
+            with suppress(NedbusError):
+                self._outbox.flush(publisher for publisher in self._outbox.publishers if publisher.lossless)
         self._finalizer()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+    def __exit__(self, exc: object, *_: object) -> None:
+        if exc is None:
+            self.close()
+        else:
+            self._finalizer()
 
     def _require_open(self) -> None:
         if not self._finalizer.alive:

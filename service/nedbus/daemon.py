@@ -137,7 +137,7 @@ class Daemon:
             for thread in threads:
                 thread.start()
             self.ready.set()
-            self._wait()
+            self._wait(outbox)
         finally:
             self._stop.set()
             deadline = time.monotonic() + _GRACE
@@ -172,13 +172,15 @@ class Daemon:
                 told = True
         return None
 
-    def _wait(self) -> None:
-        """Wait for `stop`, or for the end of all finite sources and for their readers to have had a second look."""
+    def _wait(self, outbox: Outbox) -> None:
+        """Wait for `stop`, or for the end of all finite sources and for their readers to have all of it."""
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if _is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
+                    # A reader that missed the very last message learns it from a heartbeat.
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
+                    outbox.flush(outbox.publishers, stop=self._stop)
                     return
             self._changed.wait()
             self._changed.clear()

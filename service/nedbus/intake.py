@@ -168,6 +168,7 @@ class Intake:
         self._tracks: dict[str, _Track] = {}  # by publisher
         self._received = self._lost = self._dropped = self._invalid = 0
         self._told = 0  # of what was lost
+        self._full = False  # a pump waits for room
 
     @property
     def counts(self) -> Counts:
@@ -213,6 +214,7 @@ class Intake:
     def wait_for_room(self) -> None:
         """Wait until the reader has worked off enough for more to come, or nothing more can come."""
         with self._changed:
+            self._full = True
             self._changed.wait_for(lambda: len(self._queue) < _QUEUE or self.ended)
 
     def pop(self, read: Callable[..., VehicleLocalPosition] = decode) -> Sample | None:
@@ -221,8 +223,9 @@ class Intake:
         while True:
             if waiting:
                 raw = waiting.popleft()
-                if len(waiting) == _QUEUE // 2:
+                if self._full and len(waiting) <= _QUEUE // 2:
                     with self._changed:
+                        self._full = False
                         self._changed.notify_all()
                 sample = self.read(raw, read, follow=True)
             elif self._newest:

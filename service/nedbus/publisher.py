@@ -6,6 +6,7 @@ import json
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -29,10 +30,11 @@ from nedbus_msgs import (
     json_schema,
     layout_table,
     schema_key,
+    taken_key,
 )
 
-from .errors import AddressInUseError, ClosedError
-from .session import alive_keys, translate, while_open
+from .errors import AddressInUseError, ClosedError, NedbusError
+from .session import alive_keys, ask_all, translate, while_open
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import Records
@@ -41,6 +43,7 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
+_FLUSH: Final = 600.0  # s that readers have to take what was sent to them
 _FIELDS: Final = len(FIELD_TYPES)
 _JSON: Final = "application/json"
 
@@ -71,6 +74,7 @@ class Publisher:
         self.key = address.key(prefix=prefix)
         self.published = 0
         self.source = Origin(source).source
+        self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._session = session
         self._on_close = on_close
@@ -78,6 +82,7 @@ class Publisher:
         self._closed = False
         self._encoding = encoding_of(source)
         topic = get_topic(address.topic)
+        self._priority = getattr(zenoh.Priority, topic.priority)
         control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         # A heartbeat together with BLOCK and recovering readers can stall a saturated link for 5 s.
         misses = zenoh.ext.MissDetectionConfig(heartbeat=None if lossless else HEARTBEAT, sporadic_heartbeat=None)
@@ -88,7 +93,7 @@ class Publisher:
                 self.key,
                 encoding=self._encoding,
                 congestion_control=control,
-                priority=getattr(zenoh.Priority, topic.priority),
+                priority=self._priority,
                 cache=zenoh.ext.CacheConfig(topic.cache),
                 sample_miss_detection=misses,
                 publisher_detection=True,
@@ -157,11 +162,26 @@ class Publisher:
         self.last = payload, stamp, encoding
         self.published += 1
 
+    def flush(self, timeout: float = _FLUSH) -> bool:
+        """Wait until all readers of mode "every" have what was published; return False if one has not in time.
+
+        What is still on its way to a slow reader when a publisher's process ends is gone, and nobody knows of it.
+
+        Raises ClosedError once the bus is closed.
+        """
+        return ask_all(self._session, taken_key(self.key), timeout=timeout, priority=self._priority)
+
     def close(self) -> None:
-        """Stop publishing this address: it is no longer listed, and free for another publisher."""
+        """Stop publishing this address: it is no longer listed, and free for another publisher.
+
+        A publisher that loses nothing flushes before.
+        """
         if self._closed:
             return
         self._closed = True
+        if self.lossless:
+            with suppress(NedbusError):
+                self.flush()
         self._on_close()
         with suppress(zenoh.ZError):  # closed already with the session
             self._publisher.undeclare()
@@ -259,6 +279,19 @@ class Outbox:
         callback = zenoh.handlers.Callback(hand_over, indirect=False)
         with while_open(self._session):
             self._queryables.append(self._session.declare_queryable(key_expr, callback))
+
+    def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
+        """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
+        end = time.monotonic() + _FLUSH
+        for publisher in publishers:
+            told = False
+            while not publisher.flush(0.5):
+                if (stop and stop.is_set()) or time.monotonic() > end:
+                    _log.warning("%s: not all of it was read", publisher.address)
+                    return
+                if not told:
+                    _log.info("%s: waiting for a slow reader", publisher.address)
+                told = True
 
     def close(self) -> None:
         """Stop answering; the publishers end with the session."""

@@ -180,6 +180,13 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
         return sorted({str(reply.ok.key_expr) for reply in islice(replies, _ANSWERS) if reply.ok is not None})
 
 
+def ask_all(session: Session, key: str, *, timeout: float, priority: zenoh.Priority) -> bool:
+    """Return whether all who answer on a key did so within `timeout` seconds; also when there is nobody."""
+    with while_open(session):
+        replies = session.get(key, target=zenoh.QueryTarget.ALL, timeout=_in_range(timeout), priority=priority)
+        return all(reply.ok is not None for reply in replies)
+
+
 def receive(handler: zenoh.Handler[_T]) -> list[_T]:
     """Wait for something, and return all that is there, up to 4096; empty once the subscriber is undeclared."""
     batch: list[_T] = []

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 import zenoh
 
-from nedbus_msgs import decode_row
+from nedbus_msgs import decode_row, taken_key
 
 from .errors import ClosedError, NoDataError
 from .intake import Counts, Intake, Sample
@@ -32,6 +32,8 @@ _FIFO: Final = 4096  # samples that wait for the pump of an `every` reader; then
 _BUSY: Final = 8  # samples at once from which on a pump waits a little, to be woken once for many
 _PAUSE: Final = 0.002  # s
 _TURNS: Final = 64  # samples after which an asyncio reader gives way to others
+# A query that nobody keeps is answered.
+_ANSWER: Final[zenoh.handlers.Callback[zenoh.Query]] = zenoh.handlers.Callback(lambda _: None, indirect=False)
 _T = TypeVar("_T")
 
 
@@ -39,7 +41,7 @@ class Feed:
     """The Zenoh side of one subscription: a channel, the listener for losses, and the thread that empties it.
 
     An `every` subscription has a session of its own: its channel holds back when it is full, and so would everything
-    else on that session. The feed closes it.
+    else on that session. The feed closes it. It answers publishers that want to know whether it has all they sent.
     """
 
     def __init__(self, session: zenoh.Session, key_expr: str, intake: Intake) -> None:
@@ -57,6 +59,8 @@ class Feed:
             self._subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, key_expr, channel, history=history, recovery=recovery
             )
+            # Zenoh answers a question in its turn: when all that came before it found room here.
+            self._taken = session.declare_queryable(taken_key(key_expr), _ANSWER) if every else None
             self._misses = self._subscriber.sample_miss_listener(zenoh.handlers.Callback(intake.miss, indirect=False))
         # The handler is asked, never the subscriber: a receive on that one would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler

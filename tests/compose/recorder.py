@@ -18,11 +18,14 @@ class Recorder:
     def __init__(self, subscription: nedbus.Subscription) -> None:
         self.subscription = subscription
         self.samples: list[nedbus.Sample] = []
+        self.unseen = 0  # messages that may have been superseded before the first one that was read
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
     def _run(self) -> None:
         for sample in self.subscription:
+            if not self.samples:
+                self.unseen = self.subscription.counts.dropped
             self.samples.append(sample)
 
     def wait_for_more(self, count: int, *, seconds: float = DEADLINE) -> float:

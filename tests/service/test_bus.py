@@ -19,17 +19,10 @@ import zenoh
 import nedbus
 from nedbus.session import Session
 from nedbus_msgs import TOPICS, Address, encode
-from tests.conftest import DEADLINE, Client, Mode, free_endpoint, message, wait_for
+from tests.conftest import DEADLINE, Client, Mode, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
 BOTH: list[Mode] = ["latest", "every"]
-
-
-def wait_for_reader(raw: Session, key: str) -> None:
-    """Wait until a subscriber of this key is known to the publisher's side."""
-    probe = raw.declare_publisher(key)
-    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
-    probe.undeclare()
 
 
 @pytest.mark.parametrize("mode", BOTH)
@@ -116,7 +109,7 @@ def test_subscription_is_a_choice(client: Client, bus: nedbus.Bus) -> None:
         for topic in TOPICS.values():
             for instance in (0, 1) if topic.instances else (None,):
                 bus.publisher(topic.name, vehicle=vehicle, instance=instance).publish(message(1))
-    assert len(client.latest()) == 10
+    wait_for(lambda: len(client.latest()) == 10, what="everything")
     assert {sample.vehicle for sample in client.latest(VLP)} == {"1", "2"}
     assert [str(sample.address) for sample in client.latest("estimator_local_position", vehicle="2")] == [
         "2/estimator_local_position/0",
@@ -388,6 +381,7 @@ def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
                 await asyncio.sleep(0)
 
         async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            await asyncio.to_thread(wait_for_reader, bus._session, publisher.key)
             for timestamp in range(1, 1001):
                 publisher.publish(message(timestamp))
             counter = asyncio.create_task(count_turns())

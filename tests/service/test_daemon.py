@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -150,6 +151,21 @@ def test_replay_at_full_speed_loses_nothing_to_a_slow_reader(tmp_path: Path, run
             sample = subscription.receive(DEADLINE)
             assert (sample.message.x, sample.lost) == (number, 0)
     assert service.wait() == 0
+
+
+def test_service_stays_until_all_is_read(tmp_path: Path, run_nedbus: Start) -> None:
+    """What is on its way to a reader that pauses would be gone with the service: that one waits to end."""
+    total = 10_000
+    path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
+    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        wait_for(lambda: "waiting for a slow reader" in service.err, what="the end of the log")
+        with pytest.raises(subprocess.TimeoutExpired):
+            service.popen.wait(3.0)  # twice as long as two sides are silent at most
+        assert [subscription.receive(DEADLINE).message.x for _ in range(total)] == list(range(total))
+        assert service.wait() == 0
+        assert subscription.counts == nedbus.Counts(received=total)
 
 
 def test_replay_keeps_its_order_and_speed(tmp_path: Path, run_nedbus: Start) -> None:

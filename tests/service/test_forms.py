@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Iterator
 
 import msgpack
@@ -15,7 +16,7 @@ from nedbus.batches import Batch
 from nedbus.session import Session
 from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
 from nedbus_msgs.arrays import DTYPE, to_message, to_records
-from tests.conftest import DEADLINE, message
+from tests.conftest import DEADLINE, message, wait_for_reader
 
 VLP = "vehicle_local_position"
 COUNT = 5000
@@ -42,6 +43,7 @@ def test_rows_are_the_messages(bus: nedbus.Bus, endpoint: str) -> None:
     """Sent as rows, read as rows: named tuples with the same values, in order, none lost."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        wait_for_reader(bus._session, publisher.key)
         sent = [message(number, x=number / 3, xy_valid=True, y=0.0) for number in range(1, COUNT)]
         for each in sent:
             publisher.publish_row(tuple(each.__dict__.values()))
@@ -57,7 +59,9 @@ def test_batches_hold_everything(bus: nedbus.Bus, endpoint: str) -> None:
     records = to_records([message(number, x=number / 3) for number in range(1, COUNT)])
     with nedbus.connect(endpoint) as other, other.subscribe(mode="every") as subscription:
         for vehicle in ("1", "2"):
-            bus.publisher(VLP, vehicle=vehicle, lossless=True).publish_many(records)
+            publisher = bus.publisher(VLP, vehicle=vehicle, lossless=True)
+            wait_for_reader(bus._session, publisher.key)
+            publisher.publish_many(records)
         batches = take_batches(subscription.batches(), 2 * len(records))
         for vehicle in ("1", "2"):
             own = np.concatenate([batch.of(Address(vehicle, VLP)) for batch in batches])
@@ -72,6 +76,32 @@ def test_batches_hold_everything(bus: nedbus.Bus, endpoint: str) -> None:
         assert sum(batch.lost for batch in batches) == 0
 
 
+def test_flush_waits_until_readers_have_it(bus: nedbus.Bus, endpoint: str) -> None:
+    """A reader that does not read is waited for, and so it is when a lossless publisher or its bus is closed."""
+    count = 8000
+    records = to_records([message(number) for number in range(1, count + 1)])
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+    assert publisher.flush(), "nobody reads"
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        publisher.publish_many(records[:1])
+        assert subscription.receive(DEADLINE).message.timestamp == 1
+        assert publisher.flush()
+        publisher.publish_many(records)
+        assert not publisher.flush(0.2)
+        closed = threading.Thread(target=publisher.close)
+        closed.start()
+        assert [subscription.receive(DEADLINE).message.timestamp for _ in records] == list(range(1, count + 1))
+        closed.join(DEADLINE)
+        assert not closed.is_alive()
+        bus.publisher(VLP, vehicle="2", lossless=True).publish_many(records)
+        closed = threading.Thread(target=bus.close)
+        closed.start()
+        assert [subscription.receive(DEADLINE).message.timestamp for _ in records] == list(range(1, count + 1))
+        closed.join(DEADLINE)
+        assert not closed.is_alive()
+        assert subscription.counts == nedbus.Counts(received=2 * count + 1)
+
+
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
 def test_odd_ones_go_the_slow_way(bus: nedbus.Bus, raw: Session, endpoint: str, filler: int) -> None:
     """Among others: another encoder's, an older layout's, invalid ones and wrong keys, with the same end as singly."""
@@ -84,6 +114,7 @@ def test_odd_ones_go_the_slow_way(bus: nedbus.Bus, raw: Session, endpoint: str, 
     bad = bytearray(encode(good))
     bad[4 + 9] = 0xC0  # a tag
     with nedbus.connect(endpoint) as other, other.subscribe(mode="every") as subscription:
+        wait_for_reader(raw, key)
         for payload in (*payloads, bytes(bad), b"", encode(good) + b"\0", *payloads):
             raw.put(key, payload)
         raw.put(f"nedbus/*/{VLP}", encode(good))
@@ -103,6 +134,7 @@ def test_batches_then_singles(bus: nedbus.Bus, endpoint: str) -> None:
     """A reader may change from batches to single samples: nothing counts as lost for that."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        wait_for_reader(bus._session, publisher.key)
         for start in (1, 101, 201):
             for number in range(start, start + 100):
                 publisher.publish(message(number))
@@ -154,6 +186,7 @@ def test_async_rows_and_batches(bus: nedbus.Bus, endpoint: str) -> None:
 
     async def read() -> tuple[list[int], int]:
         async with nedbus.connect_async(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            await asyncio.to_thread(wait_for_reader, bus._session, publisher.key)
             publisher.publish_many(to_records([message(number) for number in range(1, 301)]))
             stamps = []
             async for sample in subscription.rows():

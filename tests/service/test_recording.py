@@ -34,7 +34,7 @@ from nedbus_msgs import (
     upgrade,
 )
 from nedbus_msgs.arrays import to_records
-from tests.conftest import DEADLINE, LOGS, Start, message, wait_for
+from tests.conftest import DEADLINE, LOGS, Start, message, wait_for, wait_for_reader
 from tests.replays import open_replay
 
 VLP = "vehicle_local_position"
@@ -89,6 +89,8 @@ def test_flight_comes_back_to_the_bit(run_nedbus: Start, endpoint: str, bus: ned
     recorder = Recorder(bus.subscribe(mode="every"), path)
     thread = threading.Thread(target=recorder.run, args=(stop,))
     thread.start()
+    for publisher in publishers.values():
+        wait_for_reader(bus._session, publisher.key)
     sent: dict[str, list[bytes]] = {}
     for record in flight:
         each = upgrade({name: value for name, value in record.fields.items() if name != "tilt_var"})

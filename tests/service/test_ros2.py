@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import cast
 
 import pytest
 import zenoh
@@ -16,7 +15,7 @@ import nedbus
 from nedbus.rmw_zenoh import Attachment, TopicKey, publisher_token
 from nedbus.session import Session
 from nedbus_msgs import LAYOUTS, ROS2_TYPE, VehicleLocalPosition, dds_type, downgrade, type_hash, upgrade
-from tests.conftest import DEADLINE, Process, Start, message, wait_for
+from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
 from tests.replays import open_replay
 
 VLP = "vehicle_local_position"
@@ -54,12 +53,6 @@ def peer(start: Start, endpoint: str, tmp_path: Path) -> Peer:
 def as_json(fields: dict[str, object]) -> str:
     """Return fields so that NaN equals NaN, and pairs are lists."""
     return json.dumps(fields, sort_keys=True)
-
-
-def wait_for_reader(raw: Session, key: str) -> None:
-    probe = raw.declare_publisher(key)
-    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
-    probe.undeclare()
 
 
 @pytest.mark.parametrize("layout", ["1.14", "1.16"])

@@ -76,6 +76,21 @@ def test_vehicle_is_read_whole(join: Join) -> None:
         assert [subscription.receive(DEADLINE).message.timestamp for _ in range(2, 500)] == list(range(2, 500))
 
 
+def test_vehicle_learns_what_was_read(join: Join) -> None:
+    """A reader may say that it has everything, and the vehicle may ask."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    with join("reader").subscribe(mode="every") as subscription:
+        assert subscription.receive(DEADLINE).message.timestamp == 1
+        count = 8000
+        for timestamp in range(2, count):
+            publisher.publish(message(timestamp))
+        assert not publisher.flush(0.2)
+        while subscription.receive(DEADLINE).message.timestamp < count - 1:
+            pass
+        assert publisher.flush()
+
+
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])
 def test_nobody_else_writes_a_vehicles_keys(join: Join, intruder: str) -> None:
     """What an intruder publishes as vehicle 1 reaches nobody: no data, no liveliness, no last value."""
