@@ -183,7 +183,13 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 def ask_all(session: Session, key: str, *, timeout: float, priority: zenoh.Priority) -> bool:
     """Return whether all who answer on a key did so within `timeout` seconds; also when there is nobody."""
     with while_open(session):
-        replies = session.get(key, target=zenoh.QueryTarget.ALL, timeout=_in_range(timeout), priority=priority)
+        replies = session.get(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            timeout=_in_range(timeout),
+            priority=priority,
+            congestion_control=zenoh.CongestionControl.DROP,  # a question that waits for room could cut a link
+        )
         return all(reply.ok is not None for reply in replies)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import signal
-import subprocess
 import time
 from pathlib import Path
 
@@ -141,31 +140,21 @@ def test_plain_zenoh_and_msgpack_see_every_sample(start: Start, run_nedbus: Star
 
 
 def test_replay_at_full_speed_loses_nothing_to_a_slow_reader(tmp_path: Path, run_nedbus: Start) -> None:
-    """speed=max waits for whoever reads: a reader slower than the replay still gets every message."""
+    """speed=max waits for whoever reads, and the service stays until a slow reader has all of it."""
     total = 30_000
     path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
     endpoint = free_endpoint()
     service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
     with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
+        stayed = 0
         for number in range(total):
+            if number % 100 == 0:
+                time.sleep(0.01)  # what makes it slow
+                stayed = number if service.popen.poll() is None else stayed
             sample = subscription.receive(DEADLINE)
             assert (sample.message.x, sample.lost) == (number, 0)
+    assert stayed > total - 10_000, "only what the reader's process holds may be unread when the service ends"
     assert service.wait() == 0
-
-
-def test_service_stays_until_all_is_read(tmp_path: Path, run_nedbus: Start) -> None:
-    """What is on its way to a reader that pauses would be gone with the service: that one waits to end."""
-    total = 10_000
-    path = write_log(tmp_path / "a.ulg", range(0, 1000 * total, 1000))
-    endpoint = free_endpoint()
-    service = run_nedbus("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
-    with until_connected(endpoint) as bus, bus.subscribe(VLP, mode="every") as subscription:
-        wait_for(lambda: "waiting for a slow reader" in service.err, what="the end of the log")
-        with pytest.raises(subprocess.TimeoutExpired):
-            service.popen.wait(3.0)  # twice as long as two sides are silent at most
-        assert [subscription.receive(DEADLINE).message.x for _ in range(total)] == list(range(total))
-        assert service.wait() == 0
-        assert subscription.counts == nedbus.Counts(received=total)
 
 
 def test_replay_keeps_its_order_and_speed(tmp_path: Path, run_nedbus: Start) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import msgpack
 import numpy as np
@@ -76,30 +76,28 @@ def test_batches_hold_everything(bus: nedbus.Bus, endpoint: str) -> None:
         assert sum(batch.lost for batch in batches) == 0
 
 
-def test_flush_waits_until_readers_have_it(bus: nedbus.Bus, endpoint: str) -> None:
-    """A reader that does not read is waited for, and so it is when a lossless publisher or its bus is closed."""
-    count = 8000
+def test_closing_waits_until_readers_have_it(bus: nedbus.Bus, endpoint: str) -> None:
+    """A lossless publisher is closed, alone or with its bus, once a reader that pauses has everything."""
+    count = 10_000  # more than a reader's process holds
     records = to_records([message(number) for number in range(1, count + 1)])
-    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
-    assert publisher.flush(), "nobody reads"
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
-        publisher.publish_many(records[:1])
-        assert subscription.receive(DEADLINE).message.timestamp == 1
-        assert publisher.flush()
+    publishers = [bus.publisher(VLP, vehicle=vehicle, lossless=True) for vehicle in "ab"]
+    assert all(publisher.flush() for publisher in publishers), "nobody reads"
+
+    def send(publisher: nedbus.Publisher, close: Callable[[], None]) -> None:
         publisher.publish_many(records)
-        assert not publisher.flush(0.2)
-        closed = threading.Thread(target=publisher.close)
-        closed.start()
-        assert [subscription.receive(DEADLINE).message.timestamp for _ in records] == list(range(1, count + 1))
-        closed.join(DEADLINE)
-        assert not closed.is_alive()
-        bus.publisher(VLP, vehicle="2", lossless=True).publish_many(records)
-        closed = threading.Thread(target=bus.close)
-        closed.start()
-        assert [subscription.receive(DEADLINE).message.timestamp for _ in records] == list(range(1, count + 1))
-        closed.join(DEADLINE)
-        assert not closed.is_alive()
-        assert subscription.counts == nedbus.Counts(received=2 * count + 1)
+        close()
+
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        for publisher, close in zip(publishers, (publishers[0].close, bus.close), strict=True):
+            wait_for_reader(bus._session, publisher.key)
+            sending = threading.Thread(target=send, args=(publisher, close))
+            sending.start()
+            sending.join(0.5)
+            assert sending.is_alive()
+            assert [subscription.receive(DEADLINE).message.timestamp for _ in records] == list(range(1, count + 1))
+            sending.join(DEADLINE)
+            assert not sending.is_alive()
+        assert subscription.counts == nedbus.Counts(received=2 * count)
 
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])

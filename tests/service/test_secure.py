@@ -82,7 +82,7 @@ def test_vehicle_learns_what_was_read(join: Join) -> None:
     publisher.publish(message(1))
     with join("reader").subscribe(mode="every") as subscription:
         assert subscription.receive(DEADLINE).message.timestamp == 1
-        count = 8000
+        count = 12_000  # more than a reader's process holds
         for timestamp in range(2, count):
             publisher.publish(message(timestamp))
         assert not publisher.flush(0.2)
