@@ -13,10 +13,10 @@ from pydantic import ValidationError
 
 import nedbus
 from nedbus.batches import Batch
-from nedbus.session import Session
-from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
+from nedbus.session import Session, open_router
+from nedbus_msgs import LAYOUTS, TOPICS, Address, Row, VehicleLocalPosition, downgrade, encode
 from nedbus_msgs.arrays import DTYPE, to_message, to_records
-from tests.conftest import DEADLINE, message, wait_for_reader
+from tests.conftest import DEADLINE, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
 COUNT = 5000
@@ -98,6 +98,31 @@ def test_closing_waits_until_readers_have_it(bus: nedbus.Bus, endpoint: str) -> 
             sending.join(DEADLINE)
             assert not sending.is_alive()
         assert subscription.counts == nedbus.Counts(received=2 * count)
+
+
+def test_flush_repairs_what_went_nowhere() -> None:
+    """What a lossless publisher sent while its router was away: flush brings what is kept, and the rest is counted."""
+    endpoint, count = free_endpoint(), 3000
+    router = open_router(listen=(endpoint,))
+    with nedbus.connect(endpoint) as bus, nedbus.connect(endpoint) as other:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        publisher.publish(message(1))
+        with other.subscribe(VLP, mode="every") as subscription:
+            assert subscription.receive(DEADLINE).message.timestamp == 1
+            router.close()
+            wait_for(lambda: not bus.connected and not other.connected, what="the loss of the link")
+            publisher.publish_many(to_records([message(number) for number in range(2, count + 1)]))
+            router = open_router(listen=(endpoint,))
+            for key in (publisher.key, f"{publisher.key}/@adv/pub/a/1/_"):  # the messages, and the heartbeats
+                wait_for_reader(bus._session, key)
+            assert publisher.flush()
+            first = subscription.receive(DEADLINE)
+            kept = TOPICS[VLP].cache
+            assert (first.message.timestamp, first.lost) == (count - kept + 1, count - kept - 1)
+            rest = [subscription.receive(DEADLINE).message.timestamp for _ in range(kept - 1)]
+            assert rest == list(range(count - kept + 2, count + 1))
+            assert subscription.counts == nedbus.Counts(received=1 + kept, lost=count - kept - 1)
+    router.close()
 
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
