@@ -21,6 +21,7 @@ import subprocess
 import sys
 import time
 import venv
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -161,10 +162,11 @@ def answer(end: subprocess.Popen[str]) -> str:
 
 
 def tell(end: subprocess.Popen[str]) -> None:
-    """Let a process go on."""
+    """Let a process go on; one that has ended has said all."""
     assert end.stdin is not None
-    end.stdin.write("\n")
-    end.stdin.flush()
+    with suppress(BrokenPipeError):
+        end.stdin.write("\n")
+        end.stdin.flush()
 
 
 def title(name: str) -> str:
