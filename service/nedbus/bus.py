@@ -181,7 +181,7 @@ class Bus:
     def close(self) -> None:
         """Close the bus, its subscriptions and its publishers; a second call does nothing.
 
-        Publishers that lose nothing flush before.
+        Publishers that lose nothing flush before; not so where a `with` block ends by an exception.
         """
         if self._finalizer.alive:
             with suppress(NedbusError):
@@ -292,7 +292,8 @@ class AsyncBus:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        await self.close()
+        if self._bus is not None:
+            await asyncio.to_thread(self._bus.__exit__, *exc)
 
     def _opened(self) -> Bus:
         if self._bus is None:

@@ -214,8 +214,9 @@ class Intake:
     def wait_for_room(self) -> None:
         """Wait until the reader has worked off enough for more to come, or nothing more can come."""
         with self._changed:
-            self._full = True
+            self._full = True  # before the look at the queue, as readers take without the lock
             self._changed.wait_for(lambda: len(self._queue) < _QUEUE or self.ended)
+            self._full = False
 
     def pop(self, read: Callable[..., VehicleLocalPosition] = decode) -> Sample | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""

@@ -44,6 +44,7 @@ _log = logging.getLogger(__name__)
 _QUESTIONS: Final = 1000  # queries that wait for an answer
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
 _FLUSH: Final = 600.0  # s that readers have to take what was sent to them
+_PATIENCE: Final = 2.0  # s until they are asked again; three round trips over a radio link fit in
 _FIELDS: Final = len(FIELD_TYPES)
 _JSON: Final = "application/json"
 
@@ -303,7 +304,7 @@ class Outbox:
         end = time.monotonic() + _FLUSH
         for publisher in publishers:
             told = False
-            while not publisher.flush(0.5):
+            while not publisher.flush(_PATIENCE):
                 if (stop and stop.is_set()) or time.monotonic() > end:
                     _log.warning("%s: not all of it was read", publisher.address)
                     return

@@ -19,6 +19,7 @@ from nedbus_msgs import (
     schema_key,
     selection,
     status_key,
+    taken_key,
 )
 
 CHUNK = st.text("ABCXYZabcxyz0189_-", min_size=1, max_size=64)
@@ -52,6 +53,7 @@ def test_keys_are_as_documented() -> None:
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
     assert schema_key() == "nedbus/@schema/VehicleLocalPosition"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
+    assert taken_key(selection("vehicle_local_position")) == "nedbus/*/vehicle_local_position/@taken"
 
 
 @given(addresses(), PREFIXES)
@@ -79,12 +81,15 @@ def test_selection_matches_its_addresses_only(address: Address, prefix: str) -> 
     key = address.key(prefix=prefix)
     for topic in ("*", address.topic):
         for vehicle in ("*", address.vehicle):
-            assert zenoh.KeyExpr(selection(topic, vehicle=vehicle, prefix=prefix)).includes(key)
+            chosen = selection(topic, vehicle=vehicle, prefix=prefix)
+            assert zenoh.KeyExpr(chosen).includes(key)
+            assert zenoh.KeyExpr(taken_key(chosen)).includes(taken_key(key))
     other = zenoh.KeyExpr(selection(address.topic, vehicle=f"{address.vehicle[:-1]}~"[:-1] + "Q", prefix=prefix))
     assert address.vehicle.endswith("Q") or not other.intersects(key)
     assert zenoh.KeyExpr(alive_selection(prefix=prefix)).includes(address.alive_key(prefix=prefix))
     assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(address.alive_key(prefix=prefix))
     assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(address.rejected_key(prefix=prefix))
+    assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(taken_key(key))
 
 
 def test_selection_of_an_instance() -> None:

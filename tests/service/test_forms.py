@@ -15,7 +15,7 @@ import nedbus
 from nedbus.batches import Batch
 from nedbus.session import Session, open_router
 from nedbus_msgs import LAYOUTS, TOPICS, Address, Row, VehicleLocalPosition, downgrade, encode
-from nedbus_msgs.arrays import DTYPE, to_message, to_records
+from nedbus_msgs.arrays import DTYPE, Records, to_message, to_records
 from tests.conftest import DEADLINE, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
@@ -98,6 +98,33 @@ def test_closing_waits_until_readers_have_it(bus: nedbus.Bus, endpoint: str) -> 
             sending.join(DEADLINE)
             assert not sending.is_alive()
         assert subscription.counts == nedbus.Counts(received=2 * count)
+
+
+def fail_in_order(endpoint: str, records: Records) -> None:
+    with nedbus.connect(endpoint) as bus:
+        publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+        wait_for_reader(bus._session, publisher.key)
+        publisher.publish_many(records)
+        raise KeyError
+
+
+def fail_in_asyncio(endpoint: str, records: Records) -> None:
+    async def fail() -> None:
+        async with nedbus.connect_async(endpoint) as bus:
+            publisher = await bus.publisher(VLP, vehicle="1", lossless=True)
+            await asyncio.to_thread(wait_for_reader, bus._opened()._session, publisher.key)
+            await asyncio.to_thread(publisher.publish_many, records)
+            raise KeyError
+
+    asyncio.run(fail())
+
+
+@pytest.mark.parametrize("fail", [fail_in_order, fail_in_asyncio])
+def test_exception_does_not_wait_for_readers(endpoint: str, fail: Callable[[str, Records], None]) -> None:
+    """A script that fails ends at once, from either client, whoever has not read yet."""
+    records = to_records([message(number) for number in range(1, 10_001)])  # more than a reader's process holds
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every"), pytest.raises(KeyError):
+        fail(endpoint, records)
 
 
 def test_flush_repairs_what_went_nowhere() -> None:
