@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: run check test compose-test wheel bench clean
+.PHONY: run check quick test compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight; then it says what to type in a second terminal
 	$(BIN)/nedbus serve --source sim:
@@ -14,6 +14,9 @@ check: $(READY)  ## lint and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+quick: $(READY)  ## the tests that start no process: under a minute
+	$(BIN)/pytest -q -m "not process and not compose"
 
 test: check  ## lint, types, and the tests that need no containers, with branch coverage
 	$(BIN)/coverage erase

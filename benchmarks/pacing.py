@@ -1,6 +1,6 @@
-"""How exactly a replay at speed=1 keeps the pace of its log.
+"""Measure how exactly a replay at speed=1 keeps the pace of its log.
 
-A log of 20 s at 100 Hz is replayed by a service in another process; times are those that the publisher stamps.
+A log of 20 s at 100 Hz is replayed by a service in another process; times are the publisher's timestamps.
 The bar: 99 % of the errors below 5 ms on an idle machine.
 """
 

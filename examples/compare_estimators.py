@@ -5,7 +5,7 @@ import math
 import nedbus
 
 truth: nedbus.VehicleLocalPosition | None = None
-with nedbus.connect() as bus, bus.subscribe(vehicle="1", mode="every") as subscription:
+with nedbus.connect() as bus, bus.subscribe("*", vehicle="1", mode="every") as subscription:
     for sample in subscription:
         message = sample.message
         if sample.topic == "vehicle_local_position_groundtruth":

@@ -4,15 +4,15 @@ import time
 
 import nedbus
 
-with nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
+with nedbus.connect() as bus, bus.subscribe("*", mode="every") as subscription:
     monitor = nedbus.Monitor()
-    told = time.monotonic()
+    shown = time.monotonic()
     for sample in subscription:
         monitor.add(sample)
-        if time.monotonic() - told < 2.0:
+        if time.monotonic() - shown < 2.0:
             continue
-        told = time.monotonic()
-        for address, health in monitor.tell().items():
+        shown = time.monotonic()
+        for address, health in monitor.snapshot().items():
             flags = health.flags or {}
             print(
                 f"{address}: {health.rate or 0.0:.1f} of {health.nominal:g} Hz, {health.lost} lost, {health.gaps} gaps,"

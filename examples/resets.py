@@ -1,15 +1,14 @@
-"""Draw a flight twice: as its estimator told it, with all resets, and as the vehicle moved."""
+"""Plot a flight twice: as its estimator reported it, with all resets, and as a track without jumps."""
 
 import sys
 
 import matplotlib.pyplot as plt
 
 import nedbus
-from nedbus_msgs.arrays import to_message
 
 flight, picture = sys.argv[1:]
 tracker = nedbus.ResetTracker()
-messages = [to_message(record) for record in nedbus.read(flight)]
+messages = [nedbus.to_message(element) for element in nedbus.read(flight)]
 tracks = [tracker.add(message) for message in messages]
 
 figure, axes = plt.subplots(figsize=(8, 6), layout="constrained")
@@ -19,6 +18,6 @@ for message, track in zip(messages, tracks, strict=True):
     if "xy" in track.reset:
         axes.plot(message.y, message.x, "rx")
         print(f"{message.timestamp / 1e6:.2f} s: xy reset by {message.delta_xy[0]:.2f}, {message.delta_xy[1]:.2f} m")
-axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", title="crosses: where a reset of xy ended")
+axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", title="crosses: the position after a reset of xy")
 axes.legend()
 figure.savefig(picture)

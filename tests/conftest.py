@@ -1,4 +1,4 @@
-"""Fixtures: a real router for each test, both clients behind one face, processes with a deadline."""
+"""Fixtures: a real router for each test, both clients behind one interface, processes with a deadline."""
 
 from __future__ import annotations
 
@@ -9,26 +9,52 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Protocol, Self, cast
 
 import pytest
 import zenoh
 
 import nedbus
-from nedbus.session import Session, open_router
-from nedbus_msgs import Address, VehicleLocalPosition
+from nedbus import Mode
+from nedbus.transport import Session, open_router
+from nedbus_msgs import DEFAULT_TOPIC, Address, VehicleLocalPosition
 
 DEADLINE = 30.0  # s that a test waits for a condition before it fails
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
-
-Mode = Literal["latest", "every"]
 
 
 def pytest_configure() -> None:
     """Make Ctrl-C work: a shell's background job ignores it, and so would every process that the tests start."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that start processes, so that `make quick` can leave them out."""
+    for item in items:
+        if "start" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.process)
+
+
+_may_start = True
+
+
+def _watch_processes(event: str, _: object) -> None:
+    if event == "subprocess.Popen" and not _may_start:
+        raise AssertionError("this test starts a process: mark it with pytest.mark.process")
+
+
+sys.addaudithook(_watch_processes)
+
+
+@pytest.fixture(autouse=True)
+def _no_unmarked_process(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hold that the marks are true."""
+    global _may_start  # noqa: PLW0603 - an audit hook can neither be removed nor be given anything
+    _may_start = any(request.node.get_closest_marker(name) for name in ("process", "compose"))
+    yield
+    _may_start = True
 
 
 def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEADLINE) -> None:
@@ -80,17 +106,31 @@ class SubscriptionFace(Protocol):
     def close(self) -> None: ...
 
 
+class PublisherFace(Protocol):
+    """What a publisher of either client can do, as a test sees it."""
+
+    @property
+    def published(self) -> int: ...
+    def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None: ...
+    def flush(self, timeout: float = 600.0) -> bool: ...
+    def close(self) -> None: ...
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *exc: object) -> None: ...
+
+
 class Client(Protocol):
     """What a bus of either client can do, as a test sees it."""
 
     @property
     def connected(self) -> bool: ...
     def subscribe(
-        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
     ) -> SubscriptionFace: ...
-    def latest(self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None) -> list[nedbus.Sample]: ...
+    def latest(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None
+    ) -> list[nedbus.Sample]: ...
     def vehicles(self) -> dict[str, list[Address]]: ...
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> nedbus.Publisher: ...
+    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> PublisherFace: ...
     def services(self) -> list[dict[str, object]]: ...
     def close(self) -> None: ...
 
@@ -133,7 +173,7 @@ class SyncClient:
         return self._bus.connected
 
     def subscribe(
-        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
     ) -> SubscriptionFace:
         return SyncSubscription(self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode))
 
@@ -168,6 +208,34 @@ class BlockingSubscription:
         self._run(self._subscription.close())
 
 
+class BlockingPublisher:
+    """An AsyncPublisher, driven from a test."""
+
+    def __init__(self, runner: asyncio.Runner, publisher: nedbus.AsyncPublisher) -> None:
+        self._run = runner.run
+        self._publisher = publisher
+
+    @property
+    def published(self) -> int:
+        return self._publisher.published
+
+    def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
+        self._run(self._publisher.publish(message))
+
+    def flush(self, timeout: float = 600.0) -> bool:
+        return self._run(self._publisher.flush(timeout))
+
+    def close(self) -> None:
+        self._run(self._publisher.close())
+
+    def __enter__(self) -> Self:
+        self._run(self._publisher.__aenter__())
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._run(self._publisher.__aexit__(*exc))
+
+
 class BlockingClient:
     """The AsyncBus, driven from a test."""
 
@@ -182,21 +250,24 @@ class BlockingClient:
         return self._bus.connected
 
     def subscribe(
-        self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
     ) -> SubscriptionFace:
         async def subscribe() -> nedbus.AsyncSubscription:
             return self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode)
 
         return BlockingSubscription(self._runner, self._run(subscribe()))
 
-    def latest(self, topic: str = "*", *, vehicle: str = "*", instance: int | None = None) -> list[nedbus.Sample]:
+    def latest(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None
+    ) -> list[nedbus.Sample]:
         return self._run(self._bus.latest(topic, vehicle=vehicle, instance=instance))
 
     def vehicles(self) -> dict[str, list[Address]]:
         return self._run(self._bus.vehicles())
 
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> nedbus.Publisher:
-        return self._run(self._bus.publisher(topic, vehicle=vehicle, instance=instance))
+    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> PublisherFace:
+        publisher = self._run(self._bus.publisher(topic, vehicle=vehicle, instance=instance))
+        return BlockingPublisher(self._runner, publisher)
 
     def services(self) -> list[dict[str, object]]:
         return self._run(self._bus.services())

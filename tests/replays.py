@@ -1,12 +1,21 @@
-"""Replays, opened without a service."""
+"""Open replays without a service, and convert them to recordings."""
 
 from __future__ import annotations
 
-from nedbus.sources import Flight, Live, parse_source
+from pathlib import Path
+
+from nedbus.recording import convert
+from nedbus.sources import LiveSource, ReplayRun, parse_source
 
 
-def open_replay(text: str) -> Flight:
-    """Return the flight of a source that is a replay."""
+def open_replay(text: str) -> ReplayRun:
+    """Return one run of a source that is a replay."""
     source = parse_source(text).open_source(vehicle="1")
-    assert not isinstance(source, Live)
+    assert not isinstance(source, LiveSource)
     return source.open()
+
+
+def convert_replay(text: str, path: Path) -> str:
+    """Write one run of a source to a recording, as `nedbus convert` does; return its summary."""
+    pairs = ((message.address, message.fields) for message in open_replay(text).messages)
+    return convert(pairs, path, source=text.partition(":")[0], on_progress=lambda _: None)

@@ -1,19 +1,21 @@
-"""The examples, as they stand, against a service with a simulated flight."""
+"""The examples, unchanged, against a service with a simulated vehicle."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import nedbus
-from nedbus.recorder import convert
+from nedbus_msgs import ANY
 from tests.conftest import Process, Start, wait_for
-from tests.replays import open_replay
+from tests.replays import convert_replay
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-SAYS = {
-    "position.py": "1 external_ins_local_position ",
+PRINTS = {
+    "position.py": " m up",
     "position_async.py": "Counts(received=",
     "fleet.py": "vehicle 1: 5 streams",
     "compare_estimators.py": "estimator 1: ",
@@ -24,31 +26,33 @@ SAYS = {
 
 
 @pytest.fixture
-def flying(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> str:
+def simulated(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> str:
     """Run a service with a simulated vehicle on the test's router."""
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: len(bus.latest()) == 5, what="five streams")
+    wait_for(lambda: len(bus.latest(ANY)) == 5, what="five streams")
     return endpoint
 
 
-def run_example(start: Start, name: str, endpoint: str, where: Path) -> Process:
-    """Run an example; one that names the default endpoint is given this test's."""
-    script = where / name
+def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process:
+    """Run an example; the default endpoint in it is replaced by this test's."""
+    script = folder / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", endpoint))
     return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1")
 
 
 def test_all_examples_are_tested() -> None:
-    """No example without a test."""
-    assert {path.name for path in EXAMPLES.glob("*.py")} == {*SAYS, "publish.py", "resets.py"}
+    """Every example has a test."""
+    assert {path.name for path in EXAMPLES.glob("*.py")} == {*PRINTS, "publish.py", "resets.py"}
 
 
-@pytest.mark.parametrize("name", SAYS)
-def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> None:
-    """Each example says what it is for, and no error."""
-    process = run_example(start, name, flying, tmp_path)
-    wait_for(lambda: SAYS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}")
-    assert SAYS[name] in process.out, process.err
+@pytest.mark.parametrize("name", PRINTS)
+def test_example_runs(start: Start, simulated: str, tmp_path: Path, name: str) -> None:
+    """Each example prints its result, and no error."""
+    process = run_example(start, name, simulated, tmp_path)
+    wait_for(
+        lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
+    )
+    assert PRINTS[name] in process.out, process.err
     assert process.err == ""
 
 
@@ -62,11 +66,27 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
     assert process.popen.poll() is None
 
 
-def test_resets_are_drawn(start: Start, tmp_path: Path) -> None:
-    """examples/resets.py finds the reset at the end of the simulated outage, and draws both tracks."""
+def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:
+    """examples/resets.py prints the reset at the end of the simulated outage, and plots both tracks and one cross."""
     flight, picture = tmp_path / "flight.mcap", tmp_path / "resets.png"
-    convert(open_replay("sim:?duration=80"), flight, source="sim", on_progress=lambda _: None)
+    convert_replay("sim:?duration=80", flight)
     process = start(str(EXAMPLES / "resets.py"), str(flight), str(picture), MPLBACKEND="agg")
     assert process.wait(60) == 0, process.err
     assert process.out.count("xy reset by") == 1
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    pixels = imread(picture)[..., :3]
+    assert pixels.shape == (600, 800, 3)
+
+    def drawn(color: tuple[float, float, float]) -> tuple[np.ndarray, ...]:
+        return np.nonzero(np.abs(pixels - color).max(axis=2) < 0.1)
+
+    dotted, solid, cross = (drawn(color) for color in ((0.12, 0.47, 0.71), (1.0, 0.5, 0.05), (1.0, 0.0, 0.0)))
+    # The figure of eight fills the plot; the dotted track is beside it only after the reset, from the cross on.
+    assert len(solid[0]) > 2000
+    assert np.ptp(solid[0]) > 300
+    assert np.ptp(solid[1]) > 600
+    assert len(dotted[0]) > 60
+    assert np.ptp(dotted[0]) > 100
+    assert len(cross[0]) >= 10
+    assert max(np.ptp(cross[0]), np.ptp(cross[1])) < 12
+    distances = np.hypot(dotted[0] - cross[0].mean(), dotted[1] - cross[1].mean())
+    assert distances.min() < 12

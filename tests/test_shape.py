@@ -1,52 +1,79 @@
-"""The shape of the code: imports point down, doors are complete."""
+"""The shape of the code: imports point down, public interfaces are complete."""
 
 from __future__ import annotations
 
 import ast
+import builtins
 import importlib
+import inspect
+import re
+import sys
+import typing
 from pathlib import Path
 
 import pytest
 
+import nedbus
 from tests.conftest import Start
 
 ROOT = Path(__file__).parents[1]
-LAYERS = {  # who may import whom, beside itself and the standard library
-    "nedbus_msgs": {"nedbus_msgs", "pydantic", "pydantic_core", "msgpack", "numpy"},
-    "nedbus": {"nedbus", "nedbus_msgs", "pydantic", "pydantic_core", "pydantic_settings", "zenoh", "typer", "rich"}
-    | {"pyulog", "numpy", "cryptography", "pymavlink", "serial", "mcap", "zstandard", "pandas", "polars"}
-    | {"matplotlib", "foxglove"},
-}
-ONLY = {  # packages that only these files import
-    "zenoh": {"session", "publisher", "intake", "batches", "subscriber", "px4_zenoh", "ros2"},
-    "msgpack": {"wire"},
-    "pyulog": {"ulog"},
-    "pymavlink": {"mavlink"},
-    "serial": {"mavlink_link"},
-    "mcap": {"recording", "playback"},
-    "zstandard": {"playback"},
-    "pandas": {"reading"},
-    "polars": {"reading"},
-    "numpy": {"ulog", "arrays", "batches", "recorder", "reading", "picture"},
-    "matplotlib": {"picture"},
-    "foxglove": {"foxglove_view"},
-    "pydantic_settings": {"settings"},
-    "typer": {"app", "bridge", "records", "certificates", "options", "look", "watch", "serve"},
-    "rich": {"progress", "records"},
-    "cryptography": {"pki", "certificates"},
-}
-ORDER = [  # each may import those before it only
-    "errors", "extras", "pki", "session", "settings", "publisher", "batches", "intake", "subscriber", "health",
-    "recording", "bus", "rmw_zenoh", "playback", "sources", "worker", "daemon", "ros2", "recorder", "reading",
-    "picture", "foxglove_view",
-    "cli",
+# From the lowest to the highest: each may import those before it, through their __init__.
+FLOORS = [
+    "errors", "extras", "transport", "settings", "client", "recording", "sources", "daemon", "bridges", "cli",
 ]  # fmt: skip
+# Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
+ONLY: dict[str, set[str]] = {
+    "zenoh": {
+        "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries",
+        "nedbus/client/zenoh_subscriber", "nedbus/client/receive_queue", "nedbus/client/decoder",
+        "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
+        "nedbus/client/acknowledgement",
+        "nedbus/client/query_server", "nedbus/client/qos",
+        "nedbus/sources/px4_zenoh", "nedbus/bridges/ros2",
+    },
+    "msgpack": {"nedbus_msgs/wire"},
+    "numpy": {
+        "nedbus_msgs/arrays", "nedbus/client/batch", "nedbus/sources/ulog",
+        "nedbus/recording/ulog", "nedbus/recording/arrays", "nedbus/recording/plot",
+    },
+    "pydantic": {
+        "nedbus_msgs/position", "nedbus_msgs/px4_types", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
+        "nedbus/settings", "nedbus/sources/options", "nedbus/sources/spec", "nedbus/daemon/output",
+        "nedbus/recording/conversion",
+    },
+    "pydantic_core": {
+        "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus/client/publisher_registry",
+    },
+    "pydantic_settings": {"nedbus/settings"},
+    "typing_extensions": {"nedbus/client/sample"},
+    "pyulog": {"nedbus/recording/ulog"},
+    "mcap": {"nedbus/recording/writer", "nedbus/recording/reader"},
+    "zstandard": {"nedbus/recording/reader"},
+    "pandas": {"nedbus/recording/arrays"},
+    "polars": {"nedbus/recording/arrays"},
+    "matplotlib": {"nedbus/recording/plot"},
+    "pymavlink": {"nedbus/sources/mavlink"},
+    "serial": {"nedbus/sources/mavlink_link"},
+    "foxglove": {"nedbus/bridges/foxglove", "nedbus/bridges/foxglove_messages"},
+    "cryptography": {"nedbus/transport/pki"},
+    "rich": {"nedbus/cli/progress", "nedbus/cli/files"},
+    "typer": {
+        "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
+        "nedbus/cli/query", "nedbus/cli/stream", "nedbus/cli/serve", "nedbus/cli/run",
+    },
+}  # fmt: skip
+MAX_LINES = 250
 
 FILES = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])
 
 
+def path_of(file: Path) -> str:
+    """Return where a file is, as ONLY names it: nedbus/client/bus."""
+    return "/".join(file.relative_to(ROOT).with_suffix("").parts[1:])
+
+
 def imports_of(path: Path) -> list[str]:
-    """Return the full names of all modules that a file imports."""
+    """Return the full names of all modules that a file imports, in functions and for types too."""
     package = path.relative_to(ROOT).parts[1:-1]
     found: list[str] = []
     for node in ast.walk(ast.parse(path.read_text())):
@@ -58,26 +85,83 @@ def imports_of(path: Path) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("path", FILES, ids=path_of)
 def test_imports_point_down(path: Path) -> None:
-    """Each file imports only what its layer may, and never upwards."""
-    layer = path.relative_to(ROOT).parts[1]
-    place = path.relative_to(ROOT).parts[2].removesuffix(".py")
+    """Each file imports what stands below it only, other packages through their __init__, and what it may use."""
+    package, *rest = path_of(path).split("/")
+    floor = rest[0]
     for name in imports_of(path):
-        top, *rest = name.split(".")
+        top, *inner = name.split(".")
         if top in ONLY:
-            assert path.stem in ONLY[top], name
-        if top in {*LAYERS, *ONLY, "pydantic", "pydantic_core"}:
-            assert top in LAYERS[layer], name
-        if top == "nedbus_msgs" and layer == "nedbus":
-            # Arrays have a door of their own: whoever needs none should not load NumPy.
-            assert not rest or rest == ["arrays"], f"{name}: import from the door"
-        if top == "nedbus" and rest and place in ORDER and rest[0] in ORDER and rest[0] != place:
-            assert ORDER.index(rest[0]) < ORDER.index(place), name
+            assert path_of(path) in ONLY[top], name
+        elif top == "nedbus_msgs" and package == "nedbus":
+            assert inner in ([], ["arrays"]), f"{name}: import from nedbus_msgs, or nedbus_msgs.arrays for NumPy"
+        elif top == "nedbus":
+            assert package == "nedbus", f"{name}: nedbus_msgs knows nothing of the service"
+            if inner and floor in FLOORS:
+                assert inner[0] == floor or len(inner) == 1, f"{name}: import from nedbus.{inner[0]}"
+                assert FLOORS.index(inner[0]) <= FLOORS.index(floor), f"{name} points up"
+        else:
+            assert top == "nedbus_msgs" or top in sys.stdlib_module_names, f"{name}: who may import this?"
+
+
+def test_no_entry_is_left_over() -> None:
+    """Every file that ONLY names exists and imports that package; every folder is a floor."""
+    imported = {path_of(path): {name.split(".")[0] for name in imports_of(path)} for path in FILES}
+    unused = {
+        (package, path) for package, paths in ONLY.items() for path in paths if package not in imported.get(path, ())
+    }
+    assert not unused
+    folders = {path.name for path in (ROOT / "service" / "nedbus").iterdir() if (path / "__init__.py").is_file()}
+    assert folders <= set(FLOORS)
+
+
+def test_no_import_circle() -> None:
+    """Modules do not import each other in a circle, inside a package either (imports for types only are left out)."""
+    graph = {path_of(path).removesuffix("/__init__").replace("/", "."): runtime_imports(path) for path in FILES}
+    done: set[str] = set()
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert module not in trail, f"a circle: {' -> '.join([*trail[trail.index(module) :], module])}"
+        if module in done:
+            return
+        for name in sorted(graph[module] & graph.keys()):
+            if not module.startswith(f"{name}."):  # a package's __init__ imports its own modules
+                visit(name, (*trail, module))
+        done.add(module)
+
+    for module in graph:
+        visit(module, ())
+
+
+def runtime_imports(path: Path) -> set[str]:
+    """Return the modules that are imported when a file is imported."""
+    tree = ast.parse(path.read_text())
+    tree.body = [
+        node for node in tree.body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    ]
+    source = ast.unparse(ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], []))
+    package = path.relative_to(ROOT).parts[1:-1]
+    found = set()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ImportFrom):
+            base = ".".join([*package[: len(package) - node.level + 1], *filter(None, [node.module])])
+            found.add(base if node.level else node.module or "")
+            found |= {f"{base}.{alias.name}" for alias in node.names if node.level and not node.module}
+    return found
+
+
+@pytest.mark.parametrize("path", FILES, ids=path_of)
+def test_file_has_one_duty(path: Path) -> None:
+    """No file is long, and the first line of its docstring, one sentence, says what it is for."""
+    text = path.read_text()
+    assert text.count("\n") <= MAX_LINES
+    docstring = ast.get_docstring(ast.parse(text)) or ""
+    assert docstring.splitlines()[0].endswith((".", ":")) or "__main__" in path_of(path) or path.stem == "__init__"
 
 
 @pytest.mark.parametrize("name", ["nedbus", "nedbus_msgs"])
-def test_door_is_sorted_and_complete(name: str) -> None:
+def test_public_interface_is_sorted_and_complete(name: str) -> None:
     """__all__ is sorted as ruff sorts it, each name is there and documented, and nothing public is missing."""
     module = importlib.import_module(name)
     constants = [word for word in module.__all__ if word.isupper()]
@@ -85,10 +169,43 @@ def test_door_is_sorted_and_complete(name: str) -> None:
     functions = [word for word in module.__all__ if word[0].islower()]
     assert module.__all__ == sorted(constants) + sorted(classes) + sorted(functions)
     for word in [*classes, *functions]:
-        assert getattr(module, word).__doc__, word
+        public = getattr(module, word)
+        ours = (inspect.isclass(public) or inspect.isfunction(public)) and public.__module__.startswith("nedbus")
+        assert not ours or public.__doc__, word
     public = {word for word in vars(module) if not word.startswith("_")}
     submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
     assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
+
+
+# What a public signature may mention besides what nedbus exports.
+KNOWN = {*dir(builtins), *typing.__all__, "Path", "np", "npt", "pd", "pl", "zenoh"}
+# The model's fields are int, float, bool and pairs of floats, with PX4's ranges.
+KNOWN |= {"Uint64", "Uint8", "Bool", "Float32", "Float32x2", "Float64"}
+
+
+def annotations_of(public: type | typing.Callable[..., object]) -> typing.Iterator[str]:
+    """Yield the annotations of a function, or of the public methods and fields of a class, as they are written."""
+    if inspect.isfunction(public):
+        yield from inspect.get_annotations(public).values()
+    elif inspect.isclass(public):
+        yield from (text for name, text in inspect.get_annotations(public).items() if not name.startswith("_"))
+        for name, member in vars(public).items():
+            function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+            made_by_users = name == "__init__" and not re.search(r"get one from|from `connect", public.__doc__ or "")
+            if inspect.isfunction(function) and (not name.startswith("_") or made_by_users):
+                yield from inspect.get_annotations(function).values()
+
+
+@pytest.mark.parametrize("name", sorted(set(nedbus.__all__)))
+def test_public_signatures_mention_public_names_only(name: str) -> None:
+    """A script can import from nedbus whatever it gets from nedbus, or gives to it."""
+    for annotation in map(str, annotations_of(getattr(nedbus, name))):
+        expression = annotation.removeprefix("<class '").removesuffix("'>")
+        names = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
+        unknown = {
+            each for each in names if each not in KNOWN and each not in nedbus.__all__ and not each.endswith("_co")
+        }
+        assert not unknown, annotation
 
 
 @pytest.mark.parametrize(
@@ -110,6 +227,7 @@ def test_error_tree_is_drawn() -> None:
     errors = importlib.import_module("nedbus.errors")
     for name in errors.__all__:
         assert name in (errors.__doc__ or ""), name
+        assert re.match("Raised (when|for) |Base of", getattr(errors, name).__doc__), name
         bases = [base.__name__ for base in getattr(errors, name).__mro__ if base.__module__ == "builtins"]
         drawn = next(line for line in (errors.__doc__ or "").splitlines() if f" {name}" in f" {line.strip()}")
         if "(" in drawn.partition(name)[2][:2]:

@@ -1,4 +1,4 @@
-"""Write small ULog files, so that the suite needs no real ones; the format is PX4's documented one."""
+"""Write small ULog files in PX4's documented format, so that the suite needs no real ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _type(name: str, field_types: Mapping[str, str]) -> str:
 
 
 class UlogWriter:
-    """Write one log, message by message; fields are sorted by size, as PX4 does it."""
+    """Write one log, message by message; fields are sorted by size, as PX4 sorts them."""
 
     def __init__(self, *, layout: str = "1.16", system_id: int | None = 1) -> None:
         fields = LAYOUTS[layout].fields
@@ -32,7 +32,7 @@ class UlogWriter:
         self._defined: set[str] = set()
 
     def define(self, topics: Iterable[str], *, without: Sequence[str] = ()) -> None:
-        """Write the format of these topics, perhaps without some fields."""
+        """Write the format of these topics, without some fields if given."""
         self._fields = [name for name in self._fields if name not in without]
         for topic in topics:
             text = "".join(f"{self._field_type(name)} {name};" for name in self._fields) + "uint8_t[3] _padding0;"
@@ -40,7 +40,7 @@ class UlogWriter:
             self._defined.add(topic)
 
     def add(self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object) -> None:
-        """Write one message; `raw` overrides fields with what the model would refuse."""
+        """Write one message; `raw` overrides fields with values that the model rejects."""
         if (topic, instance) not in self._ids:
             self._ids[topic, instance] = len(self._ids)
             self._message("A", struct.pack("<BH", instance, self._ids[topic, instance]) + topic.encode())

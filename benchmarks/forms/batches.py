@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 
 import nedbus
-from nedbus_msgs.arrays import to_records
+from nedbus_msgs.arrays import to_array
 
 from .fields import FIELDS
 
@@ -21,9 +21,9 @@ def publish(endpoint: str) -> Iterator[Callable[[Sequence[int]], None]]:
         publisher = bus.publisher("vehicle_local_position", vehicle="1", lossless=True)
 
         def send(stamps: Sequence[int]) -> None:
-            records = np.repeat(to_records([message]), len(stamps))
-            records["timestamp"] = stamps
-            publisher.publish_many(records)
+            messages = np.repeat(to_array([message]), len(stamps))
+            messages["timestamp"] = stamps
+            publisher.publish_many(messages)
 
         yield send
 

@@ -2,10 +2,12 @@
 
 from .cdr import decode_cdr, encode_cdr
 from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
+from .flags import DOUBT_FLAGS, FLAGS, Flag, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
     MapProjection,
     NoOrigin,
+    Vector,
     enu_to_ned,
     flu_to_frd,
     frd_to_flu,
@@ -19,28 +21,30 @@ from .frames import (
     yaw_ned_to_enu,
 )
 from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade, upgraded_names
-from .origin import Origin, encoding_of, origin_of
-from .position import FIELD_TYPES, VehicleLocalPosition
-from .resets import Continuous, ResetTracker
+from .position import Message, VehicleLocalPosition
+from .provenance import Provenance, encoding_of, provenance_of
+from .resets import Continuous, Quantity, ResetTracker
+from .ros2_topics import ros2_topic_of, split_ros2_topic
 from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, message_definition, type_hash
-from .rows import Row
+from .rows import FIELD_TYPES, Row
 from .schema import json_schema, layout_table
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
+    DEFAULT_TOPIC,
     ENCODING,
     TOPICS,
     Address,
+    Selection,
     Topic,
+    ack_key,
     address_of_alive_key,
-    alive_selection,
+    alive_key_expr,
     check_prefix,
     check_vehicle,
     get_topic,
     schema_key,
-    selection,
     status_key,
-    taken_key,
 )
 from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, decode_row, describe, encode, encode_fields, encode_row
 
@@ -48,8 +52,11 @@ __all__ = [
     "ANY",
     "CURRENT",
     "DEFAULT_PREFIX",
+    "DEFAULT_TOPIC",
+    "DOUBT_FLAGS",
     "ENCODING",
     "FIELD_TYPES",
+    "FLAGS",
     "LAYOUTS",
     "PAYLOAD_LIMIT",
     "PAYLOAD_SIZE",
@@ -62,20 +69,26 @@ __all__ = [
     "Continuous",
     "DecodeError",
     "EncodeError",
+    "Flag",
     "GlobalPosition",
     "Layout",
     "LayoutError",
     "MapProjection",
+    "Message",
     "NedbusError",
     "NoOrigin",
-    "Origin",
+    "Provenance",
+    "Quantity",
     "ResetTracker",
     "Row",
+    "Selection",
     "Topic",
     "UnknownLayoutError",
+    "Vector",
     "VehicleLocalPosition",
+    "ack_key",
     "address_of_alive_key",
-    "alive_selection",
+    "alive_key_expr",
     "check_prefix",
     "check_vehicle",
     "dds_type",
@@ -83,6 +96,7 @@ __all__ = [
     "decode_cdr",
     "decode_row",
     "describe",
+    "describe_flags",
     "downgrade",
     "encode",
     "encode_cdr",
@@ -98,12 +112,13 @@ __all__ = [
     "layout_of_type_hash",
     "layout_table",
     "message_definition",
+    "message_doubts",
     "ned_to_enu",
-    "origin_of",
+    "provenance_of",
+    "ros2_topic_of",
     "schema_key",
-    "selection",
+    "split_ros2_topic",
     "status_key",
-    "taken_key",
     "to_global",
     "to_local",
     "type_hash",

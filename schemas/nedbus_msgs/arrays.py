@@ -1,7 +1,7 @@
-"""Messages by the thousand: the fixed-width payload as a NumPy record, with the model's rules checked on whole columns.
+"""Messages as a NumPy structured array: decoding, encoding and validation of many at once, column by column.
 
 Types, offsets and rules come from the same tables as those of a single message.
-Import it where arrays are used, and nowhere else: NumPy takes longer to load than all the rest.
+Import this module only where arrays are used: NumPy takes longer to load than all the rest.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from .cdr import places_in_cdr
+from .cdr import cdr_offsets
+from .flags import FLAGS
 from .layouts import CURRENT
-from .position import FIELD_TYPES, NAMES, Values, VehicleLocalPosition
+from .position import VehicleLocalPosition
 from .px4_types import TypeName
-from .rules import FLAGGED, NOT_NEGATIVE, WITHIN
-from .wire import NO_VALUES, PAYLOAD_SIZE, TAGS, places_on_the_wire
+from .rows import FIELD_TYPES, NAMES, Values
+from .rules import NOT_NEGATIVE, WITHIN
+from .wire import PAYLOAD_SIZE, TAG_MASK, TAGS, value_offsets
 
-Records = npt.NDArray[np.void]
-"""A structured array, one record a message, one column a field: `records["x"]`."""
+MessageArray = npt.NDArray[np.void]
+"""A structured array: one element per message, one column per field, such as `array["x"]`."""
 
 _NATIVE: Final[Mapping[TypeName, str]] = {
     "uint64": "u8", "uint8": "u1", "bool": "?", "float32": "f4", "float32[2]": "2f4", "float64": "f8",
@@ -28,106 +30,106 @@ _NATIVE: Final[Mapping[TypeName, str]] = {
 _ON_WIRE: Final[Mapping[TypeName, str]] = {**_NATIVE, "bool": "u1", "float32[2]": "f4"}
 
 DTYPE: Final = np.dtype([(name, _NATIVE[kind]) for name, kind in FIELD_TYPES.items()])
-"""The columns of Records: PX4's fields in PX4's order, with PX4's types."""
+"""The dtype of a MessageArray: PX4's fields in PX4's order, with PX4's types."""
 
 FEW: Final = 8
-"""Messages below which whole columns cost more than one by one."""
+"""Number of messages below which column by column takes longer than one by one."""
 
-_PAIRS: Final = [place for place, kind in enumerate(FIELD_TYPES.values()) if kind == "float32[2]"]
-_PARTS: Final = list(places_on_the_wire())
+_PAIRS: Final = [index for index, kind in enumerate(FIELD_TYPES.values()) if kind == "float32[2]"]
+_VALUES: Final = list(value_offsets())
 _WIRE: Final = np.dtype(
     {
-        "names": [f"{name}.{part}" for name, part, _ in _PARTS],
-        "formats": [">" + _ON_WIRE[FIELD_TYPES[name]] for name, _, _ in _PARTS],
-        "offsets": [offset for _, _, offset in _PARTS],
+        "names": [f"{name}.{part}" for name, part, _ in _VALUES],
+        "formats": [">" + _ON_WIRE[FIELD_TYPES[name]] for name, _, _ in _VALUES],
+        "offsets": [offset for _, _, offset in _VALUES],
         "itemsize": PAYLOAD_SIZE,
     }
 )
-_CDR_PLACES, _NOTHING_IN_CDR = places_in_cdr(CURRENT.name)
+_CDR_OFFSETS, _ZEROS_IN_CDR = cdr_offsets(CURRENT.name)
 _CDR: Final = np.dtype(
     {
         "names": list(FIELD_TYPES),
         "formats": ["<" + _NATIVE[kind] if kind != "float32[2]" else "2<f4" for kind in FIELD_TYPES.values()],
-        "offsets": [_CDR_PLACES[name] for name in FIELD_TYPES],
-        "itemsize": len(_NOTHING_IN_CDR),
+        "offsets": [_CDR_OFFSETS[name] for name in FIELD_TYPES],
+        "itemsize": len(_ZEROS_IN_CDR),
     }
 )
-_WORDS: Final = PAYLOAD_SIZE // 4
+_WORDS: Final = PAYLOAD_SIZE // 4  # 32-bit words of a payload
 _TAG_WORDS = np.frombuffer(TAGS.to_bytes(PAYLOAD_SIZE, "big"), "u4")
-_TAG_BITS = np.frombuffer((NO_VALUES & ((1 << 8 * PAYLOAD_SIZE) - 1)).to_bytes(PAYLOAD_SIZE, "big"), "u4")
+_TAG_MASK_WORDS = np.frombuffer(TAG_MASK.to_bytes(PAYLOAD_SIZE, "big"), "u4")
 
 
-def read_records(payloads: bytes) -> tuple[Records, npt.NDArray[np.bool_]]:
-    """Return the messages of full-width payloads, one after the other, and which of them are valid.
+def decode_array(payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
+    """Return the messages of concatenated payloads of PAYLOAD_SIZE, and a mask of those that are valid.
 
-    False says only that `decode` should look at that payload.
+    A payload that is False in the mask may still be valid: `decode` decides.
     """
     words = np.frombuffer(payloads, "u4").reshape(-1, _WORDS)
-    valid = ((words & _TAG_BITS) == _TAG_WORDS).all(axis=1)
+    valid = ((words & _TAG_MASK_WORDS) == _TAG_WORDS).all(axis=1)
     wire = np.frombuffer(payloads, _WIRE)
-    records = np.empty(len(wire), DTYPE)
-    for name, part, _ in _PARTS:
+    array = np.empty(len(wire), DTYPE)
+    for name, part, _ in _VALUES:
         values = wire[f"{name}.{part}"]
         if FIELD_TYPES[name] == "float32[2]":
-            records[name][:, part] = values
+            array[name][:, part] = values
         else:
-            records[name] = values & 1 if FIELD_TYPES[name] == "bool" else values
-    return records, valid & find_sound(records)
+            array[name] = values & 1 if FIELD_TYPES[name] == "bool" else values
+    return array, valid & valid_mask(array)
 
 
-def write_records(records: Records) -> bytes:
-    """Return the payloads of messages, one after the other; whether they are valid is not looked at."""
-    wire = np.frombuffer(bytearray(TAGS.to_bytes(PAYLOAD_SIZE, "big") * len(records)), _WIRE)
-    for name, part, _ in _PARTS:
+def encode_array(array: MessageArray) -> bytes:
+    """Return the concatenated payloads of messages, without validating them."""
+    wire = np.frombuffer(bytearray(TAGS.to_bytes(PAYLOAD_SIZE, "big") * len(array)), _WIRE)
+    for name, part, _ in _VALUES:
         if FIELD_TYPES[name] == "float32[2]":
-            wire[f"{name}.{part}"] = records[name][:, part]
+            wire[f"{name}.{part}"] = array[name][:, part]
         elif FIELD_TYPES[name] == "bool":
-            wire[f"{name}.{part}"] |= records[name]
+            wire[f"{name}.{part}"] |= array[name]
         else:
-            wire[f"{name}.{part}"] = records[name]
+            wire[f"{name}.{part}"] = array[name]
     return wire.tobytes()
 
 
-def write_cdr_records(records: Records) -> npt.NDArray[np.void]:
-    """Return the CDR payloads of messages, in the current layout, as an array with one payload a record."""
-    payloads = np.frombuffer(bytearray(_NOTHING_IN_CDR * len(records)), _CDR)
+def encode_cdr_array(array: MessageArray) -> npt.NDArray[np.void]:
+    """Return the CDR payloads of messages in the current layout, one per element, without validating them."""
+    payloads = np.frombuffer(bytearray(_ZEROS_IN_CDR * len(array)), _CDR)
     for name in FIELD_TYPES:
-        payloads[name] = records[name]
+        payloads[name] = array[name]
     return payloads
 
 
-def read_cdr_records(payloads: bytes) -> Records:
-    """Return the messages of CDR payloads of the current layout, one after the other; rules are not looked at."""
+def decode_cdr_array(payloads: bytes) -> MessageArray:
+    """Return the messages of concatenated CDR payloads of the current layout, without validating them."""
     return np.frombuffer(payloads, _CDR).astype(DTYPE)
 
 
-def find_sound(records: Records) -> npt.NDArray[np.bool_]:
-    """Return which messages keep the rules between fields."""
-    sound = records["timestamp_sample"] <= records["timestamp"]
-    for flag, names in FLAGGED.items():
-        for name in names:
-            sound &= ~records[flag] | np.isfinite(records[name])
+def valid_mask(array: MessageArray) -> npt.NDArray[np.bool_]:
+    """Return a mask of the messages that keep the rules between fields."""
+    valid = array["timestamp_sample"] <= array["timestamp"]
+    for flag in FLAGS.values():
+        for name in flag.fields:
+            valid &= ~array[flag.name] | np.isfinite(array[name])
     for name in NOT_NEGATIVE:
-        sound &= ~(records[name] < 0)
+        valid &= ~(array[name] < 0)
     for name, bound in WITHIN.items():
-        sound &= ~(np.abs(records[name]) > bound)
-    return sound
+        valid &= ~(np.abs(array[name]) > bound)
+    return valid
 
 
-def to_records(messages: Sequence[VehicleLocalPosition]) -> Records:
-    """Return messages as an array."""
+def to_array(messages: Sequence[VehicleLocalPosition]) -> MessageArray:
+    """Return messages as a structured array."""
     return np.array([tuple(message.__dict__.values()) for message in messages], DTYPE)
 
 
-def to_row(record: np.void) -> Values:
-    """Return the values of one record in PX4's order, `delta_xy` and `delta_vxy` as tuples."""
-    values = list(record.item())
-    for place in _PAIRS:
-        values[place] = tuple(values[place].tolist())
+def to_row(element: np.void) -> Values:
+    """Return the values of one element in PX4's order, `delta_xy` and `delta_vxy` as tuples."""
+    values = list(element.item())
+    for index in _PAIRS:
+        values[index] = tuple(values[index].tolist())
     return tuple(values)
 
 
-def to_message(record: np.void) -> VehicleLocalPosition:
-    """Return one record as a message; raise pydantic.ValidationError for what the model refuses."""
-    fields: dict[str, Any] = dict(zip(NAMES, to_row(record), strict=True))
+def to_message(element: np.void) -> VehicleLocalPosition:
+    """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
+    fields: dict[str, Any] = dict(zip(NAMES, to_row(element), strict=True))
     return VehicleLocalPosition(**fields)

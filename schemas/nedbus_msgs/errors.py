@@ -13,7 +13,7 @@ class NedbusError(Exception):
 
 
 def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict[str, object]) -> NedbusError:
-    """Make an error from its finished text; its constructor would write the text again."""
+    """Make an error from its finished text; its constructor would format the text again."""
     error = kind.__new__(kind)
     error.args = arguments
     error.__dict__.update(facts)
@@ -21,7 +21,7 @@ def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict
 
 
 class AddressError(NedbusError, ValueError):
-    """Raise when a vehicle, topic, instance or key expression cannot name a stream."""
+    """Raised when a vehicle, topic, instance or key expression cannot name a stream."""
 
     def __init__(self, what: str, given: object, expected: str) -> None:
         super().__init__(f"{what} {given!r} is not valid: expected {expected}")
@@ -29,11 +29,11 @@ class AddressError(NedbusError, ValueError):
 
 
 class LayoutError(NedbusError, ValueError):
-    """Raise when a set of field names fits no layout of VehicleLocalPosition that is known."""
+    """Raised when a layout is unknown, or when field names are not those of a layout of VehicleLocalPosition."""
 
 
 class DecodeError(NedbusError, ValueError):
-    """Raise when a payload is not a VehicleLocalPosition; `reason` says why in one line."""
+    """Raised when a payload is not a valid VehicleLocalPosition; `reason` is one line."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"not a VehicleLocalPosition: {reason}")
@@ -41,9 +41,9 @@ class DecodeError(NedbusError, ValueError):
 
 
 class UnknownLayoutError(DecodeError):
-    """Raise when a payload has a layout number whose field list is not known here.
+    """Raised when a payload has a layout number that this reader does not know.
 
-    `layout` is that number, `count` how many fields follow it, `known` the numbers that can be read.
+    `layout` is that number, `count` how many fields follow it, `known` the numbers that can be decoded.
     """
 
     def __init__(self, layout: int, count: int, known: Sequence[int]) -> None:
@@ -57,7 +57,7 @@ class UnknownLayoutError(DecodeError):
 
 
 class EncodeError(NedbusError, ValueError):
-    """Raise when a message holds what its fields cannot, because validation was bypassed."""
+    """Raised when values do not fit the types of their fields, because validation was bypassed."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"this message cannot be encoded ({reason}): build it with VehicleLocalPosition(...)")

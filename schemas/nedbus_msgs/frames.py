@@ -1,4 +1,4 @@
-"""Frames: NED and ENU, FRD and FLU, and the way between local and global positions, as PX4 computes it.
+"""Conversions between frames: NED and ENU, FRD and FLU, local and global positions, as PX4 computes them.
 
 Angles are radians, latitudes and longitudes degrees, lengths metres.
 Source: PX4's MapProjection (azimuthal equidistant, on a sphere), so that a position agrees with PX4's own
@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from .position import VehicleLocalPosition
+from .position import Message
 
 EARTH_RADIUS: Final = 6_371_000.0
 """Radius of PX4's sphere [m]."""
@@ -20,47 +20,47 @@ Vector = tuple[float, float, float]
 
 
 def ned_to_enu(vector: Vector) -> Vector:
-    """Return a position, velocity or acceleration of NED in ENU."""
+    """Convert a position, velocity or acceleration from NED to ENU."""
     north, east, down = vector
     return east, north, -down
 
 
 def enu_to_ned(vector: Vector) -> Vector:
-    """Return a position, velocity or acceleration of ENU in NED."""
+    """Convert a position, velocity or acceleration from ENU to NED."""
     east, north, up = vector
     return north, east, -up
 
 
 def frd_to_flu(vector: Vector) -> Vector:
-    """Return a vector of the body frame FRD (PX4) in FLU (ROS)."""
+    """Convert a vector from the body frame FRD (PX4) to FLU (ROS)."""
     forward, right, down = vector
     return forward, -right, -down
 
 
 def flu_to_frd(vector: Vector) -> Vector:
-    """Return a vector of the body frame FLU (ROS) in FRD (PX4)."""
+    """Convert a vector from the body frame FLU (ROS) to FRD (PX4)."""
     forward, left, up = vector
     return forward, -left, -up
 
 
 def yaw_ned_to_enu(yaw: float) -> float:
-    """Return a heading, clockwise from north, as ENU has it: counterclockwise from east, within [-pi, pi]."""
+    """Convert a heading, clockwise from north, to ENU: counterclockwise from east, within [-pi, pi]."""
     return wrap(math.pi / 2 - yaw)
 
 
 def yaw_enu_to_ned(yaw: float) -> float:
-    """Return a yaw, counterclockwise from east, as NED has it: clockwise from north, within [-pi, pi]."""
+    """Convert a yaw, counterclockwise from east, to NED: clockwise from north, within [-pi, pi]."""
     return wrap(math.pi / 2 - yaw)
 
 
 def variances_ned_to_enu(variances: Vector) -> Vector:
-    """Return variances of north, east and down as those of east, north and up: none of them changes its sign."""
+    """Convert variances of north, east and down to those of east, north and up: none changes its sign."""
     north, east, down = variances
     return east, north, down
 
 
 def variances_enu_to_ned(variances: Vector) -> Vector:
-    """Return variances of east, north and up as those of north, east and down: none of them changes its sign."""
+    """Convert variances of east, north and up to those of north, east and down: none changes its sign."""
     east, north, up = variances
     return north, east, up
 
@@ -78,14 +78,14 @@ class MapProjection:
     longitude: float
 
     def project(self, latitude: float, longitude: float) -> tuple[float, float]:
-        """Return north and east [m] of a place."""
+        """Return north and east [m] of a latitude and longitude [deg]."""
         sine, cosine = _sine_and_cosine(self.latitude)
-        sine_there, cosine_there = _sine_and_cosine(latitude)
-        turn = math.radians(longitude - self.longitude)
-        angle = math.acos(_clip(sine * sine_there + cosine * cosine_there * math.cos(turn)))
+        sine_other, cosine_other = _sine_and_cosine(latitude)
+        difference = math.radians(longitude - self.longitude)
+        angle = math.acos(_clip(sine * sine_other + cosine * cosine_other * math.cos(difference)))
         scale = EARTH_RADIUS * (angle / math.sin(angle) if math.sin(angle) else 1.0)
-        north = scale * (cosine * sine_there - sine * cosine_there * math.cos(turn))
-        return north, scale * cosine_there * math.sin(turn)
+        north = scale * (cosine * sine_other - sine * cosine_other * math.cos(difference))
+        return north, scale * cosine_other * math.sin(difference)
 
     def reproject(self, north: float, east: float) -> tuple[float, float]:
         """Return latitude and longitude [deg] of a point [m]; the longitude is within [-180, 180]."""
@@ -103,7 +103,7 @@ class MapProjection:
 
 
 class GlobalPosition(NamedTuple):
-    """A place on the earth: latitude and longitude [deg, WGS84], altitude above mean sea level [m], NaN if unknown."""
+    """Latitude and longitude [deg, WGS84], altitude above mean sea level [m], NaN if unknown."""
 
     latitude: float
     longitude: float
@@ -112,9 +112,9 @@ class GlobalPosition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NoOrigin:
-    """The answer for a message without a global origin; it is false, so `if place := to_global(message):` reads well.
+    """Returned for a message without a global origin; it is false: `if position := to_global(message):`.
 
-    `reason` says what is missing.
+    `reason` names what is missing.
     """
 
     reason: str
@@ -123,11 +123,11 @@ class NoOrigin:
         return False
 
 
-def to_global(message: VehicleLocalPosition) -> GlobalPosition | NoOrigin:
-    """Return where a message, or a Row, is on the earth; NoOrigin while it has none.
+def to_global(message: Message) -> GlobalPosition | NoOrigin:
+    """Return the global position of a message; NoOrigin while it has no global origin.
 
     The altitude is NaN while only the horizontal origin is known.
-    The position is that of x, y and z, valid or not: look at `xy_valid` and `z_valid`.
+    The position is that of x, y and z, valid or not: check `xy_valid` and `z_valid`.
     """
     if not message.xy_global:
         return NoOrigin("xy_global is false: x and y have no global origin yet")
@@ -137,15 +137,15 @@ def to_global(message: VehicleLocalPosition) -> GlobalPosition | NoOrigin:
     return GlobalPosition(latitude, longitude, message.ref_alt - message.z if message.z_global else math.nan)
 
 
-def to_local(place: GlobalPosition, origin: VehicleLocalPosition) -> Vector | NoOrigin:
-    """Return x, y and z of a place in the local frame of a message, or a Row; NoOrigin while that has none.
+def to_local(position: GlobalPosition, origin: Message) -> Vector | NoOrigin:
+    """Return x, y and z of a global position in the local frame of a message; NoOrigin while that has no origin.
 
     z is NaN while only the horizontal origin is known.
     """
     if not origin.xy_global:
         return NoOrigin("xy_global is false: x and y have no global origin yet")
-    x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(place.latitude, place.longitude)
-    return x, y, origin.ref_alt - place.altitude if origin.z_global else math.nan
+    x, y = MapProjection(origin.ref_lat, origin.ref_lon).project(position.latitude, position.longitude)
+    return x, y, origin.ref_alt - position.altitude if origin.z_global else math.nan
 
 
 def _sine_and_cosine(degrees: float) -> tuple[float, float]:

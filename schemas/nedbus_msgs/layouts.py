@@ -1,6 +1,6 @@
-"""The one table of PX4's layouts of VehicleLocalPosition, and the way between them and the model.
+"""The one table of PX4's layouts of VehicleLocalPosition, and the conversion between them and the model.
 
-A layout is found from field names or given by name; never from MESSAGE_VERSION, which two layouts share.
+A layout is found by its field names or given by its name; never by MESSAGE_VERSION, which two layouts share.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Final, cast
 
 from .errors import LayoutError
-from .position import FIELD_TYPES, VehicleLocalPosition
+from .position import VehicleLocalPosition
 from .px4_types import TypeName
+from .rows import FIELD_TYPES
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,28 +74,30 @@ LAYOUTS: Final[Mapping[str, Layout]] = {
 """PX4's layouts by name, oldest first; the last one is the model's own."""
 
 CURRENT: Final = LAYOUTS["1.16"]
-WIRE_LAYOUTS: Final[Mapping[int, Layout]] = {row.wire: row for row in LAYOUTS.values() if row.wire is not None}
-"""The layouts that a payload may have, by the number that stands first in it."""
+WIRE_LAYOUTS: Final[Mapping[int, Layout]] = {
+    layout.wire: layout for layout in LAYOUTS.values() if layout.wire is not None
+}
+"""The layouts that a payload may have, by its first value, the layout number."""
 
 _RENAMED: Final = {"yaw": "heading", "delta_yaw": "delta_heading", "yaw_reset_counter": "heading_reset_counter"}
-"""Names of 1.11 and before, and today's."""
+"""Field names of 1.11 and before, and their present names."""
 
 
 def find_layout(names: Iterable[str]) -> Layout | None:
-    """Return the layout with exactly these field names, in any order, or None (1.12 and older have no row)."""
+    """Return the layout with exactly these field names, in any order, or None (1.12 and older are not in the table)."""
     given = frozenset(names)
     return next((layout for layout in LAYOUTS.values() if given == frozenset(layout.fields)), None)
 
 
 def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleLocalPosition:
-    """Return the message that these fields of any PX4 release make; `delta_xy` and `delta_vxy` are tuples of 2.
+    """Return the message with these fields of any PX4 release; `delta_xy` and `delta_vxy` are tuples of 2.
 
     With the name of a layout, the fields must be exactly that layout's.
-    Without, whatever is there is taken, `yaw` as `heading`, and names that VehicleLocalPosition never had are ignored.
+    Without, all known fields are used, `yaw` as `heading`, and unknown names are ignored.
     `hagl_max` becomes `hagl_max_z` and `hagl_max_xy`, as in PX4's own translation.
-    What is not there is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
+    A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
 
-    Raises LayoutError for other fields than the layout's, pydantic.ValidationError for what the model refuses.
+    Raises LayoutError for other fields than the layout's, pydantic.ValidationError for an invalid message.
     """
     if layout is not None:
         require_fields(fields, get_layout(layout))
@@ -102,7 +105,7 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleL
 
 
 def upgraded_names(names: Iterable[str]) -> Mapping[str, str]:
-    """Return the fields of a message that can be made of fields with these names, and which of them makes each."""
+    """Return which of these names, of any PX4 release, provides each field of a message."""
     known = {_RENAMED.get(name, name): name for name in names}
     if "hagl_max" in known:
         known.setdefault("hagl_max_z", known["hagl_max"])
@@ -113,30 +116,30 @@ def upgraded_names(names: Iterable[str]) -> Mapping[str, str]:
 def downgrade(message: VehicleLocalPosition, layout: str) -> dict[str, object]:
     """Return the message as the fields of an older layout, in that layout's order.
 
-    `hagl_max` is `hagl_max_z`, as in PX4's own translation; fields that the layout lacks are lost.
+    `hagl_max` is `hagl_max_z`, as in PX4's own translation; fields that the layout lacks are dropped.
 
-    Raises LayoutError for the name of no layout.
+    Raises LayoutError for an unknown layout.
     """
     values: dict[str, object] = {**message.__dict__, "hagl_max": message.hagl_max_z}
     return {name: values[name] for name in get_layout(layout).fields}
 
 
 def get_layout(name: str) -> Layout:
-    """Return a row of LAYOUTS; raise LayoutError for a name that has none."""
+    """Return a layout by its name; raise LayoutError for an unknown one."""
     try:
         return LAYOUTS[name]
     except KeyError:
-        raise LayoutError(f"no layout {name!r}: choose from {', '.join(LAYOUTS)}") from None
+        raise LayoutError(f"unknown layout {name!r}: choose from {', '.join(LAYOUTS)}") from None
 
 
 def require_fields(fields: Mapping[str, object], layout: Layout) -> None:
-    """Raise LayoutError, which says what is missing and what is too many, unless these are the layout's fields."""
+    """Raise LayoutError, with the missing and the unknown names, unless these are the layout's fields."""
     given, wanted = set(fields), set(layout.fields)
     if given == wanted:
         return
     problems = [
-        f"{word} {', '.join(sorted(names)[:5])}"
-        for word, names in (("missing", wanted - given), ("unknown", given - wanted))
+        f"{problem} {', '.join(sorted(names)[:5])}"
+        for problem, names in (("missing", wanted - given), ("unknown", given - wanted))
         if names
     ]
     fitting = find_layout(cast("Iterable[str]", fields))

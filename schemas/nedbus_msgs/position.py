@@ -5,20 +5,19 @@ Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition
 
 from __future__ import annotations
 
-import math
-import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from operator import itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, cast
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Final, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import CoreConfig, CoreSchema, InitErrorDetails, PydanticCustomError, SchemaValidator, core_schema
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from .px4_types import FLOAT32_MAX, NAN, Bool, Float32, Float32x2, Float64, Px4Type, TypeName, Uint8, Uint64
-from .rules import broken_rules, make_check
+from .fast_path import validate_fields
+from .float32 import float32_overflows, round_to_float32
+from .px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
+from .rows import NAMES, Row, Values
+from .rules import make_fast_check, violations
 
-Values = tuple[object, ...]
-"""The values of all fields, in PX4's order."""
+_passes_rules = make_fast_check({name: name for name in NAMES})
 
 
 class VehicleLocalPosition(BaseModel):
@@ -26,13 +25,13 @@ class VehicleLocalPosition(BaseModel):
 
     Frame: local NED, metres, radians, seconds; z points down.
     The origin is where EKF2 started, or the global origin once that is set.
-    x, y, z, vx, vy and vz hold numbers even while they are not valid: look at the flags.
+    x, y, z, vx, vy and vz hold numbers even while they are invalid: check the flags.
 
-    A float32 field holds the float32 nearest to what it was given, as a C float would, so that what you hold is what
-    arrives, to the bit; what float32 cannot hold (1e39) is refused.
+    A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
+    bit for bit as it was made; a number beyond float32 (1e39) is rejected.
     A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
-    Raises pydantic.ValidationError, with the field and the reason, for a wrong type, an unknown field or a broken rule.
+    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings")
@@ -111,28 +110,32 @@ class VehicleLocalPosition(BaseModel):
     if not TYPE_CHECKING:
 
         def __init__(self, /, **fields: object) -> None:
-            if type(self) is not VehicleLocalPosition or not _fill_quickly(self, fields):
+            # A subclass may have validators of its own, which only Pydantic knows.
+            values = validate_fields(fields) if type(self) is VehicleLocalPosition else None
+            if values is None:
                 super().__init__(**fields)
+            else:
+                _fill(self, values)
 
-        # As Pydantic marks its own: validation of dicts and JSON goes on without passing through here.
+        # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
         __init__.__pydantic_base_init__ = True
 
     @model_validator(mode="after")
-    def _settle(self) -> Self:
+    def _round_and_check(self) -> Self:
         """Round float32 fields to float32, then check the rules between fields."""
         values = self.__dict__
         try:
-            _round_to_float32(values)
+            round_to_float32(values)
         except OverflowError:
-            raise _refuse(values, _too_large(values)) from None
-        if not _is_sound(values):
-            broken = list(broken_rules(values))
+            raise _validation_error(values, float32_overflows(values)) from None
+        if not _passes_rules(values):
+            broken = list(violations(values))
             if broken:
-                raise _refuse(values, broken)
+                raise _validation_error(values, broken)
         return self
 
     def __eq__(self, other: object) -> bool:
-        """Compare all fields; what is not a number on both sides is the same."""
+        """Compare all fields; NaN equals NaN."""
         if not isinstance(other, VehicleLocalPosition):
             return NotImplemented
         return all(_is_same(value, other.__dict__[name]) for name, value in self.__dict__.items())
@@ -141,11 +144,15 @@ class VehicleLocalPosition(BaseModel):
         return hash((self.timestamp, self.timestamp_sample))
 
     def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
-        """Return a copy; unlike Pydantic's own, one with updates is validated like any other message."""
+        """Return a copy; unlike Pydantic's own, one with updates is validated."""
         if not update:
             return super().model_copy(deep=deep)
         given = {name: self.__dict__[name] for name in self.model_fields_set}
         return type(self).model_validate({**given, **update})
+
+
+Message = VehicleLocalPosition | Row
+"""A message, as a model or as a named tuple: what functions accept that only read its fields."""
 
 
 def _is_same(one: object, other: object) -> bool:
@@ -154,39 +161,8 @@ def _is_same(one: object, other: object) -> bool:
     return one == other or (repr(one) == repr(other) == "nan")
 
 
-def _px4_type(name: str) -> TypeName:
-    marks = [mark for mark in VehicleLocalPosition.model_fields[name].metadata if isinstance(mark, Px4Type)]
-    return marks[-1].name
-
-
-FIELD_TYPES: Final[Mapping[str, TypeName]] = {name: _px4_type(name) for name in VehicleLocalPosition.model_fields}
-"""PX4's type of every field, in PX4's order."""
-
-_SCALARS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32")
-_PAIR, _OTHER_PAIR = (name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
-_get_scalars = cast("Callable[[dict[str, object]], tuple[object, ...]]", itemgetter(*_SCALARS))
-_FLOATS = struct.Struct(f"<{len(_SCALARS) + 4}f")
-_is_sound = make_check({name: name for name in FIELD_TYPES})
-
-
-def _round_to_float32(values: dict[str, Any]) -> None:
-    """Put the nearest float32 into every float32 field; raise OverflowError for what is beyond its range."""
-    floats = _FLOATS.unpack(_FLOATS.pack(*_get_scalars(values), *values[_PAIR], *values[_OTHER_PAIR]))
-    values.update(zip(_SCALARS, floats, strict=False))  # the last four are the pairs'
-    values[_PAIR], values[_OTHER_PAIR] = floats[-4:-2], floats[-2:]
-
-
-def _too_large(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
-    for name, kind in FIELD_TYPES.items():
-        value = values[name]
-        numbers = (value,) if kind == "float32" else value if kind == "float32[2]" else ()
-        for number in cast("tuple[float, ...]", numbers):
-            if math.isfinite(number) and abs(number) > FLOAT32_MAX:
-                yield name, f"is beyond the range of float32 (+-{FLOAT32_MAX:.9g})"
-
-
-def _refuse(values: Mapping[str, object], broken: Iterable[tuple[str, str]]) -> ValidationError:
-    """Build an error that names each field, so that it reads like Pydantic's own."""
+def _validation_error(values: Mapping[str, object], broken: Iterable[tuple[str, str]]) -> ValidationError:
+    """Build an error with an entry for each field, like Pydantic's own."""
     details: list[InitErrorDetails] = [
         {"type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}), "loc": (name,), "input": values[name]}
         for name, reason in broken
@@ -194,69 +170,11 @@ def _refuse(values: Mapping[str, object], broken: Iterable[tuple[str, str]]) -> 
     return ValidationError.from_exception_data("VehicleLocalPosition", details)
 
 
-# The quick lane: a row is validated by a validator made from the model's own schema, which takes a fifth of the time of
-# the model's. What does not pass here is given to the model, which has the last word and the words for it.
-
-NAMES: Final = tuple(FIELD_TYPES)
-_ALL: Final = frozenset(NAMES)
-
-
-def _field_schemas() -> list[CoreSchema]:
-    schema = cast("Mapping[str, object]", VehicleLocalPosition.__pydantic_core_schema__)
-    while "fields" not in schema:  # the model's own validators are around the fields
-        schema = cast("Mapping[str, object]", schema["schema"])
-    fields = cast("Mapping[str, Mapping[str, Mapping[str, object]]]", schema["fields"])
-    found = (fields[name]["schema"] for name in NAMES)
-    # A row has all fields: what stands around some of them is a default.
-    return [cast("CoreSchema", each["schema"] if each["type"] == "default" else each) for each in found]
-
-
-_VALIDATE: Final = SchemaValidator(
-    core_schema.tuple_positional_schema(_field_schemas()), CoreConfig(strict=True)
-).validate_python
-
-_is_sound_row = make_check({name: place for place, name in enumerate(NAMES)})
-_get_all = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
-
-
-def check_row(values: Values) -> Values | None:
-    """Return the values, validated; None if the model should look at them."""
-    try:
-        row: Values = _VALIDATE(values)
-    except ValidationError:
-        return None
-    return row if _is_sound_row(row) else None
-
-
-def row_of(fields: Mapping[str, object]) -> Values | None:
-    """Return the values of all fields in their order, validated; None if the model should look at them."""
-    if len(fields) != len(NAMES):
-        return None
-    try:
-        return check_row(_get_all(fields))
-    except KeyError:  # another name among as many
-        return None
-
-
 def message_of(row: Values) -> VehicleLocalPosition:
-    """Return the message of a row that was checked and holds float32, without checking it again."""
+    """Return the message of a row that is valid and rounded to float32, without validating it again."""
     message = VehicleLocalPosition.__new__(VehicleLocalPosition)
     _fill(message, dict(zip(NAMES, row, strict=True)))
     return message
-
-
-def _fill_quickly(message: VehicleLocalPosition, fields: Mapping[str, object]) -> bool:
-    """Fill a message with these fields; return False if Pydantic should do it, which also knows what is wrong."""
-    row = row_of(fields)
-    if row is None:
-        return False
-    values = dict(zip(NAMES, row, strict=True))
-    try:
-        _round_to_float32(values)
-    except OverflowError:
-        return False
-    _fill(message, values)
-    return True
 
 
 def _fill(message: VehicleLocalPosition, values: dict[str, object]) -> None:
@@ -266,7 +184,8 @@ def _fill(message: VehicleLocalPosition, values: dict[str, object]) -> None:
     _set_private(message, None)
 
 
-# What Pydantic's own validator sets on an instance; the model is frozen, so the way is by its slots.
+# What Pydantic's own validator sets on an instance; the model is frozen, so this sets its slots.
+_ALL: Final = frozenset(NAMES)
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[VehicleLocalPosition, object], None]", vars(BaseModel)[slot].__set__)
     for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")

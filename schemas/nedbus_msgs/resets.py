@@ -1,27 +1,27 @@
-"""A continuous track of a stream whose estimator resets: what the deltas and counters of the message are for.
+"""A continuous track of a stream whose estimator resets, computed from the deltas and reset counters of its messages.
 
-When an estimator corrects itself its position jumps, and the message says by how much.
-A delta explains a jump only if its counter rose by exactly one since the last message that was seen.
-A new origin resets as well, and then the delta may describe a jump that never came: what came is looked at.
-Source: counted on real logs, among them one where `delta_z` says -179.5 m and z moved by 2 mm.
+When an estimator corrects itself its position jumps, and the message holds the delta.
+A delta explains a jump only if its counter rose by exactly one since the previous message.
+A new origin resets as well, and then the delta may describe a jump that did not happen: it is compared with the values.
+Source: counted on real logs, among them one where `delta_z` is -179.5 m and z moved by 2 mm.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, Literal
 
 from .frames import MapProjection, wrap
-from .position import VehicleLocalPosition
+from .position import Message
 
 Quantity = Literal["xy", "z", "vxy", "vz", "heading", "dist_bottom"]
 
 
 @dataclass(frozen=True, slots=True)
-class _Row:
-    """Where a quantity stands in the message."""
+class _Fields:
+    """The fields of one quantity: its values, their delta, its reset counter, and their rates."""
 
     values: tuple[str, ...]
     delta: str
@@ -29,15 +29,15 @@ class _Row:
     rates: tuple[str, ...] = ()
 
 
-_ROWS: Final[Mapping[Quantity, _Row]] = {
-    "xy": _Row(("x", "y"), "delta_xy", "xy_reset_counter", ("vx", "vy")),
-    "z": _Row(("z",), "delta_z", "z_reset_counter", ("vz",)),
-    "vxy": _Row(("vx", "vy"), "delta_vxy", "vxy_reset_counter", ("ax", "ay")),
-    "vz": _Row(("vz",), "delta_vz", "vz_reset_counter", ("az",)),
-    "heading": _Row(("heading",), "delta_heading", "heading_reset_counter"),
-    "dist_bottom": _Row(("dist_bottom",), "delta_dist_bottom", "dist_bottom_reset_counter"),
+_QUANTITIES: Final[Mapping[Quantity, _Fields]] = {
+    "xy": _Fields(("x", "y"), "delta_xy", "xy_reset_counter", ("vx", "vy")),
+    "z": _Fields(("z",), "delta_z", "z_reset_counter", ("vz",)),
+    "vxy": _Fields(("vx", "vy"), "delta_vxy", "vxy_reset_counter", ("ax", "ay")),
+    "vz": _Fields(("vz",), "delta_vz", "vz_reset_counter", ("az",)),
+    "heading": _Fields(("heading",), "delta_heading", "heading_reset_counter"),
+    "dist_bottom": _Fields(("dist_bottom",), "delta_dist_bottom", "dist_bottom_reset_counter"),
 }
-_NEAR: Final = 2.0  # m that a position may differ from a guess at a new origin, and still be explained by it
+_TOLERANCE: Final = 2.0  # m between a jump at a new origin and the candidate that explains it
 
 Point = tuple[float, ...]
 
@@ -48,9 +48,9 @@ class Continuous:
 
     Frame and units are the message's; `heading` is within [-pi, pi].
     `reset`: the quantities that were reset just before this message, explained or not.
-    `lost`: those whose jump nothing explains: their track begins anew here, with the message's own value.
-    `origin_changed`: the global origin is new, or another one.
-    `resets`: how many resets of each there were since the first message.
+    `discontinued`: those with an unexplained jump: their track starts again here, with the message's own value.
+    `origin_changed`: the global origin was set, or changed.
+    `resets`: the number of resets of each since the first message.
     """
 
     x: float
@@ -62,87 +62,89 @@ class Continuous:
     heading: float
     dist_bottom: float
     reset: frozenset[Quantity]
-    lost: frozenset[Quantity]
+    discontinued: frozenset[Quantity]
     origin_changed: bool
     resets: Mapping[Quantity, int]
 
 
-@dataclass(slots=True)
 class ResetTracker:
-    """Follow one stream, one vehicle's topic and instance; each EKF has resets, and an origin, of its own.
+    """Track one stream, that is one address: each EKF has resets, and an origin, of its own.
 
-    The selector of several EKFs does not tell of resets of `dist_bottom`: there the track of that may jump.
+    The selector of several EKFs does not report resets of `dist_bottom`: its track of that may jump.
     """
 
-    _last: VehicleLocalPosition | None = None
-    _jumps: dict[Quantity, Point] = field(default_factory=lambda: {name: _zero(row) for name, row in _ROWS.items()})
-    _resets: dict[Quantity, int] = field(default_factory=lambda: dict.fromkeys(_ROWS, 0))
+    def __init__(self) -> None:
+        self._last: Message | None = None
+        self._jumps: dict[Quantity, Point] = {name: _zero(fields) for name, fields in _QUANTITIES.items()}
+        self._resets: dict[Quantity, int] = dict.fromkeys(_QUANTITIES, 0)
 
-    def add(self, message: VehicleLocalPosition) -> Continuous:
-        """Take the next message, or Row, of the stream, and return it without jumps.
+    def add(self, message: Message) -> Continuous:
+        """Add the next message of the stream, and return its values without jumps.
 
-        A time that goes back is a vehicle that started again: everything begins anew.
+        When the timestamp goes back the vehicle has rebooted: all tracks start again.
         """
         last, self._last = self._last, message
         reset: set[Quantity] = set()
-        lost: set[Quantity] = set()
-        moved = last is not None and _origin(last) != _origin(message)
+        discontinued: set[Quantity] = set()
+        origin_changed = last is not None and _origin(last) != _origin(message)
         if last is not None and message.timestamp < last.timestamp:
-            lost.update(_ROWS)
+            discontinued.update(_QUANTITIES)
         elif last is not None:
-            for name, row in _ROWS.items():
-                count = (getattr(message, row.counter) - getattr(last, row.counter)) % 256
-                shifts = moved and name in ("xy", "z")
+            for name, fields in _QUANTITIES.items():
+                count = (getattr(message, fields.counter) - getattr(last, fields.counter)) % 256
+                shifts = origin_changed and name in ("xy", "z")
                 if not count and not shifts:
                     continue
                 if count:
                     reset.add(name)
                     self._resets[name] += count
-                jump = _new_origin(name, row, last, message, count) if shifts else _delta(row, message, count)
+                jump = _jump_of_new_origin(name, last, message, count) if shifts else _delta(fields, message, count)
                 if jump is None:
-                    lost.add(name)
+                    discontinued.add(name)
                 else:
                     self._jumps[name] = tuple(a + b for a, b in zip(self._jumps[name], jump, strict=True))
-        for name in lost:
-            self._jumps[name] = _zero(_ROWS[name])
+        for name in discontinued:
+            self._jumps[name] = _zero(_QUANTITIES[name])
         values = {
-            word: value - jump
-            for name, row in _ROWS.items()
-            for word, value, jump in zip(row.values, _values(row, message), self._jumps[name], strict=True)
+            field_name: value - jump
+            for name, fields in _QUANTITIES.items()
+            for field_name, value, jump in zip(fields.values, _values(fields, message), self._jumps[name], strict=True)
         }
         values["heading"] = wrap(values["heading"])
         return Continuous(
             **values,
             reset=frozenset(reset),
-            lost=frozenset(lost),
-            origin_changed=moved,
+            discontinued=frozenset(discontinued),
+            origin_changed=origin_changed,
             resets=dict(self._resets),
         )
 
 
-def _delta(row: _Row, message: VehicleLocalPosition, count: int) -> Point | None:
-    """Return the jump that the message tells of, None if it does not tell of all of it."""
-    delta = getattr(message, row.delta)
+def _delta(fields: _Fields, message: Message, count: int) -> Point | None:
+    """Return the jump by the delta of the message, None if there were other resets or the delta is not provided."""
+    delta = getattr(message, fields.delta)
     jump: Point = delta if isinstance(delta, tuple) else (delta,)
     return jump if count == 1 and all(map(math.isfinite, jump)) else None
 
 
-def _new_origin(
-    name: Quantity, row: _Row, last: VehicleLocalPosition, message: VehicleLocalPosition, count: int
-) -> Point | None:
-    """Return the jump that a new origin made: none, the delta, or the way from origin to origin, whichever came."""
-    guesses = [_zero(row), _delta(row, message, count), _between_origins(name, last, message)]
+def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
+    """Return the jump at a new origin: none, the delta, or the shift between the origins, whichever fits the values."""
+    fields = _QUANTITIES[name]
+    candidates = [_zero(fields), _delta(fields, message, count), _shift_of_origin(name, last, message)]
     seconds = (message.timestamp - last.timestamp) / 1e6
-    speeds = [getattr(last, rate) for rate in row.rates]
-    motion = [speed * seconds if math.isfinite(speed) else 0.0 for speed in speeds]
-    came = [now - then - way for now, then, way in zip(_values(row, message), _values(row, last), motion, strict=True)]
-    reach = _NEAR + math.hypot(*motion) / 2
-    best = min((guess for guess in guesses if guess is not None), key=lambda guess: math.dist(guess, came))
-    return best if math.dist(best, came) <= reach else None
+    rates = [getattr(last, rate) for rate in fields.rates]
+    motion = [rate * seconds if math.isfinite(rate) else 0.0 for rate in rates]
+    observed = [
+        now - before - moved
+        for now, before, moved in zip(_values(fields, message), _values(fields, last), motion, strict=True)
+    ]
+    tolerance = _TOLERANCE + math.hypot(*motion) / 2
+    best = min((jump for jump in candidates if jump is not None), key=lambda jump: math.dist(jump, observed))
+    return best if math.dist(best, observed) <= tolerance else None
 
 
-def _between_origins(name: Quantity, last: VehicleLocalPosition, message: VehicleLocalPosition) -> Point | None:
-    """Return how far a place moves in the local frame when its origin does."""
+def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point | None:
+    """Return how far a fixed point moves in the local frame when its origin changes."""
     if name == "z":
         step = message.ref_alt - last.ref_alt
         return (step,) if math.isfinite(step) else None
@@ -151,15 +153,15 @@ def _between_origins(name: Quantity, last: VehicleLocalPosition, message: Vehicl
     return MapProjection(message.ref_lat, message.ref_lon).project(last.ref_lat, last.ref_lon)
 
 
-def _origin(message: VehicleLocalPosition) -> tuple[float | None, ...]:
-    """Return the origin in a form in which no origin equals no origin."""
+def _origin(message: Message) -> tuple[float | None, ...]:
+    """Return the origin with None for NaN, so that two missing origins are equal."""
     values = (message.ref_lat, message.ref_lon, message.ref_alt)
     return tuple(value if math.isfinite(value) else None for value in values)
 
 
-def _values(row: _Row, message: VehicleLocalPosition) -> Point:
-    return tuple(getattr(message, word) for word in row.values)
+def _values(fields: _Fields, message: Message) -> Point:
+    return tuple(getattr(message, name) for name in fields.values)
 
 
-def _zero(row: _Row) -> Point:
-    return (0.0,) * len(row.values)
+def _zero(fields: _Fields) -> Point:
+    return (0.0,) * len(fields.values)

@@ -1,4 +1,4 @@
-"""How ROS 2 names the layouts: the types that hold this message, and their RIHS01 hashes, computed from the fields."""
+"""The ROS 2 types of this message: their names, definitions and RIHS01 hashes, computed from the layouts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FIELD_TYPES: Final[Mapping[TypeName, tuple[int, int]]] = {
 
 
 def dds_type(name: str) -> str:
-    """Return the name of a ROS 2 type as it stands in a key: `px4_msgs::msg::dds_::VehicleLocalPosition_`."""
+    """Return the DDS name of a ROS 2 type, as in a key: `px4_msgs::msg::dds_::VehicleLocalPosition_`."""
     package, kind, type_name = name.split("/")
     return f"{package}::{kind}::dds_::{type_name}_"
 
@@ -38,22 +38,22 @@ def dds_type(name: str) -> str:
 def type_hash(layout: str, *, ros2_type: str = ROS2_TYPE) -> str:
     """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016), `RIHS01_` and 64 hex digits.
 
-    Raises LayoutError for the name of no layout.
+    Raises LayoutError for an unknown layout.
     """
     return _hash(get_layout(layout), ros2_type)
 
 
 def message_definition(layout: str) -> str:
-    """Return a layout as a .msg file of ROS 2, with unit and meaning of each field.
+    """Return the .msg file of a layout, with unit and meaning of each field.
 
-    Raises LayoutError for the name of no layout.
+    Raises LayoutError for an unknown layout.
     """
     described = VehicleLocalPosition.model_fields
-    rows = []
+    lines = []
     for name in get_layout(layout).fields:
         meaning = described[name].description if name in described else "Greatest height above ground [m]"
-        rows.append(f"{get_layout(layout).type_of(name)} {name}  # {meaning}\n")
-    return "".join(rows)
+        lines.append(f"{get_layout(layout).type_of(name)} {name}  # {meaning}\n")
+    return "".join(lines)
 
 
 def layout_of_type_hash(text: str) -> str | None:

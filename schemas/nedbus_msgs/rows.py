@@ -1,24 +1,90 @@
-"""A message as a named tuple: the same fields, the same checks, faster than a model."""
+"""A message as a named tuple, and the names and types of its fields, which the rest is derived from."""
 
 from __future__ import annotations
 
-from collections import namedtuple
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Mapping
+from typing import Final, NamedTuple, get_type_hints
 
-from .position import NAMES, VehicleLocalPosition
+from .px4_types import Bool, Float32, Float32x2, Float64, TypeName, Uint8, Uint64, type_name
 
-if TYPE_CHECKING:
 
-    class Row(VehicleLocalPosition):
-        """A message as a named tuple, with the fields of VehicleLocalPosition."""
+class Row(NamedTuple):
+    """A message as a named tuple, with the fields of VehicleLocalPosition in PX4's order.
 
-        _fields: ClassVar[tuple[str, ...]]
+    It takes a fraction of the time of a model, and is validated where it is decoded or encoded, not where it is made.
+    """
 
-        def _asdict(self) -> dict[str, Any]: ...
+    timestamp: Uint64
+    timestamp_sample: Uint64
 
-        @classmethod
-        def _make(cls, iterable: Sequence[object]) -> Row: ...
-else:
-    Row = namedtuple("Row", NAMES, module=__name__)
-    Row.__doc__ = "A message as a named tuple, with the fields of VehicleLocalPosition."
+    xy_valid: Bool
+    z_valid: Bool
+    v_xy_valid: Bool
+    v_z_valid: Bool
+
+    x: Float32
+    y: Float32
+    z: Float32
+    delta_xy: Float32x2
+    xy_reset_counter: Uint8
+    delta_z: Float32
+    z_reset_counter: Uint8
+
+    vx: Float32
+    vy: Float32
+    vz: Float32
+    z_deriv: Float32
+    delta_vxy: Float32x2
+    vxy_reset_counter: Uint8
+    delta_vz: Float32
+    vz_reset_counter: Uint8
+
+    ax: Float32
+    ay: Float32
+    az: Float32
+
+    heading: Float32
+    heading_var: Float32
+    unaided_heading: Float32
+    delta_heading: Float32
+    heading_reset_counter: Uint8
+    heading_good_for_control: Bool
+    tilt_var: Float32
+
+    xy_global: Bool
+    z_global: Bool
+    ref_timestamp: Uint64
+    ref_lat: Float64
+    ref_lon: Float64
+    ref_alt: Float32
+
+    dist_bottom_valid: Bool
+    dist_bottom: Float32
+    dist_bottom_var: Float32
+    delta_dist_bottom: Float32
+    dist_bottom_reset_counter: Uint8
+    dist_bottom_sensor_bitfield: Uint8
+
+    eph: Float32
+    epv: Float32
+    evh: Float32
+    evv: Float32
+
+    dead_reckoning: Bool
+
+    vxy_max: Float32
+    vz_max: Float32
+    hagl_min: Float32
+    hagl_max_z: Float32
+    hagl_max_xy: Float32
+
+
+Values = tuple[object, ...]
+"""The values of all fields, in PX4's order."""
+
+FIELD_TYPES: Final[Mapping[str, TypeName]] = {
+    name: type_name(hint) for name, hint in get_type_hints(Row, include_extras=True).items()
+}
+"""PX4's type of every field, in PX4's order."""
+
+NAMES: Final = Row._fields

@@ -1,4 +1,4 @@
-"""What the contract says of itself: the JSON Schema of the message, and the layouts with their fields and types."""
+"""The schema of the contract: the JSON Schema of the message, and the layouts with their fields and types."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .position import VehicleLocalPosition
 def json_schema() -> dict[str, object]:
     """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
     schema = VehicleLocalPosition.model_json_schema()
-    # JSON has no NaN, and "not provided" is no value that a writer should put in: defaults stay in the model.
+    # JSON has no NaN, and a writer should leave out what is not provided: defaults stay in the model.
     for field in schema["properties"].values():
         field.pop("default", None)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -1,4 +1,4 @@
-"""The one table of the four topics, and the pair address <-> key expression."""
+"""The one table of the four topics, addresses and selections of them, and their key expressions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Final
 from .errors import AddressError
 
 ANY: Final = "*"
+DEFAULT_TOPIC: Final = "vehicle_local_position"
 DEFAULT_PREFIX: Final = "nedbus"
 ENCODING: Final = "application/msgpack;px4_msgs/VehicleLocalPosition"
-"""Zenoh encoding of a payload; the payload alone is sufficient."""
+"""Zenoh encoding of a payload; a payload can be decoded without it."""
 
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
@@ -24,34 +25,30 @@ class Topic:
     """One uORB topic.
 
     `instances`: it has uORB instances, one per EKF.
-    `rate`: messages a second that PX4 sends or logs, nominal.
-    `priority`: Zenoh's name of the priority on a congested link.
-    `cache`: how many messages a publisher keeps for readers that missed some, about 20 s at full rate.
+    `rate`: the nominal rate at which PX4 publishes or logs it [Hz].
     `doc`: who publishes it.
     """
 
     name: str
     instances: bool
     rate: float
-    priority: str
-    cache: int
     doc: str
 
 
 TOPICS: Final[Mapping[str, Topic]] = {
     topic.name: topic
     for topic in (
-        Topic("vehicle_local_position", False, 100.0, "DATA_HIGH", 2000, "EKF2, or the EKF2 selector of several"),
-        Topic("vehicle_local_position_groundtruth", False, 50.0, "DATA", 1000, "simulators (SITL, HITL)"),
-        Topic("external_ins_local_position", False, 50.0, "DATA", 2000, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_local_position", True, 2.0, "DATA", 400, "each EKF instance, when several run"),
+        Topic("vehicle_local_position", False, 100.0, "EKF2, or the EKF2 selector of several"),
+        Topic("vehicle_local_position_groundtruth", False, 50.0, "simulators (SITL, HITL)"),
+        Topic("external_ins_local_position", False, 50.0, "an external INS driver (VectorNav, ...)"),
+        Topic("estimator_local_position", True, 2.0, "each EKF instance, when several run"),
     )
 }
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Address:
-    """Where a message belongs: vehicle, topic and, for estimator_local_position, the uORB instance.
+    """The address of a stream: vehicle, topic and, for estimator_local_position, the uORB instance.
 
     Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, an unknown topic, a missing instance
     where the topic has instances, or an instance where it has none.
@@ -69,7 +66,7 @@ class Address:
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Return the address that a key names; raise AddressError for any other key, wildcards included."""
+        """Return the address in a key; raise AddressError for any other key, wildcards included."""
         chunks = key.removeprefix(prefix + "/").split("/")
         if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
@@ -89,7 +86,7 @@ class Address:
         return f"{prefix}/{self.vehicle}/@alive/{self.stream}"
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression where messages of this address that failed validation are reported."""
+        """Return the key expression where rejected messages of this address are reported."""
         return f"{prefix}/@rejected/{self.vehicle}/{self.stream}"
 
     @property
@@ -101,32 +98,50 @@ class Address:
         return f"{self.vehicle}/{self.stream}"
 
 
-def selection(
-    topic: str = ANY, *, vehicle: str = ANY, instance: int | None = None, prefix: str = DEFAULT_PREFIX
-) -> str:
-    """Return the key expression for the addresses with this topic, vehicle and instance; "*" and None mean any.
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The addresses with this topic, vehicle and instance; "*" and None stand for any.
 
-    Raises AddressError for what no address can have.
+    Raises AddressError for what no address has.
     """
-    if vehicle != ANY:
-        check_vehicle(vehicle)
-    if topic == ANY:
-        if instance is not None:
-            raise AddressError("instance", instance, "none: name the topic as well")
-        return f"{prefix}/{vehicle}/**"
-    _check_instance(topic, instance)
-    if get_topic(topic).instances:
-        return f"{prefix}/{vehicle}/{topic}/{ANY if instance is None else instance}"
-    return f"{prefix}/{vehicle}/{topic}"
+
+    topic: str = ANY
+    vehicle: str = ANY
+    instance: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.vehicle != ANY:
+            check_vehicle(self.vehicle)
+        if self.topic != ANY:
+            get_topic(self.topic)
+            _check_instance(self.topic, self.instance)
+        elif self.instance is not None:
+            raise AddressError("instance", self.instance, "none: name the topic as well")
+
+    def matches(self, address: Address) -> bool:
+        """Return whether this address is one of them."""
+        return (
+            self.topic in (ANY, address.topic)
+            and self.vehicle in (ANY, address.vehicle)
+            and self.instance in (None, address.instance)
+        )
+
+    def key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the Zenoh key expression that matches the keys of these addresses."""
+        if self.topic == ANY:
+            return f"{prefix}/{self.vehicle}/**"
+        if get_topic(self.topic).instances:
+            return f"{prefix}/{self.vehicle}/{self.topic}/{ANY if self.instance is None else self.instance}"
+        return f"{prefix}/{self.vehicle}/{self.topic}"
 
 
-def alive_selection(*, prefix: str = DEFAULT_PREFIX) -> str:
+def alive_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
     """Return the key expression for the liveliness tokens of all addresses."""
     return f"{prefix}/*/@alive/**"
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-    """Return the address that a liveliness token names; raise AddressError for any other key."""
+    """Return the address in the key of a liveliness token; raise AddressError for any other key."""
     vehicle, alive, stream = key.removeprefix(prefix + "/").partition("/@alive/")
     if not alive:
         raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<topic>[/<instance>]")
@@ -134,29 +149,29 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
 
 
 def schema_key(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key that answers with the JSON Schema and the layouts that a publisher knows."""
+    """Return the key to query for the JSON Schema and the layouts that a publisher knows."""
     return f"{prefix}/@schema/VehicleLocalPosition"
 
 
 def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key that answers with the status of one service; "*" stands for all of them."""
+    """Return the key to query for the status of one service; "*" stands for all services."""
     return f"{prefix}/@service/{service}/status"
 
 
-def taken_key(key_expr: str) -> str:
-    """Return the key on which readers of a key, or of a key expression, answer when they have what came before."""
-    return f"{key_expr}/@taken"
+def ack_key(key_expr: str) -> str:
+    """Return the key to query for acknowledgements by the readers of a key or key expression."""
+    return f"{key_expr}/@ack"
 
 
 def get_topic(name: object) -> Topic:
-    """Return a row of TOPICS; raise AddressError for a name that has none."""
+    """Return a topic by its name; raise AddressError for an unknown one."""
     if not isinstance(name, str) or name not in TOPICS:
         raise AddressError("topic", name, f"one of {', '.join(TOPICS)}")
     return TOPICS[name]
 
 
 def check_vehicle(vehicle: object) -> None:
-    """Raise AddressError unless this can name a vehicle."""
+    """Raise AddressError for an invalid name of a vehicle."""
     if not isinstance(vehicle, str) or not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
 
@@ -171,6 +186,6 @@ def _check_instance(topic: str, instance: int | None) -> None:
 
 
 def check_prefix(prefix: str) -> None:
-    """Raise AddressError unless this can stand before every key: plain chunks between slashes."""
+    """Raise AddressError for an invalid key prefix: it is plain chunks with slashes between them."""
     if not all(_CHUNK.fullmatch(chunk) for chunk in prefix.split("/")):
         raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - with / between them")

@@ -1,7 +1,7 @@
 """The msgpack codec: one array `[layout, field 1 ... field 53]` of exactly 244 bytes.
 
-Our encoder writes every field at its full width, so every payload is at once plain msgpack and a fixed record.
-Any other valid msgpack of the array is read as well.
+The encoder writes every field at its full width, so a payload is both plain msgpack and a fixed-size struct.
+Any other valid msgpack encoding of the array is decoded as well.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ import msgpack
 from pydantic import ValidationError
 
 from .errors import DecodeError, EncodeError, UnknownLayoutError
+from .fast_path import check_row, row_of
 from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
-from .position import FIELD_TYPES, NAMES, Values, VehicleLocalPosition, check_row, message_of, row_of
+from .position import VehicleLocalPosition, message_of
 from .px4_types import TypeName
-from .rows import Row
+from .rows import FIELD_TYPES, NAMES, Row, Values
 
 PAYLOAD_SIZE: Final = 244
-"""Bytes of every payload that `encode` writes."""
+"""Bytes of every payload that `encode` returns."""
 
 PAYLOAD_LIMIT: Final = 4096
-"""Bytes of the largest payload that `decode` looks at; no encoding of the array comes near."""
+"""Bytes of the largest payload that `decode` accepts; every encoding of the array is much smaller."""
 
-# Per type: its tag, the struct format of tag and value, and which bits of them are value.
-# A bool is its tag: 0xc2 or 0xc3, so its last bit is the value.
+# Per type: its tag, the struct format of tag and value, and the mask of the value's bits.
+# A bool is only a tag, 0xc2 or 0xc3: its last bit is the value.
 _FULL_WIDTH: Final[Mapping[TypeName, tuple[bytes, str, bytes]]] = {
     "uint64": (b"\xcf" + bytes(8), "xQ", b"\x00" + b"\xff" * 8),
     "uint8": (b"\xcc" + bytes(1), "xB", b"\x00\xff"),
@@ -38,19 +39,19 @@ _FULL_WIDTH: Final[Mapping[TypeName, tuple[bytes, str, bytes]]] = {
 _HEAD = struct.pack(">BHB", 0xDC, 1 + len(FIELD_TYPES), cast("int", CURRENT.wire))
 _TYPES = [_FULL_WIDTH[kind] for kind in FIELD_TYPES.values()]
 TAGS = int.from_bytes(_HEAD + b"".join(tags for tags, _, _ in _TYPES), "big")
-_VALUES = int.from_bytes(bytes(len(_HEAD)) + b"".join(values for _, _, values in _TYPES), "big")
-NO_VALUES = ~_VALUES
-_RECORD = struct.Struct(f">{len(_HEAD)}x" + "".join(form for _, form, _ in _TYPES))
+_VALUE_MASK = int.from_bytes(bytes(len(_HEAD)) + b"".join(values for _, _, values in _TYPES), "big")
+TAG_MASK = ((1 << 8 * PAYLOAD_SIZE) - 1) ^ _VALUE_MASK
+_FIXED = struct.Struct(f">{len(_HEAD)}x" + "".join(form for _, form, _ in _TYPES))
 
 _FIRST, _SECOND = (NAMES.index(name) for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
 
 
-def places_on_the_wire() -> Iterator[tuple[str, int, int]]:
+def value_offsets() -> Iterator[tuple[str, int, int]]:
     """Yield name, part (of delta_xy and delta_vxy, else 0) and offset of every value in a full-width payload."""
     offset = len(_HEAD)
     for name, kind in FIELD_TYPES.items():
         _, _, bits = _FULL_WIDTH[kind]
-        starts = (place for place, each in enumerate(bits) if each and not (place and bits[place - 1]))
+        starts = (index for index, each in enumerate(bits) if each and not (index and bits[index - 1]))
         yield from ((name, part, offset + start) for part, start in enumerate(starts))
         offset += len(bits)
 
@@ -58,101 +59,103 @@ def places_on_the_wire() -> Iterator[tuple[str, int, int]]:
 def encode(message: VehicleLocalPosition) -> bytes:
     """Return the 244 bytes of a message; ref_lat and ref_lon are float64, all other floats float32.
 
-    Raises EncodeError for a message whose validation was bypassed and that holds what its fields cannot.
+    Raises EncodeError for values that do not fit their fields, in a message whose validation was bypassed.
     """
     try:
-        return _write(tuple(message.__dict__.values()))
+        return _pack(tuple(message.__dict__.values()))
     except (struct.error, OverflowError, TypeError) as exc:
         raise EncodeError(str(exc)) from exc
 
 
 def encode_fields(fields: Mapping[str, object]) -> bytes:
-    """Return the 244 bytes of the message that these fields make, without making it.
+    """Return the 244 bytes of the message with these fields, validated without making a model of them.
 
-    Raises pydantic.ValidationError for what the model refuses.
+    Raises pydantic.ValidationError for an invalid message.
     """
     row = row_of(fields)
-    return encode(VehicleLocalPosition.model_validate(fields)) if row is None else _write_row(row)
+    return encode(VehicleLocalPosition.model_validate(fields)) if row is None else _encode_valid_row(row)
 
 
 def encode_row(values: Sequence[object] | Row) -> bytes:
-    """Return the 244 bytes of the message with these values of all fields in PX4's order, without making it.
+    """Return the 244 bytes of the message with these values of all fields, validated without making a model of them.
 
-    Raises EncodeError for another number of values, pydantic.ValidationError for what the model refuses.
+    The values are in PX4's order.
+    Raises EncodeError for another number of values, pydantic.ValidationError for an invalid message.
     """
     values = tuple(values)
     if len(values) != len(NAMES):
         raise EncodeError(f"{len(values)} values, where a row has {len(NAMES)}")
     row = check_row(values)
-    return encode(_model_of(values)) if row is None else _write_row(row)
+    return encode(_to_model(values)) if row is None else _encode_valid_row(row)
 
 
 def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> VehicleLocalPosition:
-    """Return the message of a payload, checked by the model.
+    """Return the message of a payload, validated by the model.
 
-    `newer` gives the field names of layouts that this version does not know, by their number on the wire: the fields
-    known by name are read, the others ignored.
+    `newer` has the field names of layouts that this version does not know, by their number on the wire: fields with a
+    known name are decoded, the others ignored.
 
-    Raises UnknownLayoutError for a layout that is neither known nor given, DecodeError for anything else that is not
-    one message: other types, other lengths, trailing, missing or too many bytes, values that the model refuses.
+    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
+    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
     """
-    row = _read_full_width(payload)
-    return _decode_slowly(payload, newer) if row is None else message_of(row)
+    row = _decode_full_width(payload)
+    return _decode_any(payload, newer) if row is None else message_of(row)
 
 
 def decode_row(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> Row:
-    """Return the message of a payload as a named tuple, checked by the same validators and rules as by `decode`."""
-    row = _read_full_width(payload)
-    return Row._make(tuple(_decode_slowly(payload, newer).__dict__.values()) if row is None else row)
+    """Return the message of a payload as a named tuple, validated by the same types and rules as in `decode`."""
+    row = _decode_full_width(payload)
+    return Row._make(tuple(_decode_any(payload, newer).__dict__.values()) if row is None else row)
 
 
 def describe(error: ValidationError) -> str:
-    """Return what a validation error says, in one line: each field, what is wrong with it, and its value."""
+    """Return a validation error in one line: each field, the reason, and its value."""
     return "; ".join(
         f"{'.'.join(map(str, detail['loc']))}: {detail['msg']} (is {detail['input']!r:.40})"
         for detail in error.errors()
     )
 
 
-def _write(row: Values) -> bytes:
-    """Pack a row; raise struct.error, OverflowError or TypeError for what its fields cannot hold."""
+def _pack(row: Values) -> bytes:
+    """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
     one, two = cast("tuple[Values, Values]", (row[_FIRST], row[_SECOND]))
     flat = (*row[:_FIRST], *one, *row[_FIRST + 1 : _SECOND], *two, *row[_SECOND + 1 :])
-    # The record has zeros where the tags belong, and the tags have zeros where the values are.
-    return (int.from_bytes(_RECORD.pack(*flat), "big") | TAGS).to_bytes(PAYLOAD_SIZE, "big")
+    # The packed struct has zeros in place of the tags, and TAGS has zeros in place of the values.
+    return (int.from_bytes(_FIXED.pack(*flat), "big") | TAGS).to_bytes(PAYLOAD_SIZE, "big")
 
 
-def _write_row(row: Values) -> bytes:
+def _encode_valid_row(row: Values) -> bytes:
     try:
-        return _write(row)
-    except OverflowError:  # beyond float32: the model says so
-        return encode(_model_of(row))
+        return _pack(row)
+    except OverflowError:  # beyond float32: the model raises the error for it
+        return encode(_to_model(row))
 
 
-def _model_of(row: Values) -> VehicleLocalPosition:
+def _to_model(row: Values) -> VehicleLocalPosition:
     return VehicleLocalPosition.model_validate(dict(zip(NAMES, row, strict=True)))
 
 
-def _read_full_width(payload: bytes) -> Values | None:
-    """Read what `encode` writes, validated; None for anything that needs a closer look."""
+def _decode_full_width(payload: bytes) -> Values | None:
+    """Return the values of a payload as `encode` writes it, validated; None if `_decode_any` has to decide."""
     if len(payload) != PAYLOAD_SIZE:
         return None
     number = int.from_bytes(payload, "big")
-    if number & NO_VALUES != TAGS:
+    if number & TAG_MASK != TAGS:
         return None
-    flat = _RECORD.unpack((number & _VALUES).to_bytes(PAYLOAD_SIZE, "big"))
+    flat = _FIXED.unpack((number & _VALUE_MASK).to_bytes(PAYLOAD_SIZE, "big"))
     first, second = flat[_FIRST : _FIRST + 2], flat[_SECOND + 1 : _SECOND + 3]
     return check_row((*flat[:_FIRST], first, *flat[_FIRST + 2 : _SECOND + 1], second, *flat[_SECOND + 3 :]))
 
 
-def _decode_slowly(payload: bytes, newer: Mapping[int, Sequence[str]] | None) -> VehicleLocalPosition:
+def _decode_any(payload: bytes, newer: Mapping[int, Sequence[str]] | None) -> VehicleLocalPosition:
+    """Return the message of any msgpack encoding, in any known layout."""
     try:
-        return upgrade(_read_any(payload, newer or {}))
+        return upgrade(_unpack_fields(payload, newer or {}))
     except ValidationError as exc:
         raise DecodeError(describe(exc)) from exc
 
 
-def _read_any(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, object]:
+def _unpack_fields(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, object]:
     if len(payload) > PAYLOAD_LIMIT:
         raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
     try:
@@ -168,7 +171,7 @@ def _read_any(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[str, o
     if len(values) != len(names):
         raise DecodeError(f"{len(values)} fields where layout {layout} has {len(names)}")
     for name, value in zip(names, values, strict=True):
-        # Deeper nesting is no field of ours, and would exhaust the stack of whoever prints it.
+        # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
         if isinstance(value, tuple) and any(isinstance(item, tuple) for item in value):
             raise DecodeError(f"{name}: an array within an array")
     return dict(zip(names, values, strict=True))

@@ -3,18 +3,61 @@
 import nedbus
 
 with nedbus.connect() as bus:
-    for sample in bus.subscribe("vehicle_local_position"):
+    for sample in bus.subscribe():
         print(sample.vehicle, sample.message.x, sample.message.y, sample.message.z)
 """
 
 from __future__ import annotations
 
+from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nedbus_msgs import Address, ResetTracker, Row, VehicleLocalPosition, to_global
+    from nedbus_msgs import (
+        ANY,
+        Address,
+        Continuous,
+        GlobalPosition,
+        MapProjection,
+        Message,
+        NoOrigin,
+        Provenance,
+        Quantity,
+        ResetTracker,
+        Row,
+        Selection,
+        Vector,
+        VehicleLocalPosition,
+        enu_to_ned,
+        flu_to_frd,
+        frd_to_flu,
+        ned_to_enu,
+        to_global,
+        to_local,
+        variances_enu_to_ned,
+        variances_ned_to_enu,
+        yaw_enu_to_ned,
+        yaw_ned_to_enu,
+    )
+    from nedbus_msgs.arrays import DTYPE, MessageArray, to_array, to_message
 
-    from .bus import AsyncBus, Bus, connect, connect_async
+    from .client import (
+        AsyncBus,
+        AsyncPublisher,
+        AsyncSubscription,
+        Batch,
+        Bus,
+        Counts,
+        Health,
+        Mode,
+        Monitor,
+        Publisher,
+        Sample,
+        StreamHealth,
+        Subscription,
+        connect,
+        connect_async,
+    )
     from .errors import (
         AddressError,
         AddressInUseError,
@@ -27,64 +70,102 @@ if TYPE_CHECKING:
         ListenError,
         NedbusError,
         NoDataError,
+        OutputError,
+        PkiError,
         SourceError,
         UnknownLayoutError,
     )
-    from .health import Health, Monitor
-    from .intake import Counts, Sample
-    from .publisher import Publisher
-    from .reading import addresses_of, read
-    from .subscriber import AsyncSubscription, Subscription
+    from .recording import addresses_of, read
+    from .transport import Session, Tls
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "ANY",
+    "DTYPE",
     "Address",
     "AddressError",
     "AddressInUseError",
     "AsyncBus",
+    "AsyncPublisher",
     "AsyncSubscription",
+    "Batch",
     "Bus",
     "ClosedError",
     "ConfigError",
     "ConnectError",
+    "Continuous",
     "Counts",
     "DecodeError",
     "EncodeError",
+    "GlobalPosition",
     "Health",
     "LayoutError",
     "ListenError",
+    "MapProjection",
+    "Message",
+    "MessageArray",
+    "Mode",
     "Monitor",
     "NedbusError",
     "NoDataError",
+    "NoOrigin",
+    "OutputError",
+    "PkiError",
+    "Provenance",
     "Publisher",
+    "Quantity",
     "ResetTracker",
     "Row",
     "Sample",
+    "Selection",
+    "Session",
     "SourceError",
+    "StreamHealth",
     "Subscription",
+    "Tls",
     "UnknownLayoutError",
+    "Vector",
     "VehicleLocalPosition",
     "addresses_of",
     "connect",
     "connect_async",
+    "enu_to_ned",
+    "flu_to_frd",
+    "frd_to_flu",
+    "ned_to_enu",
     "read",
+    "to_array",
     "to_global",
+    "to_local",
+    "to_message",
+    "variances_enu_to_ned",
+    "variances_ned_to_enu",
+    "yaw_enu_to_ned",
+    "yaw_ned_to_enu",
 ]
 
+# `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.
+_MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client")
+_WITH_NUMPY = {
+    "DTYPE": "nedbus_msgs.arrays",
+    "MessageArray": "nedbus_msgs.arrays",
+    "to_array": "nedbus_msgs.arrays",
+    "to_message": "nedbus_msgs.arrays",
+    "Batch": "nedbus.client",
+    "addresses_of": "nedbus.recording",
+    "read": "nedbus.recording",
+}
 
-def __getattr__(name: str) -> object:
-    """Load everything when the first thing is asked for, and nothing before: `nedbus --version` needs nothing."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name in {"addresses_of", "read"}:  # NumPy takes longer to load than all the rest
-        from . import reading
 
-        return vars(reading)[name]
-    import nedbus_msgs
+if not TYPE_CHECKING:  # else type checkers would accept any name
 
-    from . import bus, errors, health, intake, publisher, subscriber
-
-    for module in (nedbus_msgs, bus, errors, health, intake, publisher, subscriber):
-        globals().update({each: vars(module)[each] for each in __all__ if each in vars(module)})
-    return globals()[name]
+    def __getattr__(name: str) -> object:
+        """Import what a public name needs when it is first used."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        if name in _WITH_NUMPY:
+            return getattr(_import_module(_WITH_NUMPY[name]), name)
+        for module in map(_import_module, _MODULES):
+            globals().update({each: vars(module)[each] for each in __all__ if each in vars(module)})
+        return globals()[name]

@@ -1,21 +1,21 @@
 """Every error that nedbus raises on purpose.
 
     NedbusError
-    ├── the caller's words
-    │   ├── AddressError (ValueError)        a vehicle, topic, instance, key or prefix that cannot be
+    ├── the caller's arguments
+    │   ├── AddressError (ValueError)        a vehicle, topic, instance, key or prefix that is invalid
     │   ├── LayoutError (ValueError)         field names that fit no layout
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
     │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
     │   ├── PkiError                         a key or certificate that cannot be made
-    │   └── RecordError (OSError)            a recording that cannot be written
+    │   └── OutputError (OSError)            a recording or a picture that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   └── ClosedError (RuntimeError)       the bus was closed
     └── the data
-        ├── DecodeError (ValueError)         a payload that is no VehicleLocalPosition
+        ├── DecodeError (ValueError)         a payload that is not a VehicleLocalPosition
         │   └── UnknownLayoutError           ... because its layout is newer than this reader
         └── SourceError                      a source that cannot be opened or read
 
@@ -50,23 +50,23 @@ __all__ = [
     "ListenError",
     "NedbusError",
     "NoDataError",
+    "OutputError",
     "PkiError",
-    "RecordError",
     "SourceError",
     "UnknownLayoutError",
 ]
 
 
 class AddressInUseError(NedbusError, ValueError):
-    """Raise when a second publisher of an address is asked for in one process."""
+    """Raised when a second publisher of an address is asked for in one process."""
 
     def __init__(self, address: Address) -> None:
-        super().__init__(f"{address} is published here already: give one of the two another vehicle")
+        super().__init__(f"{address} is published by this process already: give one of the two another vehicle")
         self.address = address
 
 
 class ConfigError(NedbusError, ValueError):
-    """Raise for a setting that cannot be; `where` names the flag, the environment variable or the place in a file."""
+    """Raised for an invalid setting; `where` names the flag, the environment variable, or file, line and column."""
 
     def __init__(self, where: str, reason: str) -> None:
         super().__init__(f"{where}: {reason}")
@@ -75,9 +75,9 @@ class ConfigError(NedbusError, ValueError):
 
     @classmethod
     def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:
-        """Build the error for a place in a file."""
-        place = f", line {line}, column {column}" if line else ""
-        return cls(f"{path}{place}", reason)
+        """Build the error for a line and column of a file."""
+        position = f", line {line}, column {column}" if line else ""
+        return cls(f"{path}{position}", reason)
 
 
 _TLS_HINT = (
@@ -87,7 +87,7 @@ _TLS_HINT = (
 
 
 class ConnectError(NedbusError, ConnectionError):
-    """Raise when no endpoint answered in time."""
+    """Raised when no endpoint answered in time."""
 
     def __init__(self, endpoints: Sequence[str], seconds: float) -> None:
         secure = any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints)
@@ -100,7 +100,7 @@ class ConnectError(NedbusError, ConnectionError):
 
 
 class ListenError(NedbusError, OSError):
-    """Raise when an endpoint cannot be listened on."""
+    """Raised when an endpoint cannot be listened on."""
 
     def __init__(
         self,
@@ -114,38 +114,38 @@ class ListenError(NedbusError, OSError):
 
 
 class NoDataError(NedbusError, TimeoutError):
-    """Raise when nothing arrived in time."""
+    """Raised when nothing arrived in time."""
 
     def __init__(self, what: str, seconds: float) -> None:
         super().__init__(f"nothing arrived on {what} within {seconds:.3g} s: 'nedbus list' shows what there is")
 
 
 class PkiError(NedbusError):
-    """Raise when a key or a certificate cannot be made, or would replace one."""
+    """Raised when a key or a certificate cannot be made, or would replace one."""
 
 
-class RecordError(NedbusError, OSError):
-    """Raise when a recording cannot be written; what was flushed before can be read."""
+class OutputError(NedbusError, OSError):
+    """Raised when a file cannot be written; of a recording, what was flushed before can be read."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {
             errno.EEXIST: "choose another name, or remove it",
-            errno.ENOSPC: "free some space or record elsewhere; what was written before can be read",
+            errno.ENOSPC: "free some space, or write elsewhere; what was flushed before can be read",
         }
-        hint = hints.get(error.errno or 0, "check the place that it names")
+        hint = hints.get(error.errno or 0, "check that its folder exists and that this user may write there")
         super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")
         self.path = path
 
 
 class ClosedError(NedbusError, RuntimeError):
-    """Raise when something is asked of a bus, a subscription or a publisher that was closed."""
+    """Raised when something is asked of a bus, a subscription or a publisher that was closed."""
 
     def __init__(self) -> None:
         super().__init__("this is closed, or the bus that it came from is: connect again")
 
 
 class SourceError(NedbusError):
-    """Raise when a source cannot be opened or read."""
+    """Raised when a source cannot be opened or read."""
 
     def __init__(self, source: str, reason: str) -> None:
         super().__init__(f"{source}: {reason}")

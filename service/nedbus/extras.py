@@ -1,21 +1,40 @@
-"""Optional parts: what is not installed is said in one line, with what to install."""
+"""Optional dependencies: modules that are imported when they are first used, and what to install for them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+from typing import Any, Final
 
 from .errors import ConfigError
 
+EXTRAS: Final = frozenset({"mcap", "mavlink", "foxglove", "plot", "pki"})
+"""The extras of this package, as in `pip install "nedbus[mcap]"`."""
+
 
 def needs(extra: str, module: str) -> Any:
-    """Return a module that needs an extra; raise ConfigError, which says what to install, when that is missing."""
+    """Import and return a module that needs an extra, or another package.
+
+    Raises ConfigError, which says what to install, when something that it imports is missing.
+    """
     try:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
-        what = f"'nedbus[{extra}]'" if extra in EXTRAS else extra
-        raise ConfigError(missing, f"this is not installed: pip install {what}") from exc
+        package = f"'nedbus[{extra}]'" if extra in EXTRAS else extra
+        raise ConfigError(missing, f"not installed: pip install {package}") from exc
 
 
-EXTRAS = frozenset({"mcap", "mavlink", "foxglove", "plot", "pki"})
+def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:
+    """Return a `__getattr__` for a package whose names are imported when they are first used.
+
+    `modules` gives the extra ("" for none) and the module of each name.
+    """
+
+    def get(name: str) -> object:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        extra, module = modules[name]
+        return getattr(needs(extra, f"{package}.{module}"), name)
+
+    return get

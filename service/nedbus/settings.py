@@ -1,4 +1,4 @@
-"""Settings from `nedbus.toml`, the environment and flags, in that rising order; the one place that reads them."""
+"""Settings from `nedbus.toml`, the environment and flags, each overriding the one before; nothing else reads them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
 from pydantic_settings import (
     BaseSettings,
     NoDecode,
@@ -21,7 +21,7 @@ from pydantic_settings import (
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
 
 from .errors import ConfigError
-from .session import DEFAULT_ENDPOINT, Tls, check_endpoints
+from .transport import Tls, check_endpoints, dial_endpoint, router_endpoints
 
 DEFAULT_FILE = Path("nedbus.toml")
 
@@ -49,18 +49,13 @@ def _vehicle(value: str) -> str:
     return value
 
 
-def dialled(endpoint: str) -> str:
-    """Return where a client of this host reaches a router that listens here, on all interfaces perhaps."""
-    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
-
-
 Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split), AfterValidator(_endpoints)]
 
 
 class Settings(BaseSettings):
-    """What can be set; every field is also NEDBUS_<FIELD> in the environment, with commas between several values.
+    """All settings; every field is also NEDBUS_<FIELD> in the environment, with commas between several values.
 
-    Make one with `load_settings`, which turns every mistake into a ConfigError that names its place.
+    `load_settings` makes one; it raises ConfigError with the flag, the variable, or file, line and column.
     """
 
     model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
@@ -78,6 +73,8 @@ class Settings(BaseSettings):
     source: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)] = Field((), description="What is published")
     until_done: bool = Field(False, description="End when every finite source has ended")
 
+    _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
+
     @classmethod
     def settings_customise_sources(
         cls,
@@ -93,11 +90,25 @@ class Settings(BaseSettings):
     @property
     def routers(self) -> tuple[str, ...]:
         """The endpoints that a client joins: `connect`, else the router that these settings start on this host."""
-        return self.connect or tuple(map(dialled, self.listen)) or (DEFAULT_ENDPOINT,)
+        return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
+
+    @property
+    def router_endpoints(self) -> tuple[str, ...]:
+        """The endpoints on which the embedded router of a service with these settings listens."""
+        return router_endpoints(self.listen, self.router_config)
+
+    @property
+    def is_client(self) -> bool:
+        """Whether a service with these settings joins other routers without being one itself."""
+        return bool(self.connect) and not (self.listen or self.router_config)
+
+    def set_by(self, name: str) -> str:
+        """Return what sets a setting: the name of a flag, an environment variable, or a file; "" for a default."""
+        return self._set_by.get(name, "")
 
     @property
     def tls(self) -> Tls | None:
-        """The files of a client of tls/ endpoints; raise ConfigError for a certificate without an authority."""
+        """The files of a client of tls/ endpoints; raise ConfigError for half of what is needed."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
                 raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")
@@ -108,23 +119,38 @@ class Settings(BaseSettings):
 def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if there is one) and the environment.
 
-    What is given here and not None wins.
+    What is given here and not None overrides both.
 
     Raises ConfigError, with file, line and column or the name of the flag or variable.
     """
-    path = Path(file) if file else (Path(os.environ["NEDBUS_CONFIG"]) if os.environ.get("NEDBUS_CONFIG") else None)
-    if path is not None and not path.is_file():
-        raise ConfigError.in_file(path, "there is no such file")
-    path = path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
+    path = _settings_file(file)
     flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     try:
-        return _with_file(path)(**flags)
+        settings = _with_file(path)(**flags)
     except UnicodeDecodeError as exc:
-        raise ConfigError.in_file(path or DEFAULT_FILE, "this is no text in UTF-8") from exc
+        raise ConfigError.in_file(path or DEFAULT_FILE, "this is not text in UTF-8") from exc
     except tomllib.TOMLDecodeError as exc:
         raise _toml_error(path or DEFAULT_FILE, exc) from exc
     except ValidationError as exc:
         raise _setting_error(path, flags, exc) from exc
+    settings._set_by.update({name: _set_by(name, path, flags) for name in settings.model_fields_set})
+    return settings
+
+
+def _settings_file(given: str | Path | None) -> Path | None:
+    """Return the file to read, None if there is none; raise ConfigError when one is named that does not exist."""
+    path = Path(given) if given else (Path(os.environ["NEDBUS_CONFIG"]) if os.environ.get("NEDBUS_CONFIG") else None)
+    if path is not None and not path.is_file():
+        raise ConfigError.in_file(path, "there is no such file")
+    return path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
+
+
+def _set_by(name: str, path: Path | None, flags: Mapping[str, object]) -> str:
+    """Return what sets a setting: the flag or argument of that name, its environment variable, or the file."""
+    variable = f"NEDBUS_{name.upper()}"
+    if name in flags or not (os.environ.get(variable) or path):
+        return name
+    return variable if os.environ.get(variable) else str(path)
 
 
 def _with_file(path: Path | None) -> type[Settings]:
@@ -137,12 +163,12 @@ def _with_file(path: Path | None) -> type[Settings]:
 
 
 def _toml_error(path: Path, error: tomllib.TOMLDecodeError) -> ConfigError:
-    place = re.search(r"\(at line (\d+), column (\d+)\)", str(error))
+    position = re.search(r"\(at line (\d+), column (\d+)\)", str(error))
     reason = re.sub(r" \(at .*\)", "", str(error))
-    if place is None:  # "at end of document"
+    if position is None:  # "at end of document"
         lines = path.read_text().splitlines() or [""]
         return ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1)
-    return ConfigError.in_file(path, reason, line=int(place[1]), column=int(place[2]))
+    return ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2]))
 
 
 def _setting_error(path: Path | None, flags: Mapping[str, object], error: ValidationError) -> ConfigError:
@@ -153,13 +179,9 @@ def _setting_error(path: Path | None, flags: Mapping[str, object], error: Valida
         reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
-    if name in flags:
-        return ConfigError(name, reason)
-    variable = f"NEDBUS_{name.upper()}"
-    if variable in os.environ:
-        return ConfigError(variable, reason)
-    if path is None:
-        return ConfigError(name, reason)
+    setter = _set_by(name, path, flags)
+    if path is None or setter != str(path):
+        return ConfigError(setter, reason)
     line, column = _find_key(path.read_text(), name)
     return ConfigError.in_file(path, reason, line=line, column=column)
 

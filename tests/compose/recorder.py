@@ -43,6 +43,6 @@ class Recorder:
         self._thread.join(DEADLINE)
 
 
-def places(samples: list[nedbus.Sample], flight: Flight) -> list[int]:
-    """Return the places of these samples of one address in its flight; every value must be right."""
-    return flight.places((sample.address, sample.message) for sample in samples).popitem()[1]
+def indices(samples: list[nedbus.Sample], flight: Flight) -> list[int]:
+    """Return the indices of these samples of one address in its flight; every value must be right."""
+    return flight.indices((sample.address, sample.message) for sample in samples).popitem()[1]

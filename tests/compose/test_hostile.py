@@ -15,7 +15,7 @@ from tests.conftest import DEADLINE, message, wait_for
 
 from .conftest import StartStack
 from .flight import Flight, is_whole
-from .recorder import Recorder, places
+from .recorder import Recorder, indices
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
 
@@ -49,8 +49,8 @@ def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: list[R
     stack.up()
     host, port = stack.address.split(":")
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        reader = Recorder(bus.subscribe(mode="every"))
-        latest = Recorder(bus.subscribe())
+        reader = Recorder(bus.subscribe("*", mode="every"))
+        latest = Recorder(bus.subscribe("*"))
         record += [reader, latest]
         reader.wait_for_more(100)
         chance = random.Random(1)
@@ -72,7 +72,7 @@ def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: list[R
             hostile._session.put(f"nedbus/1/{VLP}", b"\xc0" * 10_000_000, congestion_control=BLOCK)
             reader.wait_for_more(500)
         assert reader.subscription.counts == nedbus.Counts(received=len(reader.samples), invalid=1006)
-        assert is_whole(places(reader.of(Address("1", VLP)), Flight()))
+        assert is_whole(indices(reader.of(Address("1", VLP)), Flight()))
         assert 500 < latest.subscription.counts.invalid <= 1006, "superseded ones are not judged"
         assert {sample.vehicle for sample in reader.samples + latest.samples} == {"1"}
     for service in ("router", "service"):

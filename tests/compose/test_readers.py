@@ -8,8 +8,9 @@ import time
 import pytest
 
 import nedbus
+from nedbus import Mode
 from nedbus_msgs import TOPICS, Address, VehicleLocalPosition
-from tests.conftest import DEADLINE, Mode, Process, wait_for
+from tests.conftest import DEADLINE, Process, wait_for
 
 from .conftest import StartStack
 from .flight import Flight, is_whole
@@ -34,16 +35,16 @@ def parse(output: str) -> list[tuple[Address, VehicleLocalPosition]]:
 
 
 def read_on_host(endpoint: str) -> list[tuple[Address, VehicleLocalPosition]]:
-    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(mode="every") as subscription:
+    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe("*", mode="every") as subscription:
         arrived = [subscription.receive(DEADLINE) for _ in range(COUNT)]
         assert subscription.counts == nedbus.Counts(received=COUNT)
     return [(sample.address, sample.message) for sample in arrived]
 
 
 def check(arrived: list[tuple[Address, VehicleLocalPosition]]) -> None:
-    places = Flight().places(arrived)
-    assert set(places) >= STREAMS
-    assert all(map(is_whole, places.values()))
+    indices = Flight().indices(arrived)
+    assert set(indices) >= STREAMS
+    assert all(map(is_whole, indices.values()))
 
 
 def check_echo(echo: Process) -> None:
@@ -54,7 +55,7 @@ def check_echo(echo: Process) -> None:
     check(arrived)
 
 
-ECHO = ("echo", "--wait", "--json", "--count", str(COUNT))
+ECHO = ("echo", "*", "--every", "--wait", "--json", "--count", str(COUNT))
 
 
 def test_host_and_container_read_everything(make_stack: StartStack) -> None:

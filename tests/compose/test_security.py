@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 import nedbus
-from nedbus.pki import make_authority, make_certificate
+from nedbus.transport import make_authority, make_certificate
 from nedbus_msgs import Address
 from tests.conftest import DEADLINE, Process, message, wait_for
 
 from .conftest import StartStack
 from .flight import Flight, is_whole
-from .recorder import Recorder, places
+from .recorder import Recorder, indices
 from .stack import Stack
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
@@ -56,14 +56,14 @@ def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeo
     """Connect from the host, as somebody."""
     own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
     endpoint = f"tls/{stack.address}"
-    return nedbus.connect(endpoint, tls_ca=pki / ca, tls_certificate=own, tls_key=key, timeout=timeout)
+    return nedbus.connect(endpoint, tls=nedbus.Tls(pki / ca, own, key), timeout=timeout)
 
 
 @pytest.fixture
 def reader(secure: Stack, pki: Path, record: list[Recorder]) -> Recorder:
     """Read everything, as the host's script of the README does."""
     bus = join(secure, pki, "reader")
-    record.append(Recorder(bus.subscribe(mode="every")))
+    record.append(Recorder(bus.subscribe("*", mode="every")))
     record[-1].wait_for_more(100)
     return record[-1]
 
@@ -73,7 +73,7 @@ def check_genuine(reader: Recorder) -> None:
     reader.wait_for_more(300)
     samples = list(reader.samples)
     assert {sample.vehicle for sample in samples} == {"1"}
-    assert is_whole(places([sample for sample in samples if sample.address == MINE], Flight()))
+    assert is_whole(indices([sample for sample in samples if sample.address == MINE], Flight()))
     assert reader.subscription.counts.invalid == 0
 
 
@@ -89,7 +89,7 @@ def test_denied_puts_do_not_arrive(secure: Stack, pki: Path, reader: Recorder, n
         check_genuine(reader)
         with join(secure, pki, "reader") as other:
             assert list(other.vehicles()) == ["1"]
-            assert {sample.vehicle for sample in other.latest()} == {"1"}
+            assert {sample.vehicle for sample in other.latest("*")} == {"1"}
 
 
 def test_service_with_a_wrong_name_publishes_nothing(secure: Stack, reader: Recorder) -> None:

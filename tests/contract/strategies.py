@@ -1,4 +1,4 @@
-"""Hypothesis strategies for messages: every valid one, and every way to write one in msgpack."""
+"""Hypothesis strategies for valid messages, with the rules spelled out once more, independently of nedbus_msgs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
 
-FLAGGED: Mapping[str, tuple[str, ...]] = {
+FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
     "xy_valid": ("x", "y"),
     "z_valid": ("z",),
     "v_xy_valid": ("vx", "vy"),
@@ -35,7 +35,7 @@ TYPES: Mapping[str, st.SearchStrategy[object]] = {
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:
-    """Bend any fields of the right types so that they keep every rule between fields."""
+    """Change any fields of the right types so that they pass every rule between fields."""
     for name in NOT_NEGATIVE:
         value = fields[name]
         assert isinstance(value, float)
@@ -45,7 +45,7 @@ def make_valid(fields: dict[str, object]) -> dict[str, object]:
         assert isinstance(value, float)
         if abs(value) > bound:
             fields[name] = math.copysign(bound, value)
-    for flag, names in FLAGGED.items():
+    for flag, names in FLAG_FIELDS.items():
         if not all(math.isfinite(value) for name in names if isinstance(value := fields[name], float)):
             fields[flag] = False
     first, second = fields["timestamp_sample"], fields["timestamp"]
@@ -56,15 +56,15 @@ def make_valid(fields: dict[str, object]) -> dict[str, object]:
 
 
 def fields() -> st.SearchStrategy[dict[str, object]]:
-    """Return every valid message by its fields."""
+    """Return a strategy for the fields of any valid message."""
     return st.fixed_dictionaries({name: TYPES[kind] for name, kind in FIELD_TYPES.items()}).map(make_valid)
 
 
 def messages() -> st.SearchStrategy[VehicleLocalPosition]:
-    """Return every valid message."""
+    """Return a strategy for any valid message."""
     return fields().map(VehicleLocalPosition.model_validate)
 
 
 def bits(message: VehicleLocalPosition) -> dict[str, str]:
-    """Return a message so that any NaN equals any NaN, and -0.0 does not equal 0.0."""
+    """Return the values of a message as text: NaN equals NaN, and -0.0 does not equal 0.0."""
     return {name: repr(value) for name, value in message.model_dump().items()}

@@ -1,4 +1,4 @@
-"""One by one, as rows and by the thousand: every form accepts and refuses exactly what the model does."""
+"""Models, rows, fields and arrays: each form accepts and rejects exactly what the model does."""
 
 from __future__ import annotations
 
@@ -21,16 +21,27 @@ from nedbus_msgs import (
     VehicleLocalPosition,
     decode,
     decode_row,
+    downgrade,
     encode,
+    encode_cdr,
     encode_fields,
     encode_row,
 )
-from nedbus_msgs.arrays import DTYPE, find_sound, read_records, to_message, to_records, write_records
+from nedbus_msgs.arrays import (
+    DTYPE,
+    decode_array,
+    decode_cdr_array,
+    encode_array,
+    encode_cdr_array,
+    to_array,
+    to_message,
+    valid_mask,
+)
 
-from .strategies import FLAGGED, NOT_NEGATIVE, WITHIN, bits, messages
+from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, messages
 
 GOOD = encode(VehicleLocalPosition.model_validate({"timestamp": 5, **dict.fromkeys(["vxy_max", "eph"], math.inf)}))
-# What a field may be given, good or bad, whatever its type.
+# Values for any field, valid or not, whatever its type.
 ODD = st.one_of(
     st.integers(-(2**70), 2**70),
     st.floats(allow_subnormal=True),
@@ -43,7 +54,7 @@ ODD = st.one_of(
     st.lists(st.floats(), max_size=3),
 )
 CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ODD, max_size=3)
-# Values that the field's own type allows, and perhaps not the rules.
+# Values that the field's own type allows, but perhaps not the rules.
 SAME_TYPE = {
     "uint64": st.integers(0, 2**64 - 1),
     "uint8": st.integers(0, 255),
@@ -52,42 +63,59 @@ SAME_TYPE = {
     "float32[2]": st.tuples(st.floats(width=32), st.floats(width=32)),
     "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
 }
-RULED = ["timestamp", "timestamp_sample", *FLAGGED, *(n for names in FLAGGED.values() for n in names), *NOT_NEGATIVE]
-BROKEN = st.sampled_from([*RULED, *WITHIN]).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
+FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
+RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
+BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
 
 
-def judged(fields: Mapping[str, object]) -> bytes | None:
-    """Return the payload of the message that the model makes of these, None if it refuses them."""
+def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
+    """Return the payload of the message with these fields, None if the model rejects them."""
     try:
         return encode(VehicleLocalPosition.model_validate(fields))
     except ValidationError:
         return None
 
 
-def reasons(send: Callable[[Any], bytes], values: object) -> str:
-    """Return why this is refused."""
+def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
+    """Return the reasons for which these values are rejected."""
     with pytest.raises(ValidationError) as info:
-        send(values)
+        encode_values(values)
     return str(info.value)
 
 
 @given(messages(), CHANGES)
-def test_fields_and_rows_are_judged_as_by_the_model(message: VehicleLocalPosition, changes: dict[str, object]) -> None:
-    """Made by keywords, sent as fields or as a row: the same bytes, or the same refusal, with the same reasons."""
+def test_fields_and_rows_are_validated_as_by_the_model(
+    message: VehicleLocalPosition, changes: dict[str, object]
+) -> None:
+    """As keywords, as fields or as a row: the same bytes, or the same rejection, with the same reasons."""
     fields = {**message.model_dump(), **changes}
-    right = judged(fields)
-    if right is not None:
+    expected = payload_by_model(fields)
+    if expected is not None:
         made = VehicleLocalPosition(**fields)
-        assert encode(made) == encode_fields(fields) == encode_row(list(fields.values())) == right
+        assert encode(made) == encode_fields(fields) == encode_row(list(fields.values())) == expected
         assert bits(made) == bits(VehicleLocalPosition.model_validate(fields))
         return
-    why = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
-    assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == why
-    assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == why
+    expected_reasons = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    assert reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == expected_reasons
+    assert reasons(encode_fields, fields) == reasons(encode_row, list(fields.values())) == expected_reasons
+
+
+@pytest.mark.parametrize("changes", [{"x": 1e39}, {"delta_xy": (0.0, -1e39)}, {"x": "1"}, {"hagl": 1.0}])
+def test_model_decides_what_the_fast_path_does_not_accept(changes: dict[str, object]) -> None:
+    """A number beyond float32, a wrong type or a misspelled field among all the others has the model's reasons."""
+    fields = {**decode(GOOD).model_dump(), **changes}
+    if "hagl" in changes:
+        del fields["hagl_min"]
+    expected = reasons(lambda each: encode(VehicleLocalPosition.model_validate(each)), fields)
+    assert (
+        reasons(lambda each: encode(VehicleLocalPosition(**each)), fields) == reasons(encode_fields, fields) == expected
+    )
+    if "hagl" not in changes:
+        assert reasons(encode_row, list(fields.values())) == expected
 
 
 def pack_full_width(values: Mapping[str, object]) -> bytes:
-    """Return the payload of values that their types allow, whatever the rules say of them."""
+    """Return the payload of values of the right types, whether they pass the rules or not."""
     forms = {"uint64": ">BQ", "uint8": ">BB", "float32": ">Bf", "float64": ">Bd"}
     tags = {"uint64": 0xCF, "uint8": 0xCC, "float32": 0xCA, "float64": 0xCB}
     parts = [b"\xdc\x00\x36\x01"]
@@ -104,50 +132,52 @@ def pack_full_width(values: Mapping[str, object]) -> bytes:
 
 
 @given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))
-def test_payloads_are_judged_as_by_the_model(
+def test_payloads_are_valid_as_by_the_model(
     cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]],
 ) -> None:
-    """Read one by one, as rows, or as an array: the same values to the bit, or the same refusal."""
+    """Decoded one by one, as rows, or as an array: the same values to the bit, or the same rejection."""
     payloads = [pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases]
-    records, valid = read_records(b"".join(payloads))
-    for place, payload in enumerate(payloads):
+    array, valid = decode_array(b"".join(payloads))
+    for index, payload in enumerate(payloads):
         fields = dict(zip(FIELD_TYPES, msgpack.unpackb(payload, use_list=False)[1:], strict=True))
-        right = judged(fields)
-        assert (right is not None) == valid[place]
-        if right is None:
-            for read in (decode, decode_row):
+        expected = payload_by_model(fields)
+        assert (expected is not None) == valid[index]
+        if expected is None:
+            for decode_payload in (decode, decode_row):
                 with pytest.raises(DecodeError):
-                    read(payload)
+                    decode_payload(payload)
             with pytest.raises(ValidationError):
-                to_message(records[place])
+                to_message(array[index])
         else:
             message = decode(payload)
-            assert right == payload == encode(message) == encode_row(decode_row(payload))
+            assert expected == payload == encode(message) == encode_row(decode_row(payload))
             assert bits(message) == bits(VehicleLocalPosition.model_validate(fields))
             assert message.model_fields_set == set(FIELD_TYPES)
-            assert encode(to_message(records[place])) == payload
+            assert encode(to_message(array[index])) == payload
             assert decode_row(payload)._fields == tuple(FIELD_TYPES)
-    assert write_records(records) == b"".join(payloads)
+    assert encode_array(array) == b"".join(payloads)
 
 
 @given(messages(), st.integers(0, 243), st.integers(0, 255))
-def test_damaged_payload_is_never_taken_for_a_good_one(message: VehicleLocalPosition, place: int, byte: int) -> None:
-    """Whatever one byte becomes: an array's quick look accepts only what one by one is accepted too."""
+def test_damaged_payload_is_valid_in_an_array_only_if_it_decodes(
+    message: VehicleLocalPosition, index: int, byte: int
+) -> None:
+    """Whatever one byte becomes: an array's mask accepts only what `decode` accepts too."""
     payload = bytearray(encode(message))
-    payload[place] = byte
-    _, valid = read_records(bytes(payload))
+    payload[index] = byte
+    _, valid = decode_array(bytes(payload))
     try:
-        read = decode(bytes(payload))
+        message = decode(bytes(payload))
     except DecodeError:
         assert not valid[0]
     else:
         row = decode_row(bytes(payload))
-        assert bits(VehicleLocalPosition.model_validate(dict(zip(FIELD_TYPES, row, strict=True)))) == bits(read)
+        assert bits(VehicleLocalPosition.model_validate(dict(zip(FIELD_TYPES, row, strict=True)))) == bits(message)
 
 
 @given(messages())
-def test_any_encoding_is_read_as_a_row(message: VehicleLocalPosition) -> None:
-    """What another encoder writes shorter is the same row."""
+def test_any_encoding_is_decoded_as_a_row(message: VehicleLocalPosition) -> None:
+    """A shorter encoding by another encoder is the same row."""
     values = [1, *(list(value) if isinstance(value, tuple) else value for value in message.model_dump().values())]
     payload = msgpack.packb(values)
     assert encode_row(decode_row(payload)) == encode(message)
@@ -155,12 +185,21 @@ def test_any_encoding_is_read_as_a_row(message: VehicleLocalPosition) -> None:
 
 @given(st.lists(messages(), max_size=4))
 def test_arrays_are_messages(many: list[VehicleLocalPosition]) -> None:
-    """There and back, with exact types."""
-    records = to_records(many)
-    assert records.dtype == DTYPE
-    assert find_sound(records).all()
-    assert [bits(to_message(record)) for record in records] == [bits(message) for message in many]
-    assert write_records(records) == b"".join(map(encode, many))
+    """Messages survive the round trip through an array and its payloads, with exact types."""
+    array = to_array(many)
+    assert array.dtype == DTYPE
+    assert valid_mask(array).all()
+    assert [bits(to_message(element)) for element in array] == [bits(message) for message in many]
+    assert encode_array(array) == b"".join(map(encode, many))
+
+
+@given(st.lists(messages(), max_size=4))
+def test_cdr_arrays_are_messages(many: list[VehicleLocalPosition]) -> None:
+    """An array has the same CDR payloads as its messages, and they decode to the same array."""
+    array = to_array(many)
+    payloads = encode_cdr_array(array).tobytes()
+    assert payloads == b"".join(encode_cdr(downgrade(message, "1.16"), layout="1.16") for message in many)
+    assert decode_cdr_array(payloads).tobytes() == array.tobytes()
 
 
 def test_dtypes_are_px4s() -> None:
@@ -172,14 +211,14 @@ def test_dtypes_are_px4s() -> None:
 
 
 @pytest.mark.parametrize("values", [[], [1], range(54)])
-def test_row_of_another_length_is_refused(values: list[object]) -> None:
-    """Too few or too many values are no message."""
+def test_row_of_another_length_is_rejected(values: list[object]) -> None:
+    """Too few or too many values are not a message."""
     with pytest.raises(EncodeError, match="where a row has 53"):
         encode_row(values)
 
 
 class Low(VehicleLocalPosition):
-    """A user's own model, which wants more."""
+    """A user's own model, with a rule more."""
 
     @field_validator("z")
     @classmethod
@@ -190,15 +229,15 @@ class Low(VehicleLocalPosition):
 
 
 def test_subclass_keeps_its_own_rules() -> None:
-    """The quick lane is for the model itself: whoever derives from it is asked."""
+    """The fast path is for the model itself: the validators of a subclass run."""
     fields = {name: value for name, value in decode(GOOD).model_dump().items() if name != "z"}
     assert type(Low(z=-5.0, **fields)) is Low
     with pytest.raises(ValidationError, match="too high"):
         Low(z=-20.0, **fields)
 
 
-def test_dicts_and_json_do_not_pass_through_the_constructor() -> None:
-    """Pydantic takes the constructor for its own: JSON keeps its words for what is no number."""
+def test_dicts_and_json_do_not_call_the_constructor() -> None:
+    """Pydantic treats the constructor as its own: JSON keeps its strings for NaN and infinities."""
     assert not VehicleLocalPosition.__pydantic_custom_init__
     message = decode(GOOD)
     assert bits(VehicleLocalPosition.model_validate_json(message.model_dump_json())) == bits(message)

@@ -1,4 +1,4 @@
-"""The layout table, compared with the documents that the project started from, and the way between layouts."""
+"""The layout table, compared with the documents that the project started from, and conversion between layouts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_layout_is_the_documents(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEEDS)
 def test_fixture_is_the_documents(name: str) -> None:
-    """The facts in tests/data/seeds.json are what the documents say."""
+    """tests/data/seeds.json has the fields of the documents."""
     path = SHARED / SEEDS[name]["seed"]
     if not path.exists():
         pytest.skip(f"the document is not here: {path.name}")
@@ -51,7 +51,7 @@ def test_fixture_is_the_documents(name: str) -> None:
 
 
 def test_table_has_px4s_layouts() -> None:
-    """Five layouts, with PX4's numbers of fields; two of them may stand on the wire."""
+    """Five layouts, with PX4's numbers of fields; two of them are used on the wire."""
     assert {name: len(layout.fields) for name, layout in LAYOUTS.items()} == COUNTS
     assert {number: layout.name for number, layout in WIRE_LAYOUTS.items()} == {0: "V0", 1: "1.16"}
     assert CURRENT.fields == tuple(FIELD_TYPES)
@@ -60,7 +60,7 @@ def test_table_has_px4s_layouts() -> None:
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_layout_is_found_from_names_in_any_order(name: str) -> None:
-    """A ULog sorts fields by size; the names alone tell the layout."""
+    """A ULog sorts fields by size; the names alone determine the layout."""
     assert find_layout(reversed(LAYOUTS[name].fields)) is LAYOUTS[name]
     assert find_layout(LAYOUTS[name].fields[1:]) is None
 
@@ -92,22 +92,22 @@ def test_not_provided_fields_of_an_old_layout() -> None:
 
 
 def test_yaw_of_1_11_is_heading() -> None:
-    """1.11 and before say yaw; 2016 logs have 24 fields: what is there is taken, the rest is not provided."""
+    """1.11 and before have yaw; 2016 logs have 24 fields: known fields are used, the rest is not provided."""
     message = upgrade({"timestamp": 5, "x": 1.0, "yaw": 0.5, "ref_yaw": 9.0, "dist_bottom_rate": 1.0})
     assert (message.heading, message.x) == (0.5, 1.0)
     assert message.model_fields_set == {"timestamp", "x", "heading"}
 
 
-def test_upgrade_with_a_name_wants_exactly_its_fields() -> None:
-    """The error names what is missing or unknown, and the layout that would fit."""
+def test_upgrade_with_a_layout_needs_exactly_its_fields() -> None:
+    """The error names what is missing or unknown, and the layout that fits."""
     fields = downgrade(VehicleLocalPosition(timestamp=1), "1.14")
     with pytest.raises(LayoutError, match=r"missing.*tilt_var.*layout 1\.14"):
         upgrade(fields, "1.15")
     with pytest.raises(LayoutError, match="unknown bogus"):
         upgrade({**fields, "bogus": 1}, "1.14")
-    with pytest.raises(LayoutError, match=r"no layout '1\.12'"):
+    with pytest.raises(LayoutError, match=r"unknown layout '1\.12'"):
         upgrade(fields, "1.12")
-    with pytest.raises(LayoutError, match="no layout 'v9'"):
+    with pytest.raises(LayoutError, match="unknown layout 'v9'"):
         downgrade(VehicleLocalPosition(timestamp=1), "v9")
 
 
@@ -118,7 +118,7 @@ def test_upgrade_keeps_the_rules() -> None:
 
 
 def test_layout_table_is_json() -> None:
-    """Publishers answer with it, so it must be JSON and complete."""
+    """Publishers reply with it to queries, so it must be JSON and complete."""
     table = json.loads(json.dumps(layout_table()))
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
         ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),

@@ -1,4 +1,4 @@
-"""The model: types, ranges, rules between fields, what it says when it refuses."""
+"""The model: types, ranges, rules between fields, and the reasons of its errors."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pydantic import ValidationError
 
 from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, describe, json_schema
 
-from .strategies import FLAGGED, NOT_NEGATIVE, WITHIN, bits, messages
+from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, messages
 
 FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]
 
 
-def refuse(**fields: object) -> str:
+def rejection(**fields: object) -> str:
     with pytest.raises(ValidationError) as info:
         VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
     return describe(info.value)
@@ -34,21 +34,21 @@ def test_not_provided_is_nan_false_or_zero() -> None:
 
 @pytest.mark.parametrize("name", FLOATS)
 def test_float32_field_holds_the_nearest_float32(name: str) -> None:
-    """A double is rounded as a C float would be, so that what is held is what arrives."""
+    """A double is rounded as a C float would be, so that a message is received as it was made."""
     message = VehicleLocalPosition.model_validate({"timestamp": 1, name: 0.1})
     assert getattr(message, name) == struct.unpack("<f", struct.pack("<f", 0.1))[0] != 0.1
 
 
 @pytest.mark.parametrize("name", [name for name in FLOATS if name not in WITHIN])
 @pytest.mark.parametrize("value", [3.5e38, 1e39, 1e308])
-def test_float32_field_refuses_what_float32_cannot_hold(name: str, value: float) -> None:
-    """1e39 is refused with the name of the field, never turned into infinity."""
-    assert refuse(**{name: value}).startswith(f"{name}: ")
+def test_float32_field_rejects_a_number_beyond_float32(name: str, value: float) -> None:
+    """1e39 is rejected with the name of the field, never turned into infinity."""
+    assert rejection(**{name: value}).startswith(f"{name}: ")
 
 
-def test_float32_pair_refuses_what_float32_cannot_hold() -> None:
+def test_float32_pair_rejects_a_number_beyond_float32() -> None:
     """Arrays are checked like scalars."""
-    assert refuse(delta_xy=(0.0, -1e39)).startswith("delta_xy: ")
+    assert rejection(delta_xy=(0.0, -1e39)).startswith("delta_xy: ")
 
 
 @pytest.mark.parametrize("name", ["ref_lat", "ref_lon"])
@@ -60,7 +60,7 @@ def test_origin_is_never_rounded(name: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in FLOATS if name not in WITHIN])
 def test_nan_and_infinity_pass_where_no_rule_forbids_them(name: str) -> None:
-    """PX4 says "no limit" and "unknown" with them."""
+    """In PX4 they mean "no limit" and "unknown"."""
     for value in (math.nan, math.inf):
         message = VehicleLocalPosition.model_validate({"timestamp": 1, name: value})
         assert str(getattr(message, name)) == str(value)
@@ -76,43 +76,43 @@ def test_nan_and_infinity_pass_where_no_rule_forbids_them(name: str) -> None:
         ("delta_xy", 0.0), ("delta_xy", (0.0,)), ("delta_xy", (0.0, 0.0, 0.0)), ("delta_xy", (0.0, "0")),
     ],
 )  # fmt: skip
-def test_wrong_type_is_refused(field: str, value: object) -> None:
-    """Nothing is converted silently: what ROS 2's Python lets through does not pass here."""
-    assert field in refuse(**{field: value})
+def test_wrong_type_is_rejected(field: str, value: object) -> None:
+    """No value is converted silently, unlike in ROS 2's Python."""
+    assert field in rejection(**{field: value})
 
 
 def test_int_is_a_float_where_a_float_is_meant() -> None:
-    """0 and 1 are numbers that people write for 0.0 and 1.0."""
+    """0 and 1 are accepted for 0.0 and 1.0."""
     message = VehicleLocalPosition(timestamp=1, x=3)
     assert (message.x, type(message.x)) == (3.0, float)
 
 
-def test_unknown_field_is_refused() -> None:
+def test_unknown_field_is_rejected() -> None:
     """A misspelled field is an error, not a field that is not provided."""
-    assert "xy_vaild" in refuse(xy_vaild=True)
+    assert "xy_vaild" in rejection(xy_vaild=True)
 
 
 def test_timestamp_is_required() -> None:
-    """A message without a time is no message."""
+    """A message without timestamp is invalid."""
     with pytest.raises(ValidationError, match="timestamp"):
         VehicleLocalPosition.model_validate({})
 
 
-@pytest.mark.parametrize(("flag", "names"), FLAGGED.items())
+@pytest.mark.parametrize(("flag", "names"), FLAG_FIELDS.items())
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_flag_promises_finite_fields(flag: str, names: tuple[str, ...], bad: float) -> None:
-    """A flag that is set needs its fields finite, each of them; one that is not set needs nothing."""
+def test_flag_needs_finite_fields(flag: str, names: tuple[str, ...], bad: float) -> None:
+    """While a flag is set each of its fields is finite; while it is not set they may be NaN."""
     good = dict.fromkeys(names, 1.0)
     VehicleLocalPosition.model_validate({"timestamp": 1, flag: True, **good})
     for name in names:
-        assert name in refuse(**{flag: True, **good, name: bad})
+        assert name in rejection(**{flag: True, **good, name: bad})
     VehicleLocalPosition.model_validate({"timestamp": 1, flag: False, **dict.fromkeys(names, math.nan)})
 
 
 @pytest.mark.parametrize("name", NOT_NEGATIVE)
 def test_variances_and_sigmas_are_not_negative(name: str) -> None:
     """-0.0 is 0."""
-    assert name in refuse(**{name: -1e-6})
+    assert name in rejection(**{name: -1e-6})
     VehicleLocalPosition.model_validate({"timestamp": 1, name: -0.0})
 
 
@@ -123,18 +123,18 @@ def test_angles_have_bounds(name: str, bound: float) -> None:
         VehicleLocalPosition.model_validate({"timestamp": 1, name: value})
     beyond = bound + (3e-7 if name == "heading" else 1e-12)
     for value in (math.nextafter(beyond, math.inf), -beyond, math.inf):
-        assert name in refuse(**{name: value})
+        assert name in rejection(**{name: value})
 
 
 def test_sample_is_not_later_than_message() -> None:
     """timestamp_sample <= timestamp."""
-    assert "timestamp_sample" in refuse(timestamp_sample=2)
+    assert "timestamp_sample" in rejection(timestamp_sample=2)
     VehicleLocalPosition(timestamp=2, timestamp_sample=2)
 
 
-def test_all_broken_rules_are_told_at_once() -> None:
-    """Who mends one thing should not have to come back for the next."""
-    text = refuse(xy_valid=True, eph=-1.0, heading=7.0)
+def test_all_violations_are_reported_at_once() -> None:
+    """One error lists every field that violates a rule."""
+    text = rejection(xy_valid=True, eph=-1.0, heading=7.0)
     assert all(name in text for name in ("x:", "y:", "eph:", "heading:"))
     assert "-1.0" in text
 
@@ -147,7 +147,7 @@ def test_message_is_immutable() -> None:
 
 
 def test_copy_with_updates_is_validated() -> None:
-    """model_copy is no way around the rules, and keeps what was provided."""
+    """model_copy validates updates, and keeps which fields were provided."""
     message = VehicleLocalPosition(timestamp=1, y=2.0)
     copy = message.model_copy(update={"x": 0.1})
     assert copy.x == struct.unpack("<f", struct.pack("<f", 0.1))[0]
@@ -159,7 +159,7 @@ def test_copy_with_updates_is_validated() -> None:
 
 @given(messages())
 def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
-    """JSON has NaN and infinities as strings, and reading it gives the same message to the bit."""
+    """JSON has NaN and infinities as strings, and decodes to the same message to the bit."""
     text = message.model_dump_json()
     assert "nan" not in text
     assert "inf" not in text
@@ -168,7 +168,7 @@ def test_json_round_trip_is_exact(message: VehicleLocalPosition) -> None:
 
 @given(messages(), st.sampled_from(sorted(FIELD_TYPES)))
 def test_copy_of_a_valid_message_is_the_same(message: VehicleLocalPosition, name: str) -> None:
-    """Validation changes nothing that is valid already."""
+    """Validation does not change a valid value."""
     copy = message.model_copy(update={name: getattr(message, name)})
     assert bits(copy) == bits(message)
 
@@ -188,7 +188,7 @@ def test_json_schema_describes_the_json() -> None:
 
 
 def test_messages_are_equal_by_their_values() -> None:
-    """NaN is the same as NaN here: a message equals its own copy, and can be found in a set."""
+    """NaN equals NaN here: a message equals its own copy, and can be found in a set."""
     one, two = VehicleLocalPosition(timestamp=1, x=0.5), VehicleLocalPosition(timestamp=1, x=0.5)
     assert one == two
     assert len({one, two}) == 1

@@ -1,4 +1,4 @@
-"""Tracks without jumps: rules by hand, real logs with resets, and a simulated flight whose truth is known."""
+"""Tracks without jumps: rules by hand, real logs with resets, and a simulation with known ground truth."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def track(*messages: VehicleLocalPosition) -> list[Continuous]:
     return [tracker.add(message) for message in messages]
 
 
-def test_complete_delta_is_taken_out() -> None:
-    """A counter that rose by one says that the delta is the jump."""
+def test_complete_delta_is_removed() -> None:
+    """When a counter rises by one the delta is the jump."""
     first, second, third = track(
         at(1, x=1.0, y=1.0),
         at(2, x=11.5, y=-3.5, xy_reset_counter=1, delta_xy=(10.0, -5.0)),
@@ -41,7 +41,7 @@ def test_complete_delta_is_taken_out() -> None:
     assert (second.x, second.y) == (1.5, 1.5)
     assert (third.x, third.y) == (2.0, 2.0)
     assert second.reset == {"xy"}
-    assert not second.lost
+    assert not second.discontinued
     assert not third.reset
     assert third.resets["xy"] == 1
 
@@ -59,7 +59,7 @@ def test_complete_delta_is_taken_out() -> None:
 def test_every_quantity_has_its_own_delta(
     values: tuple[str, ...], delta: str, counter: str, jump: float | tuple[float, float]
 ) -> None:
-    """Each counter belongs to its delta, and to nothing else."""
+    """Each counter belongs to its own delta only."""
     steps = jump if isinstance(jump, tuple) else (jump,)
     jumped = {name: cast("float", PLAIN[name]) + step for name, step in zip(values, steps, strict=True)}
     first, second = track(at(1), at(2, **jumped, **{delta: jump, counter: 1}))
@@ -76,52 +76,52 @@ def test_counter_wraps() -> None:
 
 
 def test_incomplete_delta_is_not_used() -> None:
-    """Two resets between two messages: the delta is that of the last one, so the track begins anew and says so."""
+    """Two resets between two messages: the delta is that of the last one, so the track is discontinued."""
     _, second, third = track(
         at(1, z=1.0), at(2, z=50.0, z_reset_counter=2, delta_z=3.0), at(3, z=51.0, z_reset_counter=2, delta_z=3.0)
     )
-    assert second.lost == {"z"}
+    assert second.discontinued == {"z"}
     assert (second.z, third.z) == (50.0, 51.0)
     assert second.resets["z"] == 2
-    assert not third.lost
+    assert not third.discontinued
 
 
 def test_delta_that_is_not_provided_is_not_used() -> None:
-    """A layout or a source without deltas cannot explain a jump."""
+    """Without a delta, as in old layouts and from some sources, a jump is unexplained."""
     _, second = track(at(1), at(2, heading=1.0, heading_reset_counter=1))
-    assert second.lost == {"heading"}
+    assert second.discontinued == {"heading"}
 
 
-def test_time_that_goes_back_is_a_new_track() -> None:
-    """A vehicle that started again has nothing to do with what was before."""
+def test_timestamp_that_goes_back_starts_a_new_track() -> None:
+    """A vehicle that rebooted has no relation to the track before."""
     _, second, third = track(
         at(100, x=5.0), at(101, x=6.0, xy_reset_counter=1, delta_xy=(1.0, 0.0)), at(1, x=0.5, xy_reset_counter=0)
     )
     assert second.x == 5.0
-    assert third.lost == {"xy", "z", "vxy", "vz", "heading", "dist_bottom"}
+    assert third.discontinued == {"xy", "z", "vxy", "vz", "heading", "dist_bottom"}
     assert third.x == 0.5
 
 
 def test_origin_that_is_set_moves_nothing() -> None:
-    """The origin's altitude becomes known, delta_z says -179.5 m, and z moved by 2 mm: what came is believed."""
+    """The origin's altitude becomes known, delta_z is -179.5 m, and z moved by 2 mm: the values decide."""
     first, second = track(
         at(21.574, z=-0.2),
         at(21.674, z=-0.198, z_reset_counter=1, delta_z=-179.5362, z_global=True, ref_alt=179.5362),
     )
     assert second.origin_changed
     assert second.reset == {"z"}
-    assert not second.lost
+    assert not second.discontinued
     assert second.z == pytest.approx(first.z + 0.002)
 
 
 @pytest.mark.parametrize("counted", [0, 1])
-def test_origin_that_moves_takes_the_frame_along(counted: int) -> None:
-    """A new origin elsewhere shifts all coordinates, by the way from origin to origin, counted as a reset or not."""
+def test_origin_that_moves_shifts_the_frame(counted: int) -> None:
+    """A new origin elsewhere shifts all coordinates by the distance of the origins, counted as a reset or not."""
     old, new = (47.0, 8.0, 400.0), (47.001, 8.002, 410.0)
     north, east = MapProjection(new[0], new[1]).project(old[0], old[1])
 
-    def origin(place: tuple[float, float, float]) -> dict[str, object]:
-        latitude, longitude, altitude = place
+    def origin(position: tuple[float, float, float]) -> dict[str, object]:
+        latitude, longitude, altitude = position
         return {"xy_global": True, "z_global": True, "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
 
     first, second = track(
@@ -131,27 +131,27 @@ def test_origin_that_moves_takes_the_frame_along(counted: int) -> None:
         ),
     )
     assert second.origin_changed
-    assert not second.lost
+    assert not second.discontinued
     assert (second.x, second.y, second.z) == pytest.approx((first.x + 0.1, 0.0, 0.0), abs=1e-3)
 
 
 def test_origin_with_an_unexplained_jump_is_a_new_track() -> None:
-    """A jump that neither the delta nor the origins explain is not made up for."""
+    """A jump that neither the delta nor the origins explain is not removed."""
     _, second = track(at(1), at(2, x=500.0, xy_global=True, ref_lat=47.0, ref_lon=8.0))
-    assert second.lost == {"xy"}
+    assert second.discontinued == {"xy"}
     assert second.x == 500.0
 
 
 def test_simulated_truth_is_followed() -> None:
-    """Through GPS outages and resets of a simulated flight the track moves as the vehicle really did."""
+    """Through GPS outages and resets of a simulation the track follows the ground truth."""
     truth: dict[int, VehicleLocalPosition] = {}
     tracker = ResetTracker()
     estimates: list[tuple[VehicleLocalPosition, Continuous]] = []
-    for record in open_replay("sim:?duration=260").records:
-        if record.address.topic == "vehicle_local_position_groundtruth":
-            truth[int(str(record.fields["timestamp"]))] = upgrade(record.fields)
-        elif record.address.topic == VLP:
-            message = upgrade(record.fields)
+    for source_message in open_replay("sim:?duration=260").messages:
+        if source_message.address.topic == "vehicle_local_position_groundtruth":
+            truth[int(str(source_message.fields["timestamp"]))] = upgrade(source_message.fields)
+        elif source_message.address.topic == VLP:
+            message = upgrade(source_message.fields)
             estimates.append((message, tracker.add(message)))
     resets = raw_worst = worst = 0.0
     for (before, smooth), (after, smooth_after) in pairwise(estimates[::2]):
@@ -164,7 +164,7 @@ def test_simulated_truth_is_followed() -> None:
     assert resets >= 8
     assert raw_worst > 1.0
     assert worst < 0.2
-    assert not any(smooth.lost for _, smooth in estimates)
+    assert not any(smooth.discontinued for _, smooth in estimates)
 
 
 @pytest.mark.logs
@@ -172,19 +172,19 @@ def test_simulated_truth_is_followed() -> None:
     ("name", "raw", "smooth"),
     [("fmuv6c_1.17_selector_whipsaw.ulg", 130.0, 3.0), ("nxp_v0_ekf_failure.ulg", 25.0, 6.0)],
 )
-def test_real_resets_are_taken_out(name: str, raw: float, smooth: float) -> None:
-    """Steps that velocity does not explain: in the raw track those are the resets, in ours motion between messages."""
+def test_real_resets_are_removed(name: str, raw: float, smooth: float) -> None:
+    """Steps that velocity does not explain are resets in the raw track, and motion between messages in ours."""
     if not (LOGS / name).exists():
         pytest.skip(f"the real logs are not here: {LOGS}")
     worst: dict[str, float] = defaultdict(float)
     tracker = ResetTracker()
     last: tuple[VehicleLocalPosition, Continuous] | None = None
-    for record in open_replay(f"ulog:{LOGS / name}").records:
-        if record.address.topic != VLP:
+    for source_message in open_replay(f"ulog:{LOGS / name}").messages:
+        if source_message.address.topic != VLP:
             continue
-        message = upgrade(record.fields)
+        message = upgrade(source_message.fields)
         track = tracker.add(message)
-        assert not track.lost
+        assert not track.discontinued
         if last is not None:
             before, smooth_before = last
             seconds = (message.timestamp - before.timestamp) / 1e6

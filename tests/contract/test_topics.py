@@ -1,4 +1,4 @@
-"""The topic table, and the pair address <-> key expression."""
+"""The topic table, addresses and selections, and their key expressions."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import (
+    ANY,
+    DEFAULT_TOPIC,
     TOPICS,
     Address,
     AddressError,
+    Selection,
+    ack_key,
     address_of_alive_key,
-    alive_selection,
+    alive_key_expr,
     check_prefix,
     schema_key,
-    selection,
     status_key,
-    taken_key,
 )
 
 CHUNK = st.text("ABCXYZabcxyz0189_-", min_size=1, max_size=64)
@@ -53,12 +55,12 @@ def test_keys_are_as_documented() -> None:
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
     assert schema_key() == "nedbus/@schema/VehicleLocalPosition"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
-    assert taken_key(selection("vehicle_local_position")) == "nedbus/*/vehicle_local_position/@taken"
+    assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
 
 
 @given(addresses(), PREFIXES)
 def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
-    """Every address has a valid key, and the key gives the address back."""
+    """Every address has a valid key, and the key parses to the same address."""
     zenoh.KeyExpr(address.key(prefix=prefix))
     assert Address.from_key(address.key(prefix=prefix), prefix=prefix) == address
     assert address_of_alive_key(address.alive_key(prefix=prefix), prefix=prefix) == address
@@ -67,35 +69,63 @@ def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
 @given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from([
     "nedbus", "7", "*", "**", "@alive", "vehicle_local_position", "estimator_local_position", "0", "01", "256", "", "é",
 ]), max_size=6).map("/".join)))  # fmt: skip
-def test_any_key_gives_an_address_or_the_one_error(key: str) -> None:
-    """No string makes anything but an address that gives the same key, or an AddressError."""
+def test_any_key_is_an_address_or_an_error(key: str) -> None:
+    """Any string parses to an address with the same key, or raises AddressError."""
     try:
         assert Address.from_key(key).key() == key
     except AddressError as exc:
         assert str(exc)
 
 
+@st.composite
+def selections(draw: st.DrawFn, near: Address) -> Selection:
+    """Return a strategy for selections that have parts of an address, or others."""
+    topic = draw(st.sampled_from([ANY, near.topic, *TOPICS]))
+    vehicle = draw(st.sampled_from([ANY, near.vehicle, near.vehicle[:-1] + "Q"]))
+    instances = topic != ANY and TOPICS[topic].instances
+    return Selection(topic, vehicle, draw(st.sampled_from([None, near.instance, 0, 255])) if instances else None)
+
+
+@given(addresses(), PREFIXES, st.data())
+def test_selection_matches_what_its_key_expression_includes(address: Address, prefix: str, data: st.DataObject) -> None:
+    """A selection matches exactly the addresses whose keys its key expression includes, by Zenoh's own rules."""
+    selection = data.draw(selections(address))
+    key_expr = zenoh.KeyExpr(selection.key_expr(prefix=prefix))
+    assert selection.matches(address) == key_expr.includes(address.key(prefix=prefix))
+    assert zenoh.KeyExpr(ack_key(str(key_expr))).includes(ack_key(address.key(prefix=prefix))) == key_expr.includes(
+        address.key(prefix=prefix)
+    )
+
+
+def test_selection_matches_by_each_of_its_parts() -> None:
+    """Vehicle, topic and instance must be the address's, or any."""
+    estimator = Address("7", "estimator_local_position", 1)
+    for parts in ((), ("estimator_local_position",), (ANY, "7"), ("estimator_local_position", "7", 1)):
+        assert Selection(*parts).matches(estimator)
+    for parts in ((DEFAULT_TOPIC,), (ANY, "8"), ("estimator_local_position", ANY, 0)):
+        assert not Selection(*parts).matches(estimator)
+
+
 @given(addresses(), PREFIXES)
-def test_selection_matches_its_addresses_only(address: Address, prefix: str) -> None:
-    """A selection by topic, vehicle and instance matches the address, and none of its neighbours."""
-    key = address.key(prefix=prefix)
-    for topic in ("*", address.topic):
-        for vehicle in ("*", address.vehicle):
-            chosen = selection(topic, vehicle=vehicle, prefix=prefix)
-            assert zenoh.KeyExpr(chosen).includes(key)
-            assert zenoh.KeyExpr(taken_key(chosen)).includes(taken_key(key))
-    other = zenoh.KeyExpr(selection(address.topic, vehicle=f"{address.vehicle[:-1]}~"[:-1] + "Q", prefix=prefix))
-    assert address.vehicle.endswith("Q") or not other.intersects(key)
-    assert zenoh.KeyExpr(alive_selection(prefix=prefix)).includes(address.alive_key(prefix=prefix))
-    assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(address.alive_key(prefix=prefix))
-    assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(address.rejected_key(prefix=prefix))
-    assert not zenoh.KeyExpr(selection(prefix=prefix)).intersects(taken_key(key))
+def test_selection_does_not_include_other_keys(address: Address, prefix: str) -> None:
+    """The liveliness tokens, rejections and acknowledgements of an address are not messages."""
+    assert zenoh.KeyExpr(alive_key_expr(prefix=prefix)).includes(address.alive_key(prefix=prefix))
+    key_expr = zenoh.KeyExpr(Selection().key_expr(prefix=prefix))
+    assert not key_expr.intersects(address.alive_key(prefix=prefix))
+    assert not key_expr.intersects(address.rejected_key(prefix=prefix))
+    assert not key_expr.intersects(ack_key(address.key(prefix=prefix)))
+
+
+def test_default_topic_is_in_the_table() -> None:
+    """The topic that is used unless another is named is EKF2's."""
+    assert DEFAULT_TOPIC == "vehicle_local_position"
+    assert DEFAULT_TOPIC in TOPICS
 
 
 def test_selection_of_an_instance() -> None:
-    """One estimator of all vehicles, or all of one."""
-    assert selection("estimator_local_position", instance=1) == "nedbus/*/estimator_local_position/1"
-    assert selection("estimator_local_position", vehicle="7") == "nedbus/7/estimator_local_position/*"
+    """One EKF instance of all vehicles, or all instances of one vehicle."""
+    assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
+    assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
 
 
 @pytest.mark.parametrize(
@@ -113,37 +143,37 @@ def test_selection_of_an_instance() -> None:
         ("7", "estimator_local_position", -1, "instance"),
     ],
 )
-def test_impossible_address_is_refused(vehicle: str, topic: str, instance: int | None, what: str) -> None:
-    """The error names what is wrong, what was given and what is expected."""
+def test_invalid_address_is_rejected(vehicle: str, topic: str, instance: int | None, what: str) -> None:
+    """The error names the part, the given value and the expected ones."""
     with pytest.raises(AddressError, match=rf"{what} .* is not valid: expected"):
         Address(vehicle, topic, instance)
 
 
-def test_impossible_selection_is_refused() -> None:
-    """A typo in a topic must not become a subscription that stays silent."""
+def test_invalid_selection_is_rejected() -> None:
+    """A typo in a topic must not become a subscription without messages."""
     for arguments in (("vehicle_local_positon", "*", None), ("vehicle_local_position", "*", 0), ("*", "*", 1)):
         with pytest.raises(AddressError):
-            selection(arguments[0], vehicle=arguments[1], instance=arguments[2])
+            Selection(*arguments)
     with pytest.raises(AddressError):
-        selection(vehicle="a b")
+        Selection(vehicle="a b")
 
 
 @pytest.mark.parametrize("prefix", ["", "/", "a/", "a//b", "*", "a/**", "@a", "a b"])
-def test_impossible_prefix_is_refused(prefix: str) -> None:
+def test_invalid_prefix_is_rejected(prefix: str) -> None:
     """Prefixes are plain chunks."""
     with pytest.raises(AddressError, match="prefix"):
         check_prefix(prefix)
 
 
 @pytest.mark.parametrize("instance", [-1, 256, True, "0"])
-def test_impossible_instance_is_refused_in_a_selection(instance: int) -> None:
-    """What cannot be published cannot be subscribed to either."""
+def test_invalid_instance_is_rejected_in_a_selection(instance: int) -> None:
+    """An instance that no address has cannot be subscribed to."""
     with pytest.raises(AddressError, match="instance"):
-        selection("estimator_local_position", instance=instance)
+        Selection("estimator_local_position", instance=instance)
 
 
 def test_alive_key_must_be_one() -> None:
-    """A data key is no liveliness token."""
+    """The key of a stream is not a liveliness token."""
     with pytest.raises(AddressError):
         address_of_alive_key("nedbus/7/vehicle_local_position")
 

@@ -41,7 +41,7 @@ def test_golden_bytes(name: str) -> None:
 
 @given(messages())
 def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) -> None:
-    """Any msgpack reader gets an array of the layout number and the 53 fields, with PX4's types."""
+    """Any msgpack decoder returns an array of the layout number and the 53 fields, with PX4's types."""
     payload = encode(message)
     assert len(payload) == PAYLOAD_SIZE
     array = msgpack.unpackb(payload, use_list=False)
@@ -51,13 +51,13 @@ def test_payload_is_244_bytes_of_plain_msgpack(message: VehicleLocalPosition) ->
 
 @given(messages())
 def test_round_trip_is_exact(message: VehicleLocalPosition) -> None:
-    """Decode gives back what encode was given, to the bit."""
+    """Decoding an encoded message returns the same message, to the bit."""
     assert bits(decode(encode(message))) == bits(message)
 
 
 @given(messages(), st.booleans(), st.booleans())
-def test_other_encoders_are_read(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
-    """Short ints, doubles for floats, and ints where a float is meant make the same message."""
+def test_other_encodings_are_decoded(message: VehicleLocalPosition, single: bool, whole: bool) -> None:
+    """Short ints, doubles for floats, and ints where a float is meant decode to the same message."""
     values = [value for name, value in message.model_dump().items()]
     if whole:
         values = [
@@ -71,15 +71,15 @@ def test_other_encoders_are_read(message: VehicleLocalPosition, single: bool, wh
 
 
 @given(messages())
-def test_layout_0_is_read(message: VehicleLocalPosition) -> None:
+def test_layout_0_is_decoded(message: VehicleLocalPosition) -> None:
     """V0 has 52 fields and one hagl_max."""
     older = downgrade(message, "V0")
-    read = decode(msgpack.packb([0, *older.values()]))
-    assert bits(read) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
+    decoded = decode(msgpack.packb([0, *older.values()]))
+    assert bits(decoded) == bits(message.model_copy(update={"hagl_max_xy": message.hagl_max_z}))
 
 
-def test_newer_layout_is_read_by_names() -> None:
-    """With the field names of an unknown layout, what is known is read and the rest is left."""
+def test_newer_layout_is_decoded_by_names() -> None:
+    """With the field names of an unknown layout, known fields are decoded and the others ignored."""
     names = ["timestamp", "x", "y", "brand_new"]
     payload = msgpack.packb([2, 5, 1.0, 2.0, True])
     with pytest.raises(UnknownLayoutError, match="layout 2 with 4 fields; this reader knows layouts 0, 1") as info:
@@ -108,13 +108,13 @@ def test_newer_layout_is_read_by_names() -> None:
         (b"\x91" * 4000, "not one msgpack value"),
     ],
 )
-def test_bad_payload_is_named(payload: bytes, reason: str) -> None:
-    """Each way to be wrong has a reason that a person understands."""
+def test_reason_of_a_bad_payload(payload: bytes, reason: str) -> None:
+    """Each kind of bad payload has a reason of its own."""
     with pytest.raises(DecodeError, match=reason):
         decode(payload)
 
 
-def test_trailing_and_missing_bytes_are_refused() -> None:
+def test_trailing_and_missing_bytes_are_rejected() -> None:
     """One payload is one message."""
     payload = encode(VehicleLocalPosition(timestamp=1))
     for bad in (payload + b"\x00", payload[:-1], payload[1:]):
@@ -122,8 +122,8 @@ def test_trailing_and_missing_bytes_are_refused() -> None:
             decode(bad)
 
 
-def test_broken_rule_in_a_payload_is_refused() -> None:
-    """The model judges what arrives as it judges what is sent, in both paths of the decoder."""
+def test_violation_in_a_payload_is_rejected() -> None:
+    """What is received is validated as what is sent, on both paths of the decoder."""
     values = [1, *VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[3] = True  # xy_valid, while x is NaN
     with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):
@@ -135,8 +135,8 @@ def test_broken_rule_in_a_payload_is_refused() -> None:
         decode(bytes(payload))
 
 
-def test_flipped_tag_in_a_full_width_payload_is_read_or_refused() -> None:
-    """A payload of 244 bytes with other tags is no fixed record: it goes the way of any msgpack."""
+def test_flipped_bit_in_a_full_width_payload_is_decoded_or_rejected() -> None:
+    """A payload of 244 bytes with other tags is decoded as any msgpack."""
     payload = encode(VehicleLocalPosition(timestamp=1, x=1.0))
     for index in range(PAYLOAD_SIZE):
         for bit in range(8):
@@ -153,8 +153,8 @@ def test_flipped_tag_in_a_full_width_payload_is_read_or_refused() -> None:
 @example(b"\xdc\x00\x36")
 @example(b"\xc7\x0c\xff" + bytes(12))
 @settings(max_examples=2000)
-def test_any_bytes_decode_or_raise_the_one_error(payload: bytes) -> None:
-    """No byte string does anything but decode or raise DecodeError."""
+def test_any_bytes_decode_or_raise_decode_error(payload: bytes) -> None:
+    """Any byte string decodes or raises DecodeError."""
     try:
         decode(payload)
     except DecodeError as exc:
@@ -175,15 +175,15 @@ msgpack_values = st.recursive(
 
 @given(fields(), st.integers(0, 53), msgpack_values)
 @settings(max_examples=1000)
-def test_any_value_in_any_place_is_the_models_decision(given: dict[str, object], place: int, value: object) -> None:
-    """A payload with one strange value decodes exactly if the model takes that value."""
+def test_any_value_at_any_index_is_the_models_decision(given: dict[str, object], index: int, value: object) -> None:
+    """A payload with one odd value decodes only if the model accepts that value."""
     array: list[object] = [1, *given.values()]
-    array[place] = value
+    array[index] = value
     try:
         message = decode(msgpack.packb(array))
     except DecodeError:
         return
-    assert place == 0 or repr(message.model_dump()[list(FIELD_TYPES)[place - 1]]) in {
+    assert index == 0 or repr(message.model_dump()[list(FIELD_TYPES)[index - 1]]) in {
         repr(value),
         repr(float(value)) if isinstance(value, int | float) else "",
         repr(struct.unpack("<f", struct.pack("<f", value))[0]) if isinstance(value, int | float) else "",
@@ -192,8 +192,8 @@ def test_any_value_in_any_place_is_the_models_decision(given: dict[str, object],
     }
 
 
-def test_bypassed_validation_is_caught_at_encode() -> None:
-    """A message made with model_construct that holds what its fields cannot is an error, not other bytes."""
+def test_bypassed_validation_is_an_error_at_encode() -> None:
+    """A message of model_construct with values that do not fit its fields raises, and never encodes other values."""
     for field, value in (("x", 1e39), ("timestamp", -1), ("xy_reset_counter", 300), ("x", "1"), ("delta_xy", None)):
         message = VehicleLocalPosition.model_construct(**{**VehicleLocalPosition(timestamp=1).__dict__, field: value})
         with pytest.raises(EncodeError, match="VehicleLocalPosition"):
@@ -203,12 +203,12 @@ def test_bypassed_validation_is_caught_at_encode() -> None:
 def test_doubles_of_the_origin_survive() -> None:
     """ref_lat and ref_lon never pass through float32."""
     message = VehicleLocalPosition(timestamp=1, ref_lat=math.nextafter(47.0, 48.0), ref_lon=-math.nextafter(8.0, 9.0))
-    read = decode(encode(message))
-    assert (read.ref_lat, read.ref_lon) == (message.ref_lat, message.ref_lon)
+    decoded = decode(encode(message))
+    assert (decoded.ref_lat, decoded.ref_lon) == (message.ref_lat, message.ref_lon)
 
 
-def test_deep_nesting_is_refused() -> None:
-    """An array nested a thousand deep is refused before anything prints it: that would exhaust the stack."""
+def test_deep_nesting_is_rejected() -> None:
+    """An array nested a thousand deep is rejected before anything prints it: that would exhaust the stack."""
     deep = b"\x91" * 400 + b"\x01"
     values = [msgpack.packb(value) for value in VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[6] = deep

@@ -1,9 +1,9 @@
-"""Be a MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
+"""Simulate a MAVLink 2 vehicle for tests: one UDP socket, one process, the streams of a PX4 from a file of rows.
 
-Every position that really left is one JSON line on stdout with its float32 values, every command received another,
-and the last line counts: {"end": true, "sent": …, "dropped": …} for positions, "packets_*" for all messages.
-The same arguments give the same packets, in order; an answer to a command comes in between and is never dropped.
-SET_MESSAGE_INTERVAL is answered and reported; it changes no rate.
+Every position that was sent is a JSON line on stdout with its float32 values, and so is every command received.
+The last line has the counts: {"end": true, "sent": …, "dropped": …} of positions, "packets_*" of all messages.
+The same arguments give the same packets, in order; the answer to a command is sent in between, and never dropped.
+SET_MESSAGE_INTERVAL is answered and printed; it changes no rate.
 Unlike PX4, GLOBAL_POSITION_INT (the heading) is sent without an origin too and GPS_GLOBAL_ORIGIN is repeated.
 """
 
@@ -24,7 +24,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 Row = dict[str, float]
-Build = Callable[[int, Row], Any]  # (ms since boot, row) to a message, or None for "nothing to say"
+Build = Callable[[int, Row], Any]  # (ms since boot, row) to a message, or None to send nothing
 Stream = tuple[float, Build]  # Hz
 NED = ("x", "y", "z", "vx", "vy", "vz")
 NAN = math.nan
@@ -54,7 +54,7 @@ def global_position(ms: int, row: Row) -> Any:
 def origin(ms: int, row: Row) -> Any:
     lat, lon, alt = row["ref_lat"], row["ref_lon"], row["ref_alt"]
     if math.isnan(lat + lon + alt):
-        return None  # PX4 is silent while there is no origin
+        return None  # PX4 sends none while there is no origin
     return mavlink.MAVLink_gps_global_origin_message(round(lat * 1e7), round(lon * 1e7), round(alt * 1e3), 1_000_000)
 
 
@@ -79,7 +79,7 @@ def odometry(ms: int, row: Row) -> Any:
 
 
 def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
-    """Yield (seconds since boot began, builder) for ever; at equal times the position comes last."""
+    """Yield (seconds since boot, builder) endlessly; at equal times the position is last."""
     heap = [(0.0, order, 0) for order, (rate, _) in enumerate(streams) if rate > 0]
     while True:
         now, order, turn = heapq.heappop(heap)
@@ -88,26 +88,26 @@ def schedule(streams: list[Stream]) -> Iterator[tuple[float, Build]]:
         heapq.heappush(heap, ((turn + 1) / rate, order, turn + 1))
 
 
-def answer(link: socket.socket, mav: Any, data: bytes, sender: Any) -> None:
-    """Acknowledge and report the commands in one datagram."""
-    (reader := mavlink.MAVLink(None)).robust_parsing = True  # a fresh one: half a message must not reach the next
+def acknowledge(link: socket.socket, mav: Any, data: bytes, sender: Any) -> None:
+    """Acknowledge and print the commands in one datagram."""
+    (reader := mavlink.MAVLink(None)).robust_parsing = True  # a new one: half a message must not reach the next
     for message in reader.parse_buffer(data) or []:
         if message.get_type() != "COMMAND_LONG" or message.target_system not in (0, mav.srcSystem):
             continue
-        number, wanted = message.command, int(message.param1) if math.isfinite(message.param1) else -1
-        result = mavlink.MAV_RESULT_ACCEPTED if wanted in mavlink.mavlink_map else mavlink.MAV_RESULT_FAILED
+        number, requested = message.command, int(message.param1) if math.isfinite(message.param1) else -1
+        result = mavlink.MAV_RESULT_ACCEPTED if requested in mavlink.mavlink_map else mavlink.MAV_RESULT_FAILED
         if number not in (mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_REQUEST_MESSAGE):
             result = mavlink.MAV_RESULT_UNSUPPORTED
         source = (message.get_srcSystem(), message.get_srcComponent())
         link.sendto(mavlink.MAVLink_command_ack_message(number, result, 0, 0, *source).pack(mav), sender)
         mav.seq = (mav.seq + 1) % 256
-        facts = {"command": number, "message_id": wanted, "interval_us": message.param2, "result": result}
-        say(facts | {"from": source})
+        line = {"command": number, "message_id": requested, "interval_us": message.param2, "result": result}
+        print_line(line | {"from": source})
 
 
-def say(facts: dict[str, Any]) -> None:
-    """Print a line, at once."""
-    sys.stdout.write(f"{json.dumps(facts)}\n")
+def print_line(line: dict[str, Any]) -> None:
+    """Print and flush a JSON line."""
+    sys.stdout.write(f"{json.dumps(line)}\n")
     sys.stdout.flush()
 
 
@@ -121,35 +121,35 @@ def main() -> None:
     args = parser.parse_args()
     host, port = args.to.rsplit(":", 1)
     rows: list[Row] = json.loads(args.values.read_text())
-    alive = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
-    streams: list[Stream] = [(1, lambda ms, row: alive), (1, origin), (2, estimator), (10, global_position)]
+    heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+    streams: list[Stream] = [(1, lambda ms, row: heartbeat), (1, origin), (2, estimator), (10, global_position)]
     streams += [(10, altitude), (10, odometry), (args.attitude, attitude), (args.rate, local_position)]
-    link, chance = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), random.Random(args.seed)
+    link, rng = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), random.Random(args.seed)
     mav, base_ms = mavlink.MAVLink(None, args.system, 1), args.start_ms
-    plan, began = schedule(streams), time.monotonic()
+    plan, start = schedule(streams), time.monotonic()
     total = turn = sent = packets = dropped = 0
     while not args.count or total < args.count:
         now, build = next(plan)
-        while select.select([link], [], [], max(0.0, began + now / args.speed - time.monotonic()))[0]:
-            answer(link, mav, *link.recvfrom(2048))
+        while select.select([link], [], [], max(0.0, start + now / args.speed - time.monotonic()))[0]:
+            acknowledge(link, mav, *link.recvfrom(2048))
         if (message := build(base_ms + round(now * 1000), rows[turn % len(rows)])) is None:
             continue
         data, mav.seq = message.pack(mav), (mav.seq + 1) % 256
-        gone = chance.random() < args.drop
-        packets, dropped = packets + (not gone), dropped + gone
-        if not gone:
+        is_dropped = rng.random() < args.drop
+        packets, dropped = packets + (not is_dropped), dropped + is_dropped
+        if not is_dropped:
             link.sendto(data, (host, int(port)))
         if build is local_position:
-            total, turn, sent = total + 1, turn + 1, sent + (not gone)
-            if not gone:
+            total, turn, sent = total + 1, turn + 1, sent + (not is_dropped)
+            if not is_dropped:
                 values = struct.unpack("<6f", struct.pack("<6f", *(getattr(message, name) for name in NED)))
-                facts = {"time_boot_ms": message.time_boot_ms} | dict(zip(NED, values, strict=True))
-                say(facts)
+                line = {"time_boot_ms": message.time_boot_ms} | dict(zip(NED, values, strict=True))
+                print_line(line)
             if total == args.reboot_after:
-                plan, began = schedule(streams), time.monotonic()
+                plan, start = schedule(streams), time.monotonic()
                 mav.seq, base_ms, turn = 0, BOOT_MS, 0
     end = {"end": True, "sent": sent, "dropped": total - sent, "packets_sent": packets, "packets_dropped": dropped}
-    say(end)
+    print_line(end)
 
 
 if __name__ == "__main__":

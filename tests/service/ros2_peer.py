@@ -1,6 +1,6 @@
-"""A ROS 2 node by zenoh-ros2-sdk, in a process of its own: `talk` publishes rows, `listen` prints what it gets.
+"""A ROS 2 node by zenoh-ros2-sdk, in a process of its own: `talk` publishes rows, `listen` prints what it receives.
 
-It knows nothing of nedbus: the definition of the type and the rows are in the JSON file of its second argument.
+It is independent of nedbus: the definition of the type and the rows are in the JSON file of its second argument.
 """
 
 from __future__ import annotations
@@ -42,24 +42,24 @@ def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: A
     done = threading.Event()
     left = len(rows)
 
-    def take(message: Any) -> None:
+    def on_message(message: Any) -> None:
         nonlocal left
         if not left:
             return
         fields = {name: getattr(message, name) for name in rows[0]}
-        say({name: value.tolist() if name in PAIRS else value for name, value in fields.items()})
+        write({name: value.tolist() if name in PAIRS else value for name, value in fields.items()})
         left -= 1
         if not left:
             done.set()
 
-    subscriber = ROS2Subscriber(topic=topic, msg_type=TYPE, msg_definition=definition, callback=take, **options)
+    subscriber = ROS2Subscriber(topic=topic, msg_type=TYPE, msg_definition=definition, callback=on_message, **options)
     done.wait()
     options.pop("type_hash", None)
-    say(get_topic_names_and_types(**options))
+    write(get_topic_names_and_types(**options))
     subscriber.close()
 
 
-def say(value: object) -> None:
+def write(value: object) -> None:
     sys.stdout.write(f"{json.dumps(value)}\n")
     sys.stdout.flush()
 

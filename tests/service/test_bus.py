@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import json
 import logging
@@ -17,9 +18,10 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.session import Session
+from nedbus import Mode
+from nedbus.transport import Session
 from nedbus_msgs import TOPICS, Address, encode
-from tests.conftest import DEADLINE, Client, Mode, free_endpoint, message, wait_for, wait_for_reader
+from tests.conftest import DEADLINE, Client, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
 BOTH: list[Mode] = ["latest", "every"]
@@ -30,7 +32,7 @@ def test_message_arrives_as_it_was(client: Client, bus: nedbus.Bus, mode: Mode) 
     """What is published arrives typed, equal to the bit, with its address and times."""
     publisher = bus.publisher("estimator_local_position", vehicle="7", instance=1)
     sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
-    subscription = client.subscribe(mode=mode)
+    subscription = client.subscribe("*", mode=mode)
     publisher.publish(sent)
     sample = subscription.receive(DEADLINE)
     assert encode(sample.message) == encode(sent)
@@ -96,7 +98,7 @@ def test_late_joiner_gets_the_last_value(client: Client, bus: nedbus.Bus, mode: 
         publisher = bus.publisher(VLP, vehicle=vehicle)
         for timestamp in (1, 2, 3):
             publisher.publish(message(timestamp))
-    subscription = client.subscribe(mode=mode)
+    subscription = client.subscribe("*", mode=mode)
     last: dict[str, int] = {}
     while last != {"a": 3, "b": 3}:  # what was still on its way may come before
         sample = subscription.receive(DEADLINE)
@@ -109,7 +111,7 @@ def test_subscription_is_a_choice(client: Client, bus: nedbus.Bus) -> None:
         for topic in TOPICS.values():
             for instance in (0, 1) if topic.instances else (None,):
                 bus.publisher(topic.name, vehicle=vehicle, instance=instance).publish(message(1))
-    wait_for(lambda: len(client.latest()) == 10, what="everything")
+    wait_for(lambda: len(client.latest("*")) == 10, what="everything")
     assert {sample.vehicle for sample in client.latest(VLP)} == {"1", "2"}
     assert [str(sample.address) for sample in client.latest("estimator_local_position", vehicle="2")] == [
         "2/estimator_local_position/0",
@@ -124,9 +126,21 @@ def test_subscription_is_a_choice(client: Client, bus: nedbus.Bus) -> None:
         subscription.receive(0.1)
 
 
+def test_default_is_the_estimate(client: Client, bus: nedbus.Bus) -> None:
+    """Without a topic neither subscriptions nor last values mix the estimate with the truth or with single EKFs."""
+    for topic in reversed(tuple(TOPICS.values())):
+        bus.publisher(topic.name, vehicle="1", instance=0 if topic.instances else None).publish(message(1))
+    wait_for(lambda: len(client.latest("*")) == 4, what="all four topics")
+    assert [sample.topic for sample in client.latest()] == [VLP]
+    subscription = client.subscribe()
+    assert subscription.receive(DEADLINE).topic == VLP
+    with pytest.raises(nedbus.NoDataError):
+        subscription.receive(0.1)
+
+
 def test_latest_is_empty_where_nothing_is(client: Client) -> None:
     """No publisher, no answer, no error."""
-    assert client.latest() == []
+    assert client.latest("*") == []
     assert client.vehicles() == {}
     assert client.services() == []
 
@@ -233,7 +247,7 @@ def test_invalid_payload_never_ends_an_iteration(
     """Garbage, foreign keys, deletes and wildcard puts are counted and named once; good samples come through."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
-    subscription = client.subscribe(mode="every")
+    subscription = client.subscribe("*", mode="every")
     assert subscription.receive(DEADLINE).message.timestamp == 1
     good = encode(message(2, x=1.0))
     for key, payload in (
@@ -319,7 +333,7 @@ def test_publish_takes_messages_and_fields(client: Client, bus: nedbus.Bus) -> N
 def test_two_publishers_of_one_address_are_refused(client: Client) -> None:
     """Two sources of one key would mix two flights into one."""
     publisher = client.publisher(VLP, vehicle="1")
-    with pytest.raises(nedbus.AddressInUseError, match="1/vehicle_local_position is published here already"):
+    with pytest.raises(nedbus.AddressInUseError, match="1/vehicle_local_position is published by this process already"):
         client.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
 
@@ -361,9 +375,9 @@ def test_prefix_separates(endpoint: str) -> None:
     """Two fleets on one router do not see each other."""
     with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
         one.publisher(VLP, vehicle="1").publish(message(1))
-        assert [sample.vehicle for sample in one.latest()] == ["1"]
+        assert [sample.vehicle for sample in one.latest("*")] == ["1"]
         assert list(one.vehicles()) == ["1"]
-        assert two.latest() == []
+        assert two.latest("*") == []
         assert two.vehicles() == {}
 
 
@@ -467,7 +481,7 @@ def test_closed_publisher_is_gone(client: Client, bus: nedbus.Bus) -> None:
     wait_for(bus.latest, what="the message")
     publisher.close()
     publisher.close()
-    assert client.latest() == []
+    assert client.latest("*") == []
     wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
     with pytest.raises(nedbus.ClosedError):
         publisher.publish(message(2))
@@ -544,13 +558,22 @@ def test_junk_does_not_displace_a_waiting_sample(client: Client, raw: Session, b
 def test_wrong_mode_is_refused(client: Client) -> None:
     """A typo in the mode must not become another mode."""
     with pytest.raises(nedbus.AddressError, match="mode 'newest' is not valid: expected one of latest, every"):
-        client.subscribe(mode=cast("Mode", "newest"))
+        client.subscribe("*", mode=cast("Mode", "newest"))
 
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
 def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
     """None of these is an error of another library."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    bus.latest(timeout=timeout)
+    bus.latest("*", timeout=timeout)
     bus.vehicles(timeout=timeout)
-    assert bus.subscribe().receive(timeout if timeout > 0 else None).message.timestamp == 1
+    subscription = bus.subscribe()
+    taken: list[nedbus.Sample] = []
+
+    def receive() -> list[nedbus.Sample]:
+        with contextlib.suppress(nedbus.NoDataError):
+            taken.append(subscription.receive(timeout))
+        return taken
+
+    wait_for(receive, what="the message, which a receive without patience gets once it is there")
+    assert taken[0].message.timestamp == 1

@@ -13,8 +13,17 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.session import Session
-from nedbus_msgs import ENCODING, FIELD_TYPES, LAYOUTS, Address, Origin, VehicleLocalPosition, origin_of, upgrade
+from nedbus.transport import Session
+from nedbus_msgs import (
+    ENCODING,
+    FIELD_TYPES,
+    LAYOUTS,
+    Address,
+    Provenance,
+    VehicleLocalPosition,
+    provenance_of,
+    upgrade,
+)
 from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, message, wait_for
 from tests.replays import open_replay
 from tests.ulogs import UlogWriter, write_log
@@ -48,7 +57,7 @@ with session:
 NEDBUS_READER = """
 import json, sys
 import nedbus
-with nedbus.connect(sys.argv[1], timeout=30) as bus, bus.subscribe(mode="every") as subscription:
+with nedbus.connect(sys.argv[1], timeout=30) as bus, bus.subscribe("*", mode="every") as subscription:
     print("ready", flush=True)
     for number in range(int(sys.argv[2])):
         sample = subscription.receive(30)
@@ -69,9 +78,9 @@ def rows(text: str) -> list[list[object]]:
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
     """Return what a log holds, by address, read here by the source itself (test_ulog.py proves that against pyulog)."""
     found: dict[str, list[list[str]]] = {}
-    for record in open_replay(f"ulog:{path}").records:
-        values = [repr(value) for value in upgrade(record.fields).__dict__.values()]
-        found.setdefault(str(record.address), []).append(values)
+    for each in open_replay(f"ulog:{path}").messages:
+        values = [repr(value) for value in upgrade(each.fields).__dict__.values()]
+        found.setdefault(str(each.address), []).append(values)
     return found
 
 
@@ -130,7 +139,7 @@ def test_plain_zenoh_and_msgpack_see_every_sample(start: Start, run_nedbus: Star
     missing = FIELD_TYPES.keys() - {*LAYOUTS["1.13"].fields, "hagl_max_z", "hagl_max_xy"}
     encodings = {str(encoding) for _, encoding, _ in received}
     assert {encoding.split(";source=")[0] for encoding in encodings} == {ENCODING}
-    assert {origin_of(encoding) for encoding in encodings} == {Origin("ulog", frozenset(missing))}
+    assert {provenance_of(encoding) for encoding in encodings} == {Provenance("ulog", frozenset(missing))}
     expected = {
         f"nedbus/{address}": [["1", *(value.replace("(", "[").replace(")", "]") for value in row)] for row in values]
         for address, values in expected_rows(path).items()
@@ -196,7 +205,7 @@ def test_simulator_publishes_all_topics_and_several_vehicles(run_nedbus: Start) 
     endpoint = free_endpoint()
     run_nedbus("serve", "-l", endpoint, "-s", "sim:", "-s", "sim:?vehicle=two&seed=2")
     with until_connected(endpoint) as bus:
-        wait_for(lambda: len(bus.latest()) == 10, what="ten streams")
+        wait_for(lambda: len(bus.latest("*")) == 10, what="ten streams")
         assert {vehicle: len(addresses) for vehicle, addresses in bus.vehicles().items()} == {"1": 5, "two": 5}
 
 
@@ -207,8 +216,8 @@ def test_ended_replay_keeps_its_last_value(tmp_path: Path, run_nedbus: Start) ->
     run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{path}")
     with until_connected(endpoint) as bus:
         wait_for(lambda: [source_of(s)["state"] for s in bus.services()] == ["done"], what="the end of the replay")
-        assert [sample.message.x for sample in bus.latest()] == [2.0]
-        assert bus.subscribe().receive(DEADLINE).message.x == 2.0
+        assert [sample.message.x for sample in bus.latest("*")] == [2.0]
+        assert bus.subscribe("*").receive(DEADLINE).message.x == 2.0
 
 
 def test_invalid_message_is_rejected_counted_and_reported(tmp_path: Path, run_nedbus: Start) -> None:
@@ -248,7 +257,7 @@ def test_failing_source_stops_nobody(tmp_path: Path, run_nedbus: Start) -> None:
     service = run_nedbus("serve", "-l", endpoint, "-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
     with until_connected(endpoint) as bus:
         wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the good source")
-        wait_for(lambda: source_of(bus.services()[0])["restarts"], what="a retry")
+        wait_for(lambda: source_of(bus.services()[0])["retries"], what="a retry")
         status = source_of(bus.services()[0])
         assert status["state"] == "retrying"
         assert "no such file" in str(status["error"])
@@ -262,7 +271,7 @@ def test_two_sources_of_one_vehicle_are_not_mixed(run_nedbus: Start) -> None:
     endpoint = free_endpoint()
     service = run_nedbus("serve", "-l", endpoint, "-s", "sim:", "-s", "sim:?seed=2")
     with until_connected(endpoint) as bus:
-        wait_for(lambda: "published here already" in service.err, what="the refusal")
+        wait_for(lambda: "published by this process already" in service.err, what="the rejection")
         states = {str(source_of(bus.services()[0], number)["state"]) for number in (0, 1)}
         assert states == {"running", "retrying"}
 
@@ -351,6 +360,22 @@ def test_service_as_a_client_waits_for_its_router_and_comes_back(run_nedbus: Sta
     assert service.wait() == 0
 
 
+def test_service_says_what_made_it_a_client(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """NEDBUS_CONNECT is set for scripts: a service that follows it says so, and how to be a router all the same."""
+    hint = "it starts no router of its own without --listen"
+    by_variable = run_nedbus("serve", "-s", "sim:", NEDBUS_CONNECT=endpoint)
+    wait_for(lambda: f"client of {endpoint}, as set by NEDBUS_CONNECT: {hint}" in by_variable.err, what="the variable")
+    file = tmp_path / "some.toml"
+    file.write_text(f'connect = "{endpoint}"')
+    by_file = run_nedbus("serve", "-s", "sim:?vehicle=2", "--config", str(file))
+    wait_for(lambda: f"client of {endpoint}, as set by {file}: {hint}" in by_file.err, what="the file")
+    by_flag = run_nedbus("serve", "-s", "sim:?vehicle=3", "--connect", endpoint)
+    wait_for(lambda: f"client of {endpoint}\n" in by_flag.err, what="the flag")
+    here = free_endpoint()
+    router = run_nedbus("serve", "-s", "sim:?vehicle=4", "--listen", here, NEDBUS_CONNECT=endpoint)
+    wait_for(lambda: f"router on {here}, joined to {endpoint}" in router.err, what="the router")
+
+
 def test_signal_ends_a_service_that_waits_for_its_router(run_nedbus: Start) -> None:
     """A service that never found its router ends cleanly too."""
     service = run_nedbus("serve", "--connect", free_endpoint(), "-s", "sim:")
@@ -377,11 +402,11 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
         (["-s", "ulog:"], "source 'ulog:': write it as ulog:FILE"),
         (["-s", "sim:x"], "source 'sim:x': write it as sim:?OPTION=VALUE"),
         (["-s", "sim:?sed=1"], "source 'sim:?sed=1': there is no option 'sed'"),
-        (["-s", "sim:?speed=0"], "speed=0 cannot be: expected a factor from 0.001"),
-        (["-s", "sim:?vehicle=a/b"], "vehicle=a/b cannot be: expected 1 to 64 of A-Z"),
+        (["-s", "sim:?speed=0"], "speed=0 is invalid: expected a factor from 0.001"),
+        (["-s", "sim:?vehicle=a/b"], "vehicle=a/b is invalid: expected 1 to 64 of A-Z"),
         (["-s", "sim:?speed"], "'speed' is not OPTION=VALUE"),
         (["-s", "sim:", "--until-done"], "until_done: no source ever ends"),
-        (["-s", "sim:", "--listen", "7447"], "listen: '7447' is no endpoint: write PROTOCOL/HOST:PORT"),
+        (["-s", "sim:", "--listen", "7447"], "listen: '7447' is not an endpoint: write PROTOCOL/HOST:PORT"),
         (["-s", "sim:", "--config", "no.toml"], "no.toml: there is no such file"),
         (["-s", "sim:", "--prefix", "a/*"], "prefix: prefix 'a/*' is not valid"),
     ],
@@ -489,7 +514,7 @@ def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: s
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="the first service")
     second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: "is published by somebody else too" in second.err, what="the warning")
+    wait_for(lambda: "is published by another process too" in second.err, what="the warning")
 
 
 def test_failing_source_lets_go_of_its_addresses(tmp_path: Path, run_nedbus: Start) -> None:

@@ -11,8 +11,12 @@ import threading
 from functools import partial
 from pathlib import Path
 
+import pytest
+
 from tests.conftest import DEADLINE, free_endpoint, wait_for
 from tests.ulogs import write_log
+
+pytestmark = pytest.mark.process
 
 
 def test_terminal_shows_progress_and_what_to_type(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Foxglove: a real WebSocket client that speaks its protocol looks at live vehicles."""
+"""Foxglove: a real WebSocket client that speaks its protocol shows live vehicles."""
 
 from __future__ import annotations
 
@@ -14,16 +14,25 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 import nedbus
-from nedbus.foxglove_view import FoxgloveView
-from nedbus_msgs import CURRENT, ROS2_TYPE, MapProjection, decode_cdr, message_definition, to_global, upgrade
+from nedbus.bridges import FoxgloveServer
+from nedbus_msgs import (
+    CURRENT,
+    DEFAULT_TOPIC,
+    ROS2_TYPE,
+    MapProjection,
+    decode_cdr,
+    message_definition,
+    to_global,
+    upgrade,
+)
 from tests.conftest import DEADLINE, Process, Start, message, wait_for
 
-VLP = "vehicle_local_position"
+VLP = DEFAULT_TOPIC
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
 
 
 class Client:
-    """What the Foxglove app does: it is told of channels, subscribes, and gets binary frames."""
+    """Do what the Foxglove app does: get the list of channels, subscribe, receive binary frames."""
 
     def __init__(self, url: str) -> None:
         self._opened = ExitStack()
@@ -35,16 +44,16 @@ class Client:
         self.info = self.receive()
 
     def receive(self, seconds: float = DEADLINE) -> dict[str, Any]:
-        """Take the next frame in; return what it said if it was no data."""
+        """Receive the next frame; return its JSON if it is not data."""
         frame = self._socket.recv(timeout=seconds)
         if isinstance(frame, str):
-            said: dict[str, Any] = json.loads(frame)
-            if said["op"] == "advertise":
-                self.channels |= {channel["id"]: channel for channel in said["channels"]}
-            elif said["op"] == "unadvertise":
-                for number in said["channelIds"]:
+            content: dict[str, Any] = json.loads(frame)
+            if content["op"] == "advertise":
+                self.channels |= {channel["id"]: channel for channel in content["channels"]}
+            elif content["op"] == "unadvertise":
+                for number in content["channelIds"]:
                     del self.channels[number]
-            return said
+            return content
         if frame[0] == 1:
             number, when = struct.unpack_from("<IQ", frame, 1)
             self.data.append((self.channels[number]["topic"], when, frame[13:]))
@@ -55,7 +64,7 @@ class Client:
         return {channel["topic"]: number for number, channel in self.channels.items()}
 
     def until(self, condition: Callable[[], object]) -> None:
-        """Take frames in until a condition holds; each waits for at most the deadline."""
+        """Receive frames until a condition holds, each within the deadline."""
         while not condition():
             self.receive()
 
@@ -69,7 +78,7 @@ class Client:
 
 
 @pytest.fixture
-def view(run_nedbus: Start, endpoint: str, start: Start) -> Iterator[tuple[Process, Client]]:
+def server(run_nedbus: Start, endpoint: str, start: Start) -> Iterator[tuple[Process, Client]]:
     """Run `nedbus foxglove`, and connect a client."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -81,9 +90,9 @@ def view(run_nedbus: Start, endpoint: str, start: Start) -> Iterator[tuple[Proce
     client.close()
 
 
-def test_vehicles_appear_and_every_field_can_be_plotted(view: tuple[Process, Client], bus: nedbus.Bus) -> None:
+def test_vehicles_appear_and_every_field_can_be_plotted(server: tuple[Process, Client], bus: nedbus.Bus) -> None:
     """Channels come with vehicles and go with them; a plot's data is the message, with its definition."""
-    _, client = view
+    _, client = server
     assert client.info["op"] == "serverInfo"
     publisher = bus.publisher("estimator_local_position", vehicle="7", instance=1)
     topic = "/7/estimator_local_position/1"
@@ -106,31 +115,31 @@ def test_vehicles_appear_and_every_field_can_be_plotted(view: tuple[Process, Cli
     client.until(lambda: topic not in client.topics)
 
 
-def test_poses_and_places(endpoint: str, bus: nedbus.Bus) -> None:
-    """ENU poses with their frames, and places on the map, as protobuf of Foxglove's own schemas."""
-    with FoxgloveView(bus, port=0) as view:
-        client = Client(view.url)
+def test_poses_and_locations(endpoint: str, bus: nedbus.Bus) -> None:
+    """ENU poses with their frames, and positions on the map, as protobuf of Foxglove's own schemas."""
+    with FoxgloveServer(bus, port=0) as server:
+        client = Client(server.url)
         with bus.subscribe(VLP, mode="every") as subscription:
             here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)
             there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
             bus.publisher(VLP, vehicle="1").publish(here)
-            view.show(subscription.receive(DEADLINE))
+            server.show(subscription.receive(DEADLINE))
             bus.publisher(VLP, vehicle="2").publish(there)
             sample = subscription.receive(DEADLINE)
-            view.show(sample)
+            server.show(sample)
             names = {"/1/pose", "/1/location", "/2/pose", "/2/location", "/tf", f"/1/{VLP}"}
             client.until(lambda: names <= client.topics.keys())
             assert client.channels[client.topics["/tf"]]["schemaName"] == "foxglove.FrameTransforms"
             client.subscribe("/2/pose", "/2/location", "/tf")
             received: dict[str, bytes] = {}
             while received.keys() < {"/2/pose", "/2/location", "/tf"}:
-                view.show(sample)
+                server.show(sample)
                 with suppress(TimeoutError):
                     client.receive(0.2)
                 received = {topic: payload for topic, _, payload in client.data}
-        place = to_global(there)
-        assert place
-        for value in (place.latitude, place.longitude):
+        position = to_global(there)
+        assert position
+        for value in (position.latitude, position.longitude):
             assert struct.pack("<d", value) in received["/2/location"]
         for value in (4.0, 3.0, 5.0):
             assert struct.pack("<d", value) in received["/2/pose"]
@@ -141,9 +150,9 @@ def test_poses_and_places(endpoint: str, bus: nedbus.Bus) -> None:
         client.close()
 
 
-def test_taken_port_is_said(view: tuple[Process, Client], run_nedbus: Start, endpoint: str) -> None:
+def test_port_in_use_is_reported(server: tuple[Process, Client], run_nedbus: Start, endpoint: str) -> None:
     """Two servers cannot have one port."""
-    process, _ = view
+    process, _ = server
     port = process.err.split("127.0.0.1:")[1].split()[0]
     other = run_nedbus("foxglove", "-c", endpoint, "--port", port)
     assert other.wait() == 1

@@ -1,4 +1,4 @@
-"""Every command of docs/live.md that needs no PX4 and no ROS 2, with other ports, against what stands in for them."""
+"""Every command of docs/live.md that needs no PX4 and no ROS 2, with other ports, against stand-ins for both."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ SERVES = [command for command in COMMANDS if command.startswith("nedbus serve")]
 ROS2 = [command for command in COMMANDS if command.startswith("nedbus ros2")]
 
 
-def words(command: str, **others: str) -> list[str]:
-    """Return the arguments of a command that is shown, with other places in it."""
-    for shown, meant in others.items():
-        command = command.replace(shown, meant)
+def arguments_of(command: str, **others: str) -> list[str]:
+    """Return the arguments of a command on the page, with other endpoints in it."""
+    for shown, used in others.items():
+        command = command.replace(shown, used)
     return shlex.split(command)[1:]
 
 
@@ -43,10 +43,10 @@ def test_all_commands_are_known() -> None:
 
 @pytest.mark.parametrize("command", SERVES)
 def test_vehicle_is_echoed(run_nedbus: Start, endpoint: str, port: int, fly: Fly, command: str) -> None:
-    """The service as it is shown, a vehicle, and the echo of the page: a line of that vehicle."""
-    places = {"tcp/192.168.1.5:7447": endpoint, "0.0.0.0:14540": f"127.0.0.1:{port}"}
+    """The service as on the page, a vehicle, and the echo of the page: a line of that vehicle."""
+    endpoints = {"tcp/192.168.1.5:7447": endpoint, "0.0.0.0:14540": f"127.0.0.1:{port}"}
     where = endpoint if "--connect" in command else free_endpoint()
-    arguments = [where if each == "tcp/0.0.0.0:7447" else each for each in words(command, **places)]
+    arguments = [where if each == "tcp/0.0.0.0:7447" else each for each in arguments_of(command, **endpoints)]
     if "--connect" not in arguments and "--listen" not in arguments:
         arguments += ["--listen", where]  # the page's own port may be taken
     service = run_nedbus(*arguments)
@@ -69,8 +69,8 @@ def _put_until_ended(px4: Px4, process: Process) -> bool:
 
 @pytest.mark.parametrize("command", ROS2)
 def test_ros_2_lists_it(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, peer: Peer, command: str) -> None:
-    """The bridge as it is shown, and a ROS 2 node that listens: it gets a message, and lists the topic."""
-    bridge = run_nedbus(*words(command, **{"tcp/192.168.1.5:7447": endpoint}), "-c", endpoint)
+    """The bridge as on the page, and a ROS 2 node that listens: it gets a message, and lists the topic."""
+    bridge = run_nedbus(*arguments_of(command, **{"tcp/192.168.1.5:7447": endpoint}), "-c", endpoint)
     layout, domain, vehicle, topic = "1.16", 0, "1", "/fmu/out/vehicle_local_position"
     if "1.14" in command:
         layout = "1.14"

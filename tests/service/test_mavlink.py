@@ -1,4 +1,4 @@
-"""Vehicles that speak MAVLink, each a process of its own: pymavlink encodes what a real flight's estimates were."""
+"""Vehicles that speak MAVLink, each a process of its own: pymavlink encodes the estimates of a real flight."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Fly = Callable[..., Process]
 
 @pytest.fixture
 def port() -> int:
-    """Return a UDP port that nobody uses now."""
+    """Return a free UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return cast("int", probe.getsockname()[1])
@@ -49,9 +49,9 @@ def port() -> int:
 
 @pytest.fixture
 def service(run_nedbus: Start, endpoint: str, port: int) -> Process:
-    """Run a service that listens to UDP."""
+    """Run a service that listens on UDP."""
     service = run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}?rate=50")
-    wait_for(lambda: is_taken(port), what="the service to listen")
+    wait_for(lambda: is_in_use(port), what="the service to listen")
     return service
 
 
@@ -69,12 +69,12 @@ def fly(start: Start, port: int, tmp_path: Path) -> Fly:
 
 @pytest.fixture
 def every(bus: nedbus.Bus) -> Iterator[nedbus.Subscription]:
-    """Read everything that the service publishes."""
+    """Receive every message that the service publishes."""
     with bus.subscribe(mode="every") as subscription:
         yield subscription
 
 
-def is_taken(port: int) -> bool:
+def is_in_use(port: int) -> bool:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("127.0.0.1", port))
@@ -84,37 +84,35 @@ def is_taken(port: int) -> bool:
 
 
 def status(bus: nedbus.Bus) -> dict[str, Any]:
-    """Return what the service says of its one source."""
+    """Return the status of the service's only source."""
     services = cast("list[dict[str, Any]]", bus.services())
     return services[0]["sources"][0] if services else {}
 
 
-def are_refused(bus: nedbus.Bus, count: float) -> bool:
+def are_rejected(bus: nedbus.Bus, count: float) -> bool:
     return bool(status(bus)["rejected"] >= count)
 
 
-def said(vehicle: Process) -> list[dict[str, Any]]:
+def printed(vehicle: Process) -> list[dict[str, Any]]:
     """Return the lines that a vehicle printed."""
     return [json.loads(line) for line in vehicle.out.splitlines()]
 
 
-def flight() -> list[dict[str, float]]:
-    """Return the estimates of a real flight, or of a simulated one where the log is not here."""
+def estimates() -> list[dict[str, float]]:
+    """Return the estimates of a real flight, or of a simulated one where the log is missing."""
     log = LOGS / "sitl_1.15_events.ulg"
-    records = open_replay(f"ulog:{log}" if log.exists() else "sim:").records
-    chosen = islice((record for record in records if record.address.topic == VLP), 300)
-    messages = [upgrade(record.fields) for record in chosen]
+    run = open_replay(f"ulog:{log}" if log.exists() else "sim:")
+    chosen = islice((each for each in run.messages if each.address.topic == VLP), 300)
+    messages = [upgrade(each.fields) for each in chosen]
     flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dist_bottom_valid", "xy_global")
     return [{name: getattr(message, name) for name in (*ROW, *flags)} for message in messages]
 
 
-def test_a_flight_with_loss_and_a_reboot(
-    service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
-) -> None:
-    """30 Hz of positions, 50 Hz of attitude, a tenth of all packets gone, a reboot: all that came is published."""
-    vehicle = fly("--system", 7, "--drop", 0.1, "--count", 300, "--reboot-after", 150, "--speed", 10, rows=flight())
+def test_loss_and_reboot_are_counted(service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """30 Hz of positions, 50 Hz of attitude, a tenth of all packets dropped, a reboot: all the rest is published."""
+    vehicle = fly("--system", 7, "--drop", 0.1, "--count", 300, "--reboot-after", 150, "--speed", 10, rows=estimates())
     assert vehicle.wait() == 0, vehicle.err
-    *lines, end = said(vehicle)
+    *lines, end = printed(vehicle)
     sent = [line for line in lines if "x" in line]
     assert 200 < len(sent) < 300
     for line in sent:
@@ -124,15 +122,15 @@ def test_a_flight_with_loss_and_a_reboot(
         assert [getattr(sample.message, name) for name in NED] == [line[name] for name in NED]
         assert "heading" in sample.missing or abs(sample.message.heading) <= math.pi + 1e-6
     now = status(bus)
-    assert (now["published"], now["rejected"], now["reboots"], now["restarts"]) == (len(sent), 0, 1, 0)
-    # What was lost before the first packet, around the reboot and after the last position nobody can know.
+    assert (now["published"], now["rejected"], now["reboots"], now["retries"]) == (len(sent), 0, 1, 0)
+    # Losses before the first packet, around the reboot and after the last position cannot be counted.
     assert 0 < now["lost"] <= end["packets_dropped"]
-    assert "7/vehicle_local_position: started again" in service.err
+    assert "7/vehicle_local_position: the vehicle rebooted" in service.err
 
 
 @pytest.mark.usefixtures("service")
-def test_fields_are_those_that_mavlink_has(fly: Fly, every: nedbus.Subscription) -> None:
-    """What the messages say is in the estimate, in PX4's units; all the rest is marked as not provided."""
+def test_fields_are_those_of_mavlink(fly: Fly, every: nedbus.Subscription) -> None:
+    """The estimate has what MAVLink's messages have, in PX4's units; all other fields are marked as not provided."""
     fly("--speed", 10)
     expected = {**ROW, "xy_valid": True, "z_valid": True, "v_xy_valid": True, "v_z_valid": True, "xy_global": True}
     expected |= {"z_global": True, "dist_bottom_valid": True, "ref_timestamp": 1_000_000}
@@ -150,42 +148,40 @@ def test_fields_are_those_that_mavlink_has(fly: Fly, every: nedbus.Subscription)
 
 @pytest.mark.usefixtures("service")
 def test_vehicles_on_one_port(fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """Each system id is a vehicle of its own, and each is asked for its streams at its own address."""
+    """Each system id is a vehicle of its own, and gets the requests for its streams at its own address."""
     fleet = {system: fly("--system", system, "--speed", 5) for system in (3, 250)}
-    wanted = {*STREAMS, ORIGIN}
+    expected = {*STREAMS, ORIGIN}
 
-    def asked(vehicle: Process) -> dict[int, float]:
-        return {line["message_id"]: line["interval_us"] for line in said(vehicle) if "message_id" in line}
+    def requested(vehicle: Process) -> dict[int, float]:
+        return {line["message_id"]: line["interval_us"] for line in printed(vehicle) if "message_id" in line}
 
-    wait_for(lambda: all(asked(vehicle).keys() == wanted for vehicle in fleet.values()), what="all requests")
-    assert all(asked(vehicle)[32] == 20_000 for vehicle in fleet.values())
+    wait_for(lambda: all(requested(vehicle).keys() == expected for vehicle in fleet.values()), what="all requests")
+    assert all(requested(vehicle)[32] == 20_000 for vehicle in fleet.values())
     seen = {every.receive(DEADLINE).vehicle for _ in range(200)}
     assert seen == {"3", "250"}
     assert sorted(bus.vehicles()) == ["250", "3"]
 
 
-def test_lost_link_is_seen_and_recovers(
-    service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
-) -> None:
-    """Within about 3 s of silence a vehicle is silent in the status and not listed; when it is back, so is its data."""
+def test_stale_vehicle_recovers(service: Process, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """A vehicle that sends nothing for about 3 s is stale in the status and not listed; then it is published again."""
     fly("--system", 7, "--count", 30, "--speed", 10).wait()
     wait_for(lambda: status(bus)["published"] == 30, what="the flight")
-    heard = time.monotonic()
+    last_received = time.monotonic()
     assert status(bus)["state"] == "running"
-    wait_for(lambda: status(bus)["silent"] == [f"7/{VLP}"], what="the silence")
-    assert time.monotonic() - heard < 6.0
+    wait_for(lambda: status(bus)["stale"] == [f"7/{VLP}"], what="the status to be stale")
+    assert time.monotonic() - last_received < 6.0
     assert status(bus)["state"] == "waiting"
     assert bus.vehicles() == {}
-    assert "is silent: nothing came for 3 s" in service.err
+    assert "is stale: nothing arrived for 3 s" in service.err
     fly("--system", 7, "--start-ms", 60_000, "--speed", 10)
-    wait_for(lambda: status(bus)["silent"] == [], what="the vehicle to be back")
+    wait_for(lambda: status(bus)["stale"] == [], what="the vehicle to be back")
     assert list(bus.vehicles()) == ["7"]
     assert [every.receive(DEADLINE).message.timestamp for _ in range(31)][-1] == 60_000_000
 
 
 @pytest.mark.usefixtures("service")
 def test_time_goes_on_when_its_counter_wraps(fly: Fly, every: nedbus.Subscription, bus: nedbus.Bus) -> None:
-    """time_boot_ms starts again after 49.7 days; the timestamp does not."""
+    """time_boot_ms overflows after 49.7 days; the timestamp does not."""
     fly("--start-ms", 2**32 - 500, "--count", 40, "--speed", 10)
     times = [every.receive(DEADLINE).message.timestamp for _ in range(40)]
     assert times == sorted(times)
@@ -197,38 +193,38 @@ def test_time_goes_on_when_its_counter_wraps(fly: Fly, every: nedbus.Subscriptio
 def test_hostile_datagrams_are_counted(
     service: Process, port: int, fly: Fly, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """10,000 datagrams of anything: counted, named once, nothing published, and a vehicle beside them is read."""
+    """10,000 random datagrams: counted, logged once, nothing published, and a vehicle beside them is received."""
     rng = random.Random(0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as attacker:
         for each in range(1, 10_001):
             start = (b"", b"\xfd\xff\x00", b"\xfe\x09", b"\xfd\x1c\x00\x00\x00\x01\x01\x20\x00\x00")[each % 4]
             attacker.sendto(start + rng.randbytes(rng.randrange(1, 300)), ("127.0.0.1", port))
             if each % 100 == 0:  # the kernel drops what is not read in time
-                wait_for(partial(are_refused, bus, 0.9 * each), what=f"{each} refusals")
+                wait_for(partial(are_rejected, bus, 0.9 * each), what=f"{each} rejections")
     assert status(bus)["published"] == 0
-    assert sum("refused" in line for line in service.err.splitlines()) == 1
+    assert sum(": rejected: " in line for line in service.err.splitlines()) == 1
     fly("--count", 10, "--speed", 10)
     assert len({every.receive(DEADLINE).message.timestamp for _ in range(10)}) == 10
 
 
-def test_broken_estimates_are_rejected(
+def test_invalid_estimates_are_rejected(
     service: Process, port: int, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """What the model refuses is reported, as from any source; a late datagram is not published after newer ones."""
-    us = dialect.MAVLink(None, 9, 1)
+    """Messages that violate the rules are reported, as from any source; a late datagram is not published."""
+    encoder = dialect.MAVLink(None, 9, 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
 
         def send(message: Any) -> None:
-            vehicle.sendto(message.pack(us), ("127.0.0.1", port))
+            vehicle.sendto(message.pack(encoder), ("127.0.0.1", port))
 
         send(dialect.MAVLink_estimator_status_message(0, 127, 0, 0, 0, 0, 0, 0, -1.0, 1.0))
         send(dialect.MAVLink_local_position_ned_message(1000, *range(6)))
         send(dialect.MAVLink_estimator_status_message(0, 127, 0, 0, 0, 0, 0, 0, 1.0, 1.0))
         send(dialect.MAVLink_local_position_ned_message(2000, math.nan, *range(5)))
         send(dialect.MAVLink_local_position_ned_message(1500, *range(6)))
-        us.srcComponent = 100  # a camera may say much, but not where the vehicle is
+        encoder.srcComponent = 100  # a camera: its position is not the vehicle's
         send(dialect.MAVLink_local_position_ned_message(3000, *range(6)))
-        us.srcSystem = 0
+        encoder.srcSystem = 0
         send(dialect.MAVLink_local_position_ned_message(3000, *range(6)))
     sample = every.receive(DEADLINE)
     assert (sample.vehicle, sample.message.timestamp) == ("9", 2_000_000)
@@ -239,18 +235,18 @@ def test_broken_estimates_are_rejected(
     assert "out of order: time_boot_ms 1500 after 2000" in service.err
 
 
-def test_tcp_that_breaks_is_opened_again(
+def test_broken_tcp_link_is_reopened(
     run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """A link that ends is an error in the status, and tried again; what came in pieces is put together."""
-    us = dialect.MAVLink(None, 5, 1)
+    """A link that is closed is an error in the status, and retried; a message in pieces is reassembled."""
+    encoder = dialect.MAVLink(None, 5, 1)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:tcp:127.0.0.1:{port}?vehicles=5:boat")
         for ms in (1000, 2000):
             server.settimeout(DEADLINE)
             connection, _ = server.accept()
-            data = dialect.MAVLink_local_position_ned_message(ms, *range(6)).pack(us)
+            data = dialect.MAVLink_local_position_ned_message(ms, *range(6)).pack(encoder)
             connection.sendall(b"noise" + data[:7])
             connection.sendall(data[7:])
             sample = every.receive(DEADLINE)
@@ -258,25 +254,25 @@ def test_tcp_that_breaks_is_opened_again(
             connection.settimeout(DEADLINE)
             assert connection.recv(1)[0] == dialect.PROTOCOL_MARKER_V2  # a heartbeat, or a request
             connection.close()
-            wait_for(lambda: status(bus)["state"] != "running", what="the break to be seen")
+            wait_for(lambda: status(bus)["state"] != "running", what="the error to be reported")
     wait_for(lambda: "cannot be opened (connection refused)" in str(status(bus)["error"]), what="the reason")
 
 
 def test_serial_port(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """A telemetry radio on a serial port; a port that vanishes is an error, not the end."""
-    ours, theirs = os.openpty()
-    tty.setraw(theirs)
-    run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:serial:{os.ttyname(theirs)}?baud=115200")
-    assert os.read(ours, 1)[0] == dialect.PROTOCOL_MARKER_V2
-    os.write(ours, dialect.MAVLink_local_position_ned_message(1000, *range(6)).pack(dialect.MAVLink(None, 5, 1)))
+    """A telemetry radio on a serial port is received; a port that disappears is retried."""
+    radio, port = os.openpty()
+    tty.setraw(port)
+    run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:serial:{os.ttyname(port)}?baud=115200")
+    assert os.read(radio, 1)[0] == dialect.PROTOCOL_MARKER_V2
+    os.write(radio, dialect.MAVLink_local_position_ned_message(1000, *range(6)).pack(dialect.MAVLink(None, 5, 1)))
     assert every.receive(DEADLINE).message.y == 1.0
-    os.close(ours)
-    os.close(theirs)
-    wait_for(lambda: status(bus)["state"] == "retrying", what="the port to be missed")
+    os.close(radio)
+    os.close(port)
+    wait_for(lambda: status(bus)["state"] == "retrying", what="the error to be reported")
 
 
 @pytest.mark.parametrize(
-    ("text", "word"),
+    ("text", "reason"),
     [
         ("mavlink:", "write it as mavlink:LINK"),
         ("mavlink:14550", "write udpin:0.0.0.0:14550"),
@@ -288,25 +284,25 @@ def test_serial_port(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, every: n
         ("px4-zenoh:?vehicles=px4_1:a,px4_1:b", "NAMESPACE:VEHICLE"),
         ("px4-zenoh:?domain=500", "a ROS domain, 0 to 232"),
         ("px4-zenoh:?layout=1.12", "the layout of keys without a type hash"),
-        ("px4-zenoh:here", "'here' is no endpoint"),
+        ("px4-zenoh:here", "'here' is not an endpoint"),
     ],
 )
-def test_wrong_words_are_refused(text: str, word: str) -> None:
-    """A source that cannot be says how to write it."""
-    with pytest.raises(ConfigError, match=word):
+def test_invalid_source_is_an_error(text: str, reason: str) -> None:
+    """The error of an invalid source shows the right form."""
+    with pytest.raises(ConfigError, match=reason):
         parse_source(text).open_source(vehicle="1")
 
 
 def test_missing_extra_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without pymavlink one line says what to do."""
+    """Without pymavlink the error names the extra to install."""
     monkeypatch.delitem(sys.modules, "nedbus.sources.mavlink", raising=False)
     monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
-    with pytest.raises(ConfigError, match=r"pymavlink: this is not installed: pip install 'nedbus\[mavlink\]'"):
+    with pytest.raises(ConfigError, match=r"pymavlink: not installed: pip install 'nedbus\[mavlink\]'"):
         parse_source("mavlink:udpin:0.0.0.0:14550").open_source(vehicle="1")
 
 
-def test_port_that_is_taken_is_an_error(run_nedbus: Start, endpoint: str, port: int) -> None:
-    """Two programs cannot share a port: the second one says so."""
+def test_port_in_use_is_an_error(run_nedbus: Start, endpoint: str, port: int) -> None:
+    """A port that another program uses is reported as the source's error."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", port))
         service = run_nedbus("serve", "--connect", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}")
@@ -318,89 +314,89 @@ def position(ms: int) -> SimpleNamespace:
     return SimpleNamespace(get_type=lambda: "LOCAL_POSITION_NED", time_boot_ms=ms, **values)
 
 
-def test_requests_are_repeated_and_given_up() -> None:
-    """Each stream is asked for up to five times a second apart, then the next; the origin again and again."""
+def test_requests_are_repeated_five_times() -> None:
+    """Each stream is requested up to five times, 1 s apart, then the next; the origin until it is known."""
     vehicle = Vehicle(30.0)
-    asked: list[int] = []
+    requested: list[int] = []
     for tick in range(200):
         now = 100.0 + tick / 2
-        vehicle.count(1, tick % 256, now)
-        asked += [number for number, _ in vehicle.requests(now)]
+        vehicle.track_sequence(1, tick % 256, now)
+        requested += [number for number, _ in vehicle.requests(now)]
     for number in STREAMS:
-        assert asked.count(number) == 5
-    assert asked.count(ORIGIN) > 10
+        assert requested.count(number) == 5
+    assert requested.count(ORIGIN) > 10
 
 
-def test_answers_move_requests_on() -> None:
-    """An answer of any kind ends the waiting; once all is asked for and the origin is known, nothing is asked."""
+def test_answer_ends_a_request() -> None:
+    """After any answer the next stream is requested; once all are and the origin is known, nothing is requested."""
     vehicle = Vehicle(30.0)
-    asked: list[tuple[int, float]] = []
+    requested: list[tuple[int, float]] = []
     for tick in range(20):
         now = 100.0 + tick
-        vehicle.count(1, tick, now)
-        vehicle.take(position(1000 * tick), now)
+        vehicle.track_sequence(1, tick, now)
+        vehicle.handle(position(1000 * tick), now)
         for request in list(vehicle.requests(now)):
-            asked.append(request)
-            assert vehicle.answered(now) == request[0]
+            requested.append(request)
+            assert vehicle.acknowledge(now) == request[0]
         if tick == 10:
             origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
-            assert vehicle.take(origin, now) is None
-    assert [number for number, _ in asked[:6]] == [*STREAMS, ORIGIN]
-    assert asked[0] == (32, 30.0)
-    assert len(asked) < 9
-    assert vehicle.answered(1000.0) is None
+            assert vehicle.handle(origin, now) is None
+    assert [number for number, _ in requested[:6]] == [*STREAMS, ORIGIN]
+    assert requested[0] == (32, 30.0)
+    assert len(requested) < 9
+    assert vehicle.acknowledge(1000.0) is None
 
 
-def test_overtaken_and_doubled_messages_are_not_lost() -> None:
-    """Datagrams that change places, or come twice, are no loss."""
+def test_reordered_and_duplicate_messages_are_not_lost() -> None:
+    """Datagrams that arrive out of order, or twice, do not count as lost."""
     vehicle = Vehicle(30.0)
     for sequence in (10, 12, 11, 13, 13, 14, 100, 200, 0):
-        vehicle.count(1, sequence, 100.0)
+        vehicle.track_sequence(1, sequence, 100.0)
     assert vehicle.lost == 85 + 99 + 55
 
 
-def test_positions_that_stop_are_asked_for_again() -> None:
-    """A vehicle that talks, but not of where it is, is asked again for its streams."""
+def test_positions_that_stop_are_requested_again() -> None:
+    """The streams of a vehicle that sends messages, but no positions, are requested again."""
     vehicle = Vehicle(30.0)
-    asked: list[int] = []
+    requested: list[int] = []
     for tick in range(400):
         now = 100.0 + tick / 10
-        vehicle.count(1, tick % 256, now)
+        vehicle.track_sequence(1, tick % 256, now)
         if now < 110:
-            vehicle.take(position(tick * 100), now)
+            vehicle.handle(position(tick * 100), now)
         for number, _ in list(vehicle.requests(now)):
-            vehicle.answered(now)
+            vehicle.acknowledge(now)
             if now >= 110:
-                asked.append(number)
-    assert asked.count(32) >= 3
+                requested.append(number)
+    assert requested.count(32) >= 3
 
 
-def test_old_values_are_no_part_of_an_estimate() -> None:
+def test_expired_values_are_not_provided() -> None:
     """A heading that is not repeated is not provided after 2 s; an origin stays until a reboot."""
     vehicle = Vehicle(30.0)
-    vehicle.take(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
-    vehicle.take(dialect.MAVLink_gps_global_origin_message(473977418, 85455939, 488000), 100.0)
-    first = vehicle.take(position(1000), 101.0)
-    later = vehicle.take(position(4000), 104.0)
+    vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
+    vehicle.handle(dialect.MAVLink_gps_global_origin_message(473977418, 85455939, 488000), 100.0)
+    first = vehicle.handle(position(1000), 101.0)
+    later = vehicle.handle(position(4000), 104.0)
     assert first is not None
     assert later is not None
     assert first["heading"] == pytest.approx(math.pi / 2)
     assert "heading" not in later
     assert later["ref_lat"] == 47.3977418
     assert "ref_timestamp" not in later
-    again = vehicle.take(position(500), 105.0)
+    again = vehicle.handle(position(500), 105.0)
     assert again is not None
     assert "ref_lat" not in again
-    assert vehicle.restarted
+    assert vehicle.rebooted
     with pytest.raises(OutOfOrderError):
-        vehicle.take(position(499), 105.0)
+        vehicle.handle(position(499), 105.0)
 
 
-def test_attitude_stands_in_for_the_heading() -> None:
-    """Without a global position PX4 sends no GLOBAL_POSITION_INT: then the yaw of its attitude is the heading."""
+def test_yaw_of_the_attitude_replaces_the_heading() -> None:
+    """Without a global position PX4 sends no GLOBAL_POSITION_INT; the heading is then the yaw of its attitude."""
     vehicle = Vehicle(30.0)
-    vehicle.take(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
-    vehicle.take(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
-    fields = vehicle.take(position(1), 100.0)
+    vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
+    vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
+    fields = vehicle.handle(position(1), 100.0)
     assert fields is not None
     assert fields["heading"] == pytest.approx(1.25)

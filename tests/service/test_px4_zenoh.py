@@ -1,4 +1,4 @@
-"""A PX4 that speaks Zenoh: built from what its module sends; and everything else that may stand on such keys."""
+"""PX4's Zenoh module, rebuilt from what it sends, and everything else that may be published on such keys."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.rmw_zenoh import NO_HASH, Attachment, TopicKey, make_gid
-from nedbus.session import Session
-from nedbus_msgs import LAYOUTS, ROS2_TYPE, DecodeError, dds_type, downgrade, encode_cdr, type_hash, upgrade
+from nedbus.sources.options import Px4ZenohOptions
+from nedbus.sources.px4_streams import StreamRegistry, track_sequence
+from nedbus.transport import NO_HASH, Attachment, Session, TopicKey, make_gid
+from nedbus_msgs import ANY, LAYOUTS, ROS2_TYPE, DecodeError, dds_type, downgrade, encode_cdr, type_hash, upgrade
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
 
 VLP = "vehicle_local_position"
@@ -24,7 +25,7 @@ Serve = Callable[..., Process]
 
 
 class Px4:
-    """The Zenoh module of one PX4: zenoh-pico's way of publishing, one sequence for each topic, trailing garbage."""
+    """The Zenoh module of one PX4: it publishes as zenoh-pico does, one sequence for each topic, trailing garbage."""
 
     def __init__(
         self,
@@ -50,20 +51,21 @@ class Px4:
         """Send a message as PX4 does: its sequence starts at 1, its time is us since boot, its gid is the board's."""
         fields = downgrade(message(timestamp, **given), self._layout)
         self._sequences[topic] = self._sequences.get(topic, 0) + 1 + skip
-        own = bytes(Attachment(self._sequences[topic], timestamp, GID))
+        default = bytes(Attachment(self._sequences[topic], timestamp, GID))
         extra = {"1.13": 12, "1.14": 8, "1.15": 8, "V0": 4, "1.16": 0}[self._layout] * b"\xa5"
-        self.raw(encode_cdr(fields, layout=self._layout) + extra, topic=topic, attachment=attachment or own)
+        self.raw(encode_cdr(fields, layout=self._layout) + extra, topic=topic, attachment=attachment or default)
 
     def raw(self, payload: bytes, *, topic: str = VLP, attachment: bytes | None = None) -> None:
         """Send any payload."""
         if topic not in self._publishers:
-            # PX4 lets Zenoh drop what it cannot send at once; a test that counts sends faster than any PX4.
+            # PX4 lets Zenoh drop what cannot be sent at once; this test sends faster than any PX4, and counts.
             publisher = self._session.declare_publisher(
                 self.key(topic), congestion_control=zenoh.CongestionControl.BLOCK, express=True
             )
             self._publishers[topic] = publisher
             wait_for(
-                lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, what="the service to listen"
+                lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching,
+                what="the service to subscribe",
             )
         self._publishers[topic].put(payload, attachment=attachment)
 
@@ -73,35 +75,35 @@ class Px4:
 
 @pytest.fixture
 def every(bus: nedbus.Bus) -> Iterator[nedbus.Subscription]:
-    """Read everything that the service publishes."""
-    with bus.subscribe(mode="every") as subscription:
+    """Receive every message of all topics that the service publishes."""
+    with bus.subscribe(ANY, mode="every") as subscription:
         yield subscription
 
 
 def status(bus: nedbus.Bus) -> dict[str, Any]:
-    """Return what the service says of its one source."""
+    """Return the status of the service's only source."""
     services = cast("list[dict[str, Any]]", bus.services())
     return services[0]["sources"][0] if services else {}
 
 
-def take(subscription: nedbus.Subscription, count: int) -> list[nedbus.Sample]:
+def receive(subscription: nedbus.Subscription, count: int) -> list[nedbus.Sample]:
     return [subscription.receive(DEADLINE) for _ in range(count)]
 
 
 @pytest.fixture
 def serve(run_nedbus: Start, endpoint: str) -> Serve:
-    """Start a service that listens to PX4s on its own router."""
+    """Start a service that receives from PX4s at the test's router."""
     return lambda options="": run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:{options}")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_is_read_by_its_hash(serve: Serve, raw: Session, every: nedbus.Subscription, layout: str) -> None:
-    """A vehicle of any release is read as it sends, and says which fields that release does not have."""
+    """Messages of any release are received, with the fields that this release does not have as missing."""
     serve()
     px4 = Px4(raw, layout=layout)
     for timestamp in range(1, 11):
         px4.put(timestamp, x=0.1 * timestamp, xy_valid=True, y=-1.0, hagl_max_z=5.0)
-    for timestamp, sample in enumerate(take(every, 10), 1):
+    for timestamp, sample in enumerate(receive(every, 10), 1):
         sent = message(timestamp, x=0.1 * timestamp, xy_valid=True, y=-1.0, hagl_max_z=5.0)
         expected = upgrade(downgrade(sent, layout))
         assert sample.message == expected
@@ -124,7 +126,7 @@ def test_topics_and_instances(serve: Serve, raw: Session, every: nedbus.Subscrip
     }
     for timestamp, name in enumerate(names, 1):
         px4.put(timestamp, topic=name)
-    assert {str(sample.address): sample.message.timestamp for sample in take(every, len(names))} == {
+    assert {str(sample.address): sample.message.timestamp for sample in receive(every, len(names))} == {
         address: timestamp for timestamp, address in enumerate(names.values(), 1)
     }
 
@@ -136,10 +138,10 @@ def test_topics_and_instances(serve: Serve, raw: Session, every: nedbus.Subscrip
         ("?vehicle=leader&vehicles=1:wing,px4_2:tail,swarm/px4_3:last", {"leader", "wing", "tail", "last"}),
     ],
 )
-def test_vehicles_are_told_apart(
+def test_vehicles_are_distinguished(
     serve: Serve, raw: Session, every: nedbus.Subscription, options: str, expected: set[str]
 ) -> None:
-    """In SITL all vehicles have one gid: domain and namespace tell them apart, named as the options say."""
+    """In SITL all vehicles have one gid: domain and namespace distinguish them, and options name them."""
     serve(options)
     fleet = [
         Px4(raw),
@@ -150,24 +152,24 @@ def test_vehicles_are_told_apart(
     for timestamp in range(1, 21):
         for px4 in fleet:
             px4.put(timestamp)
-    samples = take(every, 80)
+    samples = receive(every, 80)
     assert {sample.vehicle for sample in samples} == expected
     for vehicle in expected:
         assert [s.message.timestamp for s in samples if s.vehicle == vehicle] == list(range(1, 21))
 
 
-def test_only_the_domain_that_is_asked_for(serve: Serve, raw: Session, every: nedbus.Subscription) -> None:
-    """With a domain, others are not listened to, and the vehicle has the service's name."""
+def test_only_the_configured_domain_is_received(serve: Serve, raw: Session, every: nedbus.Subscription) -> None:
+    """With a domain, others are ignored, and the vehicle has the service's default name."""
     serve("?domain=5")
     five = Px4(raw, domain=5)
     five.put(1)
     raw.put(Px4(raw, domain=6).key(), encode_cdr(downgrade(message(2), "1.16"), layout="1.16"))
     five.put(3)
-    assert [(sample.vehicle, sample.message.timestamp) for sample in take(every, 2)] == [("1", 1), ("1", 3)]
+    assert [(sample.vehicle, sample.message.timestamp) for sample in receive(every, 2)] == [("1", 1), ("1", 3)]
 
 
-def test_loss_and_reboot_are_seen(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """What was lost before the service is counted by PX4's sequence; a sequence that goes back is a reboot."""
+def test_loss_and_reboot_are_counted(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """Losses before the service are counted by PX4's sequence; a sequence that goes back is a reboot."""
     service = serve()
     px4 = Px4(raw)
     px4.put(1)
@@ -175,10 +177,10 @@ def test_loss_and_reboot_are_seen(serve: Serve, raw: Session, bus: nedbus.Bus, e
     px4.reboot()
     px4.put(3)
     px4.put(4, skip=1)
-    assert [sample.message.timestamp for sample in take(every, 4)] == [1, 2, 3, 4]
+    assert [sample.message.timestamp for sample in receive(every, 4)] == [1, 2, 3, 4]
     now = status(bus)
     assert (now["lost"], now["reboots"], now["published"], now["rejected"]) == (4, 1, 4, 0)
-    assert "started again" in service.err
+    assert "the vehicle rebooted" in service.err
 
 
 def test_plain_publisher_needs_no_attachment(serve: Serve, raw: Session, every: nedbus.Subscription) -> None:
@@ -190,12 +192,12 @@ def test_plain_publisher_needs_no_attachment(serve: Serve, raw: Session, every: 
 
 
 def test_type_hash_not_supported(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """A build without hashes is refused with words that say what to do, and read once the layout is named."""
+    """A build without hashes is rejected with a hint, and received once the layout is configured."""
     service = serve()
     px4 = Px4(raw, layout="1.14")
     px4.type_hash = NO_HASH
     px4.put(1)
-    wait_for(lambda: "name the layout, as in px4-zenoh:?layout=1.14" in service.err, what="the refusal")
+    wait_for(lambda: "name the layout, as in px4-zenoh:?layout=1.14" in service.err, what="the rejection")
     assert status(bus)["rejected"] == 1
     service.kill()
     second = serve("?layout=1.14")
@@ -206,10 +208,10 @@ def test_type_hash_not_supported(serve: Serve, raw: Session, bus: nedbus.Bus, ev
     assert every.receive(DEADLINE).message.timestamp == 2
 
 
-def test_hostile_input_is_counted_and_named(
+def test_hostile_input_is_counted_and_logged(
     serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """Wrong hashes, lengths, attachments and 10,000 random payloads: counted, named once, nothing published."""
+    """Wrong hashes, lengths, attachments and 10,000 random payloads: counted, logged once, nothing published."""
     service = serve()
     good = Px4(raw)
     good.put(1)
@@ -231,22 +233,20 @@ def test_hostile_input_is_counted_and_named(
     other.raw(encode_cdr(downgrade(message(1), "1.16"), layout="1.16"), topic="somebody/pose")
     raw.put(f"0/{'x' * 200}/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
     raw.put(f"ä/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    wait_for(lambda: status(bus)["rejected"] == 18 + 10_000 + 3, what="all refusals to be counted")
+    wait_for(lambda: status(bus)["rejected"] == 18 + 10_000 + 3, what="all rejections to be counted")
     good.put(2)
-    samples = take(every, 2)
+    samples = receive(every, 2)
     assert [(sample.vehicle, sample.message.timestamp) for sample in samples] == [("1", 1), ("1", 2)]
     assert every.counts.received == 2
     assert status(bus)["published"] == 2
-    refusals = [line for line in service.err.splitlines() if "refused" in line]
-    assert sum(64 * "0" in line for line in refusals) == 1
-    assert len(refusals) <= 8, refusals
+    rejections = [line for line in service.err.splitlines() if ": rejected: " in line]
+    assert sum(64 * "0" in line for line in rejections) == 1
+    assert len(rejections) <= 8, rejections
     assert any("update nedbus" in warning for warning in status(bus)["warnings"])
 
 
-def test_what_the_model_refuses_is_rejected(
-    serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
-) -> None:
-    """A payload that is CDR but no valid estimate is reported with its reason, as from any source."""
+def test_invalid_messages_are_reported(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """A payload that is CDR but violates the rules is reported with its reason, as from any source."""
     serve()
     reports = raw.declare_subscriber("nedbus/@rejected/**", zenoh.handlers.FifoChannel(10))
     px4 = Px4(raw)
@@ -258,8 +258,10 @@ def test_what_the_model_refuses_is_rejected(
     assert every.receive(DEADLINE).message.timestamp == 2
 
 
-def test_our_own_bridge_is_refused(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """What a nedbus gave to ROS 2 does not come back, whoever hands it on."""
+def test_messages_of_nedbus_ros2_are_ignored(
+    serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """Messages that nedbus published to ROS 2 are not received again, whoever forwards them."""
     service = serve()
     px4 = Px4(raw)
     px4.put(1, attachment=bytes(Attachment(1, 1, make_gid())))
@@ -269,18 +271,18 @@ def test_our_own_bridge_is_refused(serve: Serve, raw: Session, bus: nedbus.Bus, 
     assert service.err.count("would loop") == 1
 
 
-def test_two_vehicles_with_one_id_on_one_key_are_not_mixed(
+def test_two_vehicles_with_one_gid_on_one_key_are_not_mixed(
     serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """Two simulated PX4s in one domain without namespaces: one of them is heard, the other refused, in two words."""
+    """Of two simulated PX4s in one domain without namespaces one is received, the other rejected."""
     service = serve()
     one, other = Px4(raw), Px4(raw)
     for timestamp in range(1, 101):
         one.put(1000 + timestamp, skip=1000 if timestamp == 1 else 0)
         other.put(timestamp)
-    times = [sample.message.timestamp for sample in take(every, 100)]
+    times = [sample.message.timestamp for sample in receive(every, 100)]
     assert sum(time < 1000 for time in times) <= 2
-    wait_for(lambda: status(bus)["rejected"] >= 98, what="the refusals")
+    wait_for(lambda: status(bus)["rejected"] >= 98, what="the rejections")
     assert status(bus)["reboots"] <= 2
     assert "give each a namespace or a domain" in service.err
     assert len(service.err.splitlines()) < 10
@@ -289,18 +291,18 @@ def test_two_vehicles_with_one_id_on_one_key_are_not_mixed(
 def test_two_publishers_of_one_key_are_not_mixed(
     serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
 ) -> None:
-    """Two ROS 2 nodes on one topic have different ids: the first one is heard."""
+    """Two ROS 2 nodes on one topic have different gids: the first one is received."""
     serve()
     px4 = Px4(raw)
     for sequence in range(1, 11):
         px4.put(sequence, attachment=bytes(Attachment(sequence, 0, GID)))
         px4.put(100 + sequence, attachment=bytes(Attachment(sequence, 0, GID[::-1])))
-    assert [sample.message.timestamp for sample in take(every, 10)] == list(range(1, 11))
-    wait_for(lambda: status(bus)["rejected"] == 10, what="the refusals")
+    assert [sample.message.timestamp for sample in receive(every, 10)] == list(range(1, 11))
+    wait_for(lambda: status(bus)["rejected"] == 10, what="the rejections")
 
 
 def test_hostile_keys_leave_the_status_readable(serve: Serve, raw: Session, bus: nedbus.Bus) -> None:
-    """Long keys and long reasons do not make a status that nobody can receive."""
+    """Long keys and long reasons do not make the status too long to be received."""
     serve()
     px4 = Px4(raw)
     px4.put(1)
@@ -310,63 +312,63 @@ def test_hostile_keys_leave_the_status_readable(serve: Serve, raw: Session, bus:
     wait_for(lambda: status(bus).get("rejected") == 200, what="the status")
 
 
-def test_service_listens_at_its_own_router(run_nedbus: Start, tmp_path: Path) -> None:
-    """A router by file, or one that joins another which is away, is where its own vehicles are heard."""
-    where, away = free_endpoint(), free_endpoint()
+def test_service_connects_to_its_own_router(run_nedbus: Start, tmp_path: Path) -> None:
+    """Vehicles are received at the service's router: one by file, or one that connects to another that is down."""
+    own, down = free_endpoint(), free_endpoint()
     file = tmp_path / "router.json5"
-    listen = f'listen: {{endpoints: ["{where}"]}}'
+    listen = f'listen: {{endpoints: ["{own}"]}}'
     file.write_text(f'{{mode: "router", {listen}, scouting: {{multicast: {{enabled: false}}}}}}')
-    for arguments in (["--router-config", str(file)], ["--listen", where, "--connect", away]):
+    for arguments in (["--router-config", str(file)], ["--listen", own, "--connect", down]):
         service = run_nedbus("serve", *arguments, "-s", "px4-zenoh:")
-        with nedbus.connect(where, timeout=DEADLINE) as bus, bus.subscribe() as subscription:
+        with nedbus.connect(own, timeout=DEADLINE) as bus, bus.subscribe() as subscription:
             Px4(bus._session).put(1)
             assert subscription.receive(DEADLINE).message.timestamp == 1
         service.kill()
 
 
 def test_domain_and_namespace_make_a_name(serve: Serve, raw: Session, every: nedbus.Subscription) -> None:
-    """A domain's vehicle is the first part of the name of those that have a namespace too."""
+    """The vehicle of a domain is the first part of the names of its namespaces."""
     serve("?vehicles=5:tail,/px4_2:wing")
     for namespace in ("", "px4_1", "px4_2"):
         Px4(raw, domain=5, namespace=namespace).put(1)
-    assert {sample.vehicle for sample in take(every, 3)} == {"tail", "tail-px4_1", "wing"}
+    assert {sample.vehicle for sample in receive(every, 3)} == {"tail", "tail-px4_1", "wing"}
 
 
-def test_second_speaker_is_refused(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
-    """Two keys that would be one vehicle's topic are not mixed: the first one stays, the other is named."""
+def test_second_key_of_an_address_is_rejected(
+    serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """Two keys that stand for one address are not mixed: the first one stays, the other is rejected."""
     service = serve()
     one, other = Px4(raw), Px4(raw, layout="V0")
     one.put(1)
     other.put(2)
     one.put(3)
-    assert [sample.message.timestamp for sample in take(every, 2)] == [1, 3]
+    assert [sample.message.timestamp for sample in receive(every, 2)] == [1, 3]
     assert status(bus)["rejected"] == 1
     assert "already: name one of them with vehicles=" in service.err
 
 
-def test_silent_vehicle_is_no_longer_listed(
-    serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription
-) -> None:
-    """A vehicle that says nothing for 3 s is silent in the status and not listed; one that goes on is untouched."""
+def test_stale_vehicle_is_not_listed(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
+    """A vehicle that sends nothing for 3 s is stale in the status and not listed; others are not affected."""
     serve()
     px4, other = Px4(raw), Px4(raw, domain=1)
     px4.put(1)
     every.receive(DEADLINE)
 
-    def is_silent() -> bool:
+    def is_stale() -> bool:
         other.put(time.monotonic_ns())
-        return bool(status(bus)["silent"] == [f"1/{VLP}"])
+        return bool(status(bus)["stale"] == [f"1/{VLP}"])
 
     assert status(bus)["state"] == "running"
-    wait_for(is_silent, what="the silence to be seen")
+    wait_for(is_stale, what="the status to be stale")
     assert list(bus.vehicles()) == ["domain1"]
     px4.put(2)
-    wait_for(lambda: status(bus)["silent"] == [], what="the vehicle to be back")
+    wait_for(lambda: status(bus)["stale"] == [], what="the vehicle to be back")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 
-def test_two_services_are_not_needed(run_nedbus: Start) -> None:
-    """A vehicle can connect to the service itself: it is the router."""
+def test_vehicle_connects_to_the_service(run_nedbus: Start) -> None:
+    """A vehicle can connect to the service itself, which is a router."""
     endpoint = free_endpoint()
     run_nedbus("serve", "--listen", endpoint, "-s", "px4-zenoh:")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe() as subscription:
@@ -375,14 +377,14 @@ def test_two_services_are_not_needed(run_nedbus: Start) -> None:
         assert subscription.receive(DEADLINE).message.timestamp == 1
 
 
-def test_router_that_is_away_is_waited_for(run_nedbus: Start) -> None:
-    """A router of the vehicle's that is not there is an error in the status, tried again, and nobody else's."""
-    endpoint, far = free_endpoint(), free_endpoint()
-    service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{far}", "-s", "sim:")
+def test_router_that_is_down_is_retried(run_nedbus: Start) -> None:
+    """A vehicle's router that does not answer is an error in the status, and retried; other sources go on."""
+    endpoint, other_router = free_endpoint(), free_endpoint()
+    service = run_nedbus("serve", "--listen", endpoint, "-s", f"px4-zenoh:{other_router}", "-s", "sim:")
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(vehicle="7") as subscription:
         wait_for(lambda: "no Zenoh router answers there" in service.err, what="the first try")
-        run_nedbus("router", "--listen", far)
-        with nedbus.connect(far, timeout=DEADLINE) as other:
+        run_nedbus("router", "--listen", other_router)
+        with nedbus.connect(other_router, timeout=DEADLINE) as other:
             px4 = Px4(other._session, namespace="7")
             px4.put(1)
             assert subscription.receive(DEADLINE).message.timestamp == 1
@@ -392,16 +394,85 @@ def test_router_that_is_away_is_waited_for(run_nedbus: Start) -> None:
     "key",
     ["", "0", "0/a/b", "x/fmu/out/a/b/c", "0//a/b/c", "0/*/a/b", f"{10**12}/a/b/c", "-1/a/b/c", "0/a/b/"],
 )
-def test_other_keys_are_refused(key: str) -> None:
-    """A key that rmw_zenoh would not write is no topic."""
+def test_other_keys_are_rejected(key: str) -> None:
+    """A key that rmw_zenoh would not write raises DecodeError."""
     with pytest.raises(DecodeError):
         TopicKey.parse(key)
 
 
-def test_key_and_attachment_come_back() -> None:
-    """What is parsed is what was written."""
+def test_key_and_attachment_round_trip() -> None:
+    """Parsing returns what was written."""
     key = TopicKey(3, "px4_1/fmu/out/vehicle_local_position", dds_type(ROS2_TYPE), type_hash("V0"))
     assert TopicKey.parse(str(key)) == key
     attachment = Attachment(7, 123456789, GID)
     assert len(bytes(attachment)) == 33
     assert Attachment.parse(bytes(attachment)) == attachment
+
+
+def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16") -> str:
+    """Return the key of vehicle_local_position, as PX4 writes it."""
+    topic = f"{namespace and namespace + '/'}fmu/out/{VLP}"
+    return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
+
+
+@pytest.fixture
+def streams() -> StreamRegistry:
+    """Return a registry with default options, for a service whose vehicle is 1."""
+    return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
+
+
+def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
+    """The first key owns an address until it is silent for 3 s; then another key may have it."""
+    first, second = streams.register(key()), streams.register(key(layout="V0"))
+    assert (streams.find(key()), str(second.address)) == (first, f"1/{VLP}")
+    streams.claim(first, None, 100.0)
+    track_sequence(first, None, 100.0)
+    with pytest.raises(DecodeError, match="already: name one of them with vehicles="):
+        streams.claim(second, None, 102.9)
+    streams.claim(second, None, 103.0)
+    track_sequence(second, None, 103.0)
+    with pytest.raises(DecodeError, match="already"):
+        streams.claim(first, None, 104.0)
+
+
+def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
+    """The first publisher owns a key until it is silent for 3 s; the sequence of the next one starts anywhere."""
+    stream = streams.register(key())
+    streams.claim(stream, Attachment(7, 0, GID), 100.0)
+    track_sequence(stream, Attachment(7, 0, GID), 100.0)
+    other = Attachment(500, 0, GID[::-1])
+    with pytest.raises(DecodeError, match="two publishers share this key"):
+        streams.claim(stream, other, 102.9)
+    streams.claim(stream, other, 103.0)
+    assert track_sequence(stream, other, 103.0) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "lost", "rebooted"), [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)]
+)
+def test_gap_in_the_sequence_is_loss(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
+    """A gap is that many lost messages, unless it is absurdly large; a step back is a reboot."""
+    stream = streams.register(key())
+    for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
+        assert track_sequence(stream, Attachment(each, 0, GID), 100.0) == expected
+
+
+def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry) -> None:
+    """One step back is a reboot; another one within 3 s is a second vehicle with the same gid."""
+    stream = streams.register(key())
+    for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
+        track_sequence(stream, Attachment(sequence, 0, GID), now)
+    with pytest.raises(DecodeError, match="goes back and forth"):
+        track_sequence(stream, Attachment(2, 0, GID), 103.0)
+    assert track_sequence(stream, Attachment(1, 0, GID), 106.1) == (0, True)
+    with pytest.raises(DecodeError, match="sequence number 1 is a duplicate"):
+        track_sequence(stream, Attachment(1, 0, GID), 106.2)
+
+
+def test_number_of_keys_is_limited(streams: StreamRegistry) -> None:
+    """A thousand keys are registered, and no more."""
+    for domain in range(1000):
+        streams.register(key(domain=domain))
+    with pytest.raises(DecodeError, match="more than 1000 keys"):
+        streams.register(key(domain=1000))
+    assert streams.find(key(domain=1000)) is None

@@ -1,4 +1,4 @@
-"""ROS 2 over rmw_zenoh, in both directions, against a client that no one here wrote: zenoh-ros2-sdk."""
+"""ROS 2 over rmw_zenoh, in both directions, against an independent client: zenoh-ros2-sdk."""
 
 from __future__ import annotations
 
@@ -12,13 +12,21 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.rmw_zenoh import Attachment, TopicKey, publisher_token
-from nedbus.session import Session
-from nedbus_msgs import LAYOUTS, ROS2_TYPE, VehicleLocalPosition, dds_type, downgrade, type_hash, upgrade
+from nedbus.transport import Attachment, Session, TopicKey, publisher_token
+from nedbus_msgs import (
+    DEFAULT_TOPIC,
+    LAYOUTS,
+    ROS2_TYPE,
+    VehicleLocalPosition,
+    dds_type,
+    downgrade,
+    type_hash,
+    upgrade,
+)
 from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
 from tests.replays import open_replay
 
-VLP = "vehicle_local_position"
+VLP = DEFAULT_TOPIC
 PEER = str(Path(__file__).with_name("ros2_peer.py"))
 COUNT = 200
 
@@ -27,12 +35,12 @@ Peer = Callable[..., Process]
 
 def flight() -> list[VehicleLocalPosition]:
     """Return estimates of a flight: numbers of all kinds, NaN, infinities, resets."""
-    records = (record for record in open_replay("sim:?seed=3").records if record.address.topic == VLP)
-    return [upgrade(record.fields) for record in islice(records, 0, 40 * COUNT, 40)]
+    messages = (each for each in open_replay("sim:?seed=3").messages if each.address.topic == VLP)
+    return [upgrade(each.fields) for each in islice(messages, 0, 40 * COUNT, 40)]
 
 
 def definition(layout: str) -> str:
-    """Return the message as a .msg file of px4_msgs says it."""
+    """Return the message definition as a .msg file of px4_msgs has it."""
     return "".join(f"{LAYOUTS[layout].type_of(name)} {name}\n" for name in LAYOUTS[layout].fields)
 
 
@@ -94,7 +102,7 @@ def test_ros_2_node_receives_and_lists(
 
 
 def test_bridge_writes_what_px4_writes(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """Key, payload and attachment are those of PX4's own module, so that its subscribers need not know."""
+    """Key, payload and attachment are those of PX4's own module: its subscribers see no difference."""
     publisher = bus.publisher(VLP, vehicle="1")
     run_nedbus("ros2", "-c", endpoint)
     key = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
@@ -112,19 +120,20 @@ def test_bridge_writes_what_px4_writes(run_nedbus: Start, endpoint: str, bus: ne
 
 
 def test_topic_of_another_node_is_left_to_it(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """A PX4 that publishes a topic itself is not doubled; the same topic in another layout is a translation."""
+    """What a PX4 publishes itself is not published twice; the same topic in another layout is a translation."""
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
     same = run_nedbus("ros2", "-c", endpoint, "--layout", "1.14")
-    wait_for(lambda: "node px4_0001 publishes /fmu/out/vehicle_local_position, it is left" in same.err, what="the word")
+    left = f"node px4_0001 publishes /fmu/out/{VLP} already: left to that node"
+    wait_for(lambda: left in same.err, what="the warning")
     assert "->" not in same.err
     other = run_nedbus("ros2", "-c", endpoint, "--layout", "1.16")
     wait_for(lambda: f"-> /fmu/out/{VLP}" in other.err, what="the translation")
     token.undeclare()
     wait_for(lambda: f"-> /fmu/out/{VLP}" in same.err, what="the topic to be taken over")
     back = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
-    wait_for(lambda: same.err.count("it is left") == 2, what="the topic to be given back")
+    wait_for(lambda: same.err.count(left) == 2, what="the topic to be released")
     back.undeclare()
 
 
@@ -145,8 +154,8 @@ def test_topics_come_and_go_with_their_vehicles(
     wait_for(lambda: not topics(), what="the topic to go")
 
 
-def test_loop_is_refused(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """A service that listens to ROS 2 does not take in what a bridge of its own network gave to ROS 2."""
+def test_loop_is_rejected(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A service that listens to ROS 2 rejects what a bridge of its own network published to ROS 2."""
     publisher = bus.publisher(VLP, vehicle="1", source="sim")
     with bus.subscribe(mode="every") as subscription:
         service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:?vehicle=copy")
@@ -154,13 +163,13 @@ def test_loop_is_refused(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> N
         wait_for(lambda: "->" in bridge.err and "listening" in service.err, what="both")
         timestamp = 0
 
-        def is_refused() -> bool:
+        def is_rejected() -> bool:
             nonlocal timestamp
             timestamp += 1
             publisher.publish(message(timestamp))
             return "would loop" in service.err
 
-        wait_for(is_refused, what="the refusal")
+        wait_for(is_rejected, what="the rejection")
         received = [subscription.receive(DEADLINE) for _ in range(timestamp)]
         assert {sample.vehicle for sample in received} == {"1"}
         assert list(bus.vehicles()) == ["1"]
@@ -173,7 +182,7 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
     key = f"0/a_b/fmu/out/estimator_local_position_0/{dds_type(ROS2_TYPE)}/TypeHashNotSupported"
     subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
     bridge = run_nedbus("ros2", "-c", endpoint, "--humble", "-t", "estimator_local_position", "-i", "0")
-    wait_for(lambda: "give one a --namespace" in bridge.err, what="both")
+    wait_for(lambda: "set --namespace" in bridge.err, what="both")
     for publisher in publishers:
         publisher.publish(message(7))
     assert len(subscriber.handler.recv().payload) == 220
@@ -183,17 +192,19 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
 
 
 @pytest.mark.parametrize(
-    ("arguments", "word"),
+    ("arguments", "exit_code", "text"),
     [
-        (["--to", "tcp/127.0.0.1:1"], "nothing answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
-        (["--layout", "1.12"], "no layout '1.12': choose from 1.13, 1.14, 1.15, V0, 1.16"),
-        (["--namespace", "1:7up"], "namespace '7up' is not valid"),
-        (["--namespace", "7up"], "VEHICLE:NAMESPACE"),
+        (["--to", "tcp/127.0.0.1:1"], 1, "nothing answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
+        (["--layout", "1.12"], 2, "no layout '1.12': choose from 1.13, 1.14, 1.15, V0, 1.16"),
+        (["--namespace", "1:7up"], 2, "namespace '7up' is not valid"),
+        (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),
     ],
 )
-def test_wrong_words_are_usage_errors(run_nedbus: Start, endpoint: str, arguments: list[str], word: str) -> None:
-    """What cannot be is said in one line."""
+def test_invalid_option_is_one_line(
+    run_nedbus: Start, endpoint: str, arguments: list[str], exit_code: int, text: str
+) -> None:
+    """Exit 2 for an option that is invalid, 1 for a router of ROS 2 that does not answer; one line with the reason."""
     bridge = run_nedbus("ros2", "-c", endpoint, *arguments)
-    assert bridge.wait() in {1, 2}
-    assert word in bridge.err
+    assert bridge.wait() == exit_code
+    assert text in bridge.err
     assert len(bridge.err.splitlines()) == 1

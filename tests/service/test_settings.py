@@ -44,7 +44,7 @@ def test_file_is_the_named_one_or_the_one_beside(tmp_path: Path, monkeypatch: py
         ('connect = ["tcp/a:1"', "line 1, column 21", "Unclosed array"),
         ("vehicle = 1\nx y", "line 2, column 3", "Expected '=' after a key"),
         ("vehicle = 1\n\n  conect = 3", "line 3, column 3", "there is no setting 'conect': choose from connect,"),
-        ('listen = ["7447"]', "line 1, column 1", "'7447' is no endpoint: write PROTOCOL/HOST:PORT"),
+        ('listen = ["7447"]', "line 1, column 1", "'7447' is not an endpoint: write PROTOCOL/HOST:PORT"),
         ('prefix = "a//b"', "line 1, column 1", "prefix 'a//b' is not valid"),
         ('vehicle = "a b"', "line 1, column 1", "vehicle 'a b' is not valid"),
         ('until_done = "maybe"', "line 1, column 1", "until_done: "),
@@ -64,7 +64,7 @@ def test_mistake_in_the_file_is_found(tmp_path: Path, text: str, place: str, rea
 def test_mistake_in_the_environment_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The variable is the place."""
     monkeypatch.setenv("NEDBUS_LISTEN", "here")
-    with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is no endpoint"):
+    with pytest.raises(ConfigError, match=r"^NEDBUS_LISTEN: 'here' is not an endpoint"):
         load_settings()
 
 

@@ -7,28 +7,28 @@ from collections import defaultdict
 
 import pytest
 
-from nedbus.sources import Record
+from nedbus.sources import SourceMessage
 from nedbus_msgs import FIELD_TYPES, TOPICS, VehicleLocalPosition, encode, upgrade
 from tests.replays import open_replay
 
 
-def fly(options: str) -> list[Record]:
-    return list(open_replay(f"sim:{options}").records)
+def simulate(options: str) -> list[SourceMessage]:
+    return list(open_replay(f"sim:{options}").messages)
 
 
 @pytest.fixture(scope="module")
 def streams() -> dict[str, list[VehicleLocalPosition]]:
-    """Fly more than one lap, validate everything, and sort it by stream."""
-    sorted_out: dict[str, list[VehicleLocalPosition]] = defaultdict(list)
-    for record in fly("?duration=140"):
-        assert set(record.fields) == set(FIELD_TYPES)
-        sorted_out[record.address.stream].append(upgrade(record.fields))
-    return sorted_out
+    """Simulate more than one lap, validate everything, and group it by stream."""
+    by_stream: dict[str, list[VehicleLocalPosition]] = defaultdict(list)
+    for each in simulate("?duration=140"):
+        assert set(each.fields) == set(FIELD_TYPES)
+        by_stream[each.address.stream].append(upgrade(each.fields))
+    return by_stream
 
 
 def test_same_seed_same_bits() -> None:
     """The flight is a function of its seed."""
-    one, two, other = ([encode(upgrade(record.fields)) for record in fly(f"?duration=20&seed={s}")] for s in (3, 3, 4))
+    one, two, other = ([encode(upgrade(each.fields)) for each in simulate(f"?duration=20&seed={s}")] for s in (3, 3, 4))
     assert one == two
     assert one != other
 
@@ -44,21 +44,21 @@ def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
         assert steps == {round(1e6 / TOPICS[stream.split("/")[0]].rate)}
 
 
-def test_records_are_in_time_order_and_counted() -> None:
-    """A finite flight tells how many records it has, in order of when they are due."""
-    flight = open_replay("sim:?duration=3.3")
-    due = [record.due for record in flight.records]
+def test_messages_are_in_time_order_and_counted() -> None:
+    """A finite flight has as many messages as its total, in order of `due`."""
+    run = open_replay("sim:?duration=3.3")
+    due = [each.due for each in run.messages]
     assert due == sorted(due)
-    assert len(due) == flight.total
+    assert len(due) == run.total
 
 
 def test_outage_is_dead_reckoning_with_growing_error(streams: dict[str, list[VehicleLocalPosition]]) -> None:
-    """Without GPS the estimate says so, its error and its sigma grow, and after 10 s it is no longer valid."""
-    dark = [message for message in streams["vehicle_local_position"] if message.dead_reckoning]
-    assert [(message.timestamp / 1e6 - 10.0) // 1 for message in (dark[0], dark[-1])] == [60.0, 74.0]
-    assert dark[-1].eph > dark[len(dark) // 2].eph > dark[0].eph
-    assert dark[0].xy_valid
-    assert not dark[-1].xy_valid
+    """Without GPS dead_reckoning is set, error and sigma grow, and after 10 s xy is no longer valid."""
+    outage = [message for message in streams["vehicle_local_position"] if message.dead_reckoning]
+    assert [(message.timestamp / 1e6 - 10.0) // 1 for message in (outage[0], outage[-1])] == [60.0, 74.0]
+    assert outage[-1].eph > outage[len(outage) // 2].eph > outage[0].eph
+    assert outage[0].xy_valid
+    assert not outage[-1].xy_valid
     assert not any(message.dead_reckoning for message in streams["external_ins_local_position"])
 
 
@@ -114,7 +114,7 @@ def test_origin_is_set_in_flight(streams: dict[str, list[VehicleLocalPosition]])
     assert (first.xy_global, last.xy_global, last.ref_lat) == (False, True, 47.397742)
 
 
-def test_two_vehicles_fly_apart() -> None:
-    """Another seed is another direction."""
-    ends = [upgrade(fly(f"?duration=30&seed={seed}")[-1].fields) for seed in (0, 1)]
+def test_seeds_have_different_directions() -> None:
+    """Vehicles with different seeds fly apart."""
+    ends = [upgrade(simulate(f"?duration=30&seed={seed}")[-1].fields) for seed in (0, 1)]
     assert abs(ends[0].x - ends[1].x) + abs(ends[0].y - ends[1].y) > 5

@@ -11,7 +11,7 @@ import pytest
 from pyulog import ULog
 
 from nedbus.errors import SourceError
-from nedbus.sources import Flight
+from nedbus.sources import ReplayRun
 from nedbus_msgs import FIELD_TYPES, LAYOUTS, TOPICS, VehicleLocalPosition, upgrade
 from tests.conftest import LOGS, message
 from tests.replays import open_replay
@@ -30,12 +30,12 @@ REAL = {
 }
 
 
-def open_log(path: Path, options: str = "") -> Flight:
+def open_log(path: Path, options: str = "") -> ReplayRun:
     return open_replay(f"ulog:{path}{options}")
 
 
-def read_all(flight: Flight) -> list[tuple[str, VehicleLocalPosition]]:
-    return [(str(record.address), upgrade(record.fields)) for record in flight.records]
+def read_all(run: ReplayRun) -> list[tuple[str, VehicleLocalPosition]]:
+    return [(str(each.address), upgrade(each.fields)) for each in run.messages]
 
 
 @pytest.mark.logs
@@ -46,17 +46,17 @@ def test_real_log_is_read_whole_and_exact(name: str) -> None:
     if not path.exists():
         pytest.skip(f"the real log is not here: {path}")
     total, layout, streams = REAL[name]
-    flight = open_log(path)
-    assert (flight.total, len(flight.addresses), flight.warnings) == (total, streams, ())
-    assert f"layout {layout}," in flight.summary
+    run = open_log(path)
+    assert (run.total, len(run.addresses), run.warnings) == (total, streams, ())
+    assert f"layout {layout}," in run.summary
     oracle = {(data.name, data.multi_id): data.data for data in ULog(str(path), list(TOPICS)).data_list}
     rows = dict.fromkeys(oracle, 0)
     last_due, fields = 0.0, 0
-    for record in flight.records:
-        assert record.due >= last_due
-        last_due = record.due
-        read = upgrade(record.fields)
-        where = (record.address.topic, record.address.instance or 0)
+    for each in run.messages:
+        assert each.due >= last_due
+        last_due = each.due
+        read = upgrade(each.fields)
+        where = (each.address.topic, each.address.instance or 0)
         for column, values in oracle[where].items():
             base, _, index = column.partition("[")
             for field in ("hagl_max_z", "hagl_max_xy") if base == "hagl_max" else (base,):
@@ -71,16 +71,16 @@ def test_real_log_is_read_whole_and_exact(name: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_layout_is_read(tmp_path: Path, layout: str) -> None:
-    """A log of any layout gives messages; fields that it lacks are not provided."""
+    """A log of any layout is read; fields that it lacks are not provided."""
     writer = UlogWriter(layout=layout)
     writer.define([VLP])
     writer.add(VLP, message(5, x=1.5, delta_xy=(1.0, 2.0), hagl_max_z=9.0, xy_reset_counter=3))
-    flight = open_log(writer.write(tmp_path / "a.ulg"))
-    [(_, read)] = read_all(flight)
+    run = open_log(writer.write(tmp_path / "a.ulg"))
+    [(_, read)] = read_all(run)
     assert (read.timestamp, read.x, read.delta_xy, read.xy_reset_counter) == (5, 1.5, (1.0, 2.0), 3)
     assert (read.hagl_max_z, math.isnan(read.hagl_max_xy)) == (9.0, layout == "1.16")
-    assert f"layout {layout}," in flight.summary
-    assert flight.warnings == ()
+    assert f"layout {layout}," in run.summary
+    assert run.warnings == ()
 
 
 def test_all_topics_and_instances_are_read_in_time_order(tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_all_topics_and_instances_are_read_in_time_order(tmp_path: Path) -> None
                 time = 1000 * step + 100 * number + instance
                 writer.add(topic.name, message(time), instance=instance)
                 expected.append(time)
-    flight = open_log(writer.write(tmp_path / "a.ulg"))
-    read = read_all(flight)
+    run = open_log(writer.write(tmp_path / "a.ulg"))
+    read = read_all(run)
     assert [got.timestamp for _, got in read] == sorted(expected)
     assert sorted({address for address, _ in read}) == [
         "7/estimator_local_position/0",
@@ -105,7 +105,7 @@ def test_all_topics_and_instances_are_read_in_time_order(tmp_path: Path) -> None
         "7/vehicle_local_position",
         "7/vehicle_local_position_groundtruth",
     ]
-    assert flight.total == len(expected)
+    assert run.total == len(expected)
 
 
 def test_vehicle_is_the_options_else_the_logs_else_the_default(tmp_path: Path) -> None:
@@ -119,74 +119,74 @@ def test_vehicle_is_the_options_else_the_logs_else_the_default(tmp_path: Path) -
 
 
 def test_many_rows_are_read_in_order(tmp_path: Path) -> None:
-    """Rows are turned into Python values in pieces; none is lost between two."""
-    flight = open_log(write_log(tmp_path / "a.ulg", range(0, 2_500_000, 1000)))
-    assert [read.x for _, read in read_all(flight)] == list(range(2500))
+    """Rows are converted to Python values in chunks; none is lost between two."""
+    run = open_log(write_log(tmp_path / "a.ulg", range(0, 2_500_000, 1000)))
+    assert [read.x for _, read in read_all(run)] == list(range(2500))
 
 
 @pytest.mark.parametrize(
     ("timestamps", "due"),
     [
         ([10, 20, 15, 30, 40], [10, 10, 15, 30, 40]),  # one comes late
-        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),  # one is from the future: it must not hold up the others
+        ([10, 20, 10**15, 30, 40], [10, 20, 20, 30, 40]),  # one is in the future: it must not delay the others
         ([10, 20, 30, 40, 10**15], [10, 20, 30, 40, 40]),  # the last one is
         ([10, 20, 10**15, 30, 0, 40, 50], [10, 20, 20, 30, 30, 40, 50]),  # two, one each way
-        ([10, 20, 30 + 61_000_000, 40 + 61_000_000], [10, 20, 20, 30]),  # a silence of a minute
+        ([10, 20, 30 + 61_000_000, 40 + 61_000_000], [10, 20, 20, 30]),  # a gap of a minute
     ],
 )
-def test_disorder_is_published_in_the_logs_order(tmp_path: Path, timestamps: list[int], due: list[int]) -> None:
-    """Out-of-order timestamps and impossible gaps lose no message and never stall the replay; a warning says so."""
-    flight = open_log(write_log(tmp_path / "a.ulg", timestamps))
-    records = list(flight.records)
-    assert [record.fields["timestamp"] for record in records] == timestamps
-    assert [round(record.due * 1e6) + 10 for record in records] == due
-    assert len(flight.warnings) == 1
+def test_unordered_timestamps_keep_the_logs_order(tmp_path: Path, timestamps: list[int], due: list[int]) -> None:
+    """Out-of-order timestamps and impossible gaps lose no message and never stall the replay; there is a warning."""
+    run = open_log(write_log(tmp_path / "a.ulg", timestamps))
+    messages = list(run.messages)
+    assert [each.fields["timestamp"] for each in messages] == timestamps
+    assert [round(each.due * 1e6) + 10 for each in messages] == due
+    assert len(run.warnings) == 1
 
 
-def test_bool_that_is_neither_0_nor_1_is_left_for_the_model(tmp_path: Path) -> None:
-    """A damaged flag is refused, not read as true."""
+def test_bool_that_is_neither_0_nor_1_is_rejected_by_the_model(tmp_path: Path) -> None:
+    """A damaged flag is rejected, not read as true."""
     writer = UlogWriter()
     writer.define([VLP])
     writer.add(VLP, message(1), z_valid=2)
     writer.add(VLP, message(2))
-    first, second = open_log(writer.write(tmp_path / "a.ulg")).records
+    first, second = open_log(writer.write(tmp_path / "a.ulg")).messages
     with pytest.raises(ValueError, match="z_valid"):
         upgrade(first.fields)
     assert upgrade(second.fields).timestamp == 2
 
 
 @pytest.mark.parametrize("part", [0.3, 0.6, 0.95])
-def test_truncated_log_gives_what_is_readable(tmp_path: Path, part: float) -> None:
-    """A log that was cut gives all whole messages before the cut."""
+def test_truncated_log_is_read_up_to_the_cut(tmp_path: Path, part: float) -> None:
+    """All whole messages before the cut are read."""
     path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000))
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * part)])
-    flight = open_log(path)
-    assert flight.warnings == ("cut: it ends inside a message",)
-    read = read_all(flight)
+    run = open_log(path)
+    assert run.warnings == ("cut: it ends inside a message",)
+    read = read_all(run)
     assert [got.x for _, got in read] == list(range(len(read)))
     assert len(read) > 1000 * (part - 0.05)
 
 
-def test_damaged_log_gives_what_is_readable_and_a_warning(tmp_path: Path) -> None:
-    """A hole of garbage costs the messages in it, not the others."""
+def test_damaged_log_is_read_with_a_warning(tmp_path: Path) -> None:
+    """A block of garbage costs the messages in it, not the others."""
     path = write_log(tmp_path / "a.ulg", range(0, 1_000_000, 1000), xy_valid=False)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 300] = b"\xff" * 300
     path.write_bytes(data)
-    flight = open_log(path)
-    assert flight.total is not None
-    assert flight.total > 450
-    assert any("damaged" in warning for warning in flight.warnings)
+    run = open_log(path)
+    assert run.total is not None
+    assert run.total > 450
+    assert any("damaged" in warning for warning in run.warnings)
 
 
 def test_random_damage_never_crashes(tmp_path: Path) -> None:
-    """Whatever is wrong with a file, it is a flight or a SourceError."""
+    """Any damaged file is read in part, or raises SourceError."""
     data = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000)).read_bytes()
     rng = random.Random(1)
     path = tmp_path / "b.ulg"
-    flights = 0
+    readable = 0
     for _ in range(150):
         damaged = bytearray(data[: rng.randrange(len(data))] if rng.random() < 0.3 else data)
         for _ in range(rng.choice([1, 5, 50])):
@@ -194,13 +194,13 @@ def test_random_damage_never_crashes(tmp_path: Path) -> None:
                 damaged[rng.randrange(min(len(damaged), rng.choice([3000, 30_000])))] = rng.randrange(256)
         path.write_bytes(damaged)
         try:
-            flight = open_log(path)
+            run = open_log(path)
         except SourceError:
             continue
-        flights += 1
-        for record in flight.records:
-            assert set(FIELD_TYPES) & set(record.fields)
-    assert flights > 20
+        readable += 1
+        for each in run.messages:
+            assert set(FIELD_TYPES) & set(each.fields)
+    assert readable > 20
 
 
 def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) -> None:
@@ -209,17 +209,17 @@ def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) 
     writer.define([VLP])
     writer.add(VLP, message(1, x=1.0))
     writer.add(VLP, message(2, x=2.0), instance=1)
-    flight = open_log(writer.write(tmp_path / "a.ulg"))
-    assert [read.x for _, read in read_all(flight)] == [1.0]
-    assert "vehicle_local_position [1] is left out" in flight.warnings[0]
+    run = open_log(writer.write(tmp_path / "a.ulg"))
+    assert [read.x for _, read in read_all(run)] == [1.0]
+    assert "vehicle_local_position [1] is left out" in run.warnings[0]
 
 
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
         (None, "no such file"),
-        (b"", "no ULog file"),
-        (b"hello", "no ULog file"),
+        (b"", "not a readable ULog file"),
+        (b"hello", "not a readable ULog file"),
         (b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8), "no message of the local position topics"),
     ],
 )
@@ -234,13 +234,13 @@ def test_unreadable_file_is_a_clear_error(tmp_path: Path, content: bytes | None,
 
 
 def test_log_without_the_topics_is_a_clear_error(tmp_path: Path) -> None:
-    """A log of something else says so."""
+    """A log of other topics is an error."""
     with pytest.raises(SourceError, match="no message of the local position topics is in this log"):
         open_log(write_log(tmp_path / "a.ulg", [1], topic="something_else"))
 
 
-def test_log_that_leads_round_in_circles_ends(tmp_path: Path) -> None:
-    """A size that points back into what was read already must not hold a source for ever."""
+def test_log_that_loops_is_an_error(tmp_path: Path) -> None:
+    """A size that points back into what was read already must not make reading endless."""
     writer = UlogWriter()
     for number in range(3000):
         writer.define([f"topic_{number:05d}"], without=list(FIELD_TYPES)[3:])

@@ -1,4 +1,4 @@
-"""The command line: everything it does, the library does."""
+"""The command line, a user of the library."""
 
 import sys
 
@@ -10,7 +10,7 @@ __all__ = ["main"]
 def main() -> None:
     """Run `nedbus`."""
     if sys.argv[1:] == ["--version"]:
-        sys.stdout.write(f"nedbus {__version__}\n")  # at once: all the rest takes longer to load than this takes
+        sys.stdout.write(f"nedbus {__version__}\n")  # at once: the imports below take longer
         return
     from .app import app
 

@@ -11,13 +11,13 @@ import typer
 
 from nedbus import __version__
 
-from .bridge import foxglove, ros2
-from .certificates import pki
-from .look import get, health, info, list_, schema
+from .bridges import foxglove, ros2
+from .files import convert, plot, record
 from .options import write
-from .records import convert, plot, record
+from .pki import pki
+from .query import get, health, info, list_, schema
 from .serve import router, serve
-from .watch import echo, hz
+from .stream import echo, hz
 
 app = typer.Typer(
     name="nedbus",

@@ -1,4 +1,4 @@
-"""What holds for all commands: options, exit codes, one line for an error."""
+"""What all commands share: options, the open bus, exit codes, one line for an error."""
 
 from __future__ import annotations
 
@@ -8,25 +8,27 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
 import typer
 
-from nedbus.bus import Bus
-from nedbus.bus import connect as nedbus_connect
+from nedbus.client import Bus, connect_with
 from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, NedbusError
-from nedbus_msgs import ANY, TOPICS
+from nedbus.settings import load_settings
+from nedbus.transport import DEFAULT_ENDPOINT
+from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, TOPICS, Selection
 
 P = ParamSpec("P")
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
 ConnectOption = Annotated[
     list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join (default: tcp/127.0.0.1:7447)"),
+    typer.Option("--connect", "-c", metavar="ENDPOINT", help=f"Router to join (default: {DEFAULT_ENDPOINT})"),
 ]
-PrefixOption = Annotated[str | None, typer.Option("--prefix", help="First chunks of every key (default: nedbus)")]
+PrefixOption = Annotated[
+    str | None, typer.Option("--prefix", help=f"First chunks of every key (default: {DEFAULT_PREFIX})")
+]
 TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="Authority of tls/ routers, PEM")]
 TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="This client's certificate, PEM")]
 TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of that certificate, PEM")]
@@ -36,7 +38,10 @@ TopicArgument = Annotated[
         metavar="TOPIC", help="TOPIC, or what nedbus list prints: VEHICLE/TOPIC/INSTANCE", show_default=False
     ),
 ]
-TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
+TopicOption = Annotated[str | None, typer.Option("--topic", "-t", help='Topic, "*" for all (default: all)')]
+PositionTopicOption = Annotated[
+    str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {DEFAULT_TOPIC})')
+]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
     int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position (default: all)")
@@ -55,26 +60,25 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
         try:
             function(*args, **kwargs)
         except (ConfigError, AddressError, LayoutError) as exc:
-            raise _fail(exc, 2) from exc
+            raise _exit_with(exc, 2) from exc
         except NedbusError as exc:
-            raise _fail(exc, 1) from exc
+            raise _exit_with(exc, 1) from exc
         except KeyboardInterrupt:
             raise typer.Exit(130) from None
         except BrokenPipeError:
-            # The reader of a pipe is gone (`| head`): say nothing, and nothing more at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            # The reader of a pipe is gone (`| head`): nothing can be written, at exit either.
+            _discard_stdout()
             raise typer.Exit(0) from None
         except OSError as exc:
-            tell(f"nedbus: cannot write: {(exc.strerror or str(exc)).lower()}")
-            # What is buffered cannot be written at exit either.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            write_stderr(f"nedbus: cannot write: {(exc.strerror or str(exc)).lower()}")
+            _discard_stdout()
             raise typer.Exit(1) from None
 
     return run
 
 
 def on_bus(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function: give it an open bus first, and the options that say where that is."""
+    """Make a command of a function: it gets an open bus as its first argument, and the options for connecting."""
 
     @command
     def run(**options: Any) -> None:
@@ -99,33 +103,29 @@ def _open_bus(
     config: ConfigOption = None,
     wait: WaitOption = False,
 ) -> Bus:
-    """Connect as the options say; with `wait` for as long as it takes."""
-
-    def connect_within(seconds: float) -> Bus:
-        return nedbus_connect(
-            connect,
-            timeout=seconds,
-            prefix=prefix,
-            tls_ca=tls_ca,
-            tls_certificate=tls_certificate,
-            tls_key=tls_key,
-            config=config,
-        )
-
+    """Connect with these options; with `wait` for as long as it takes."""
+    settings = load_settings(
+        config,
+        connect=connect and tuple(connect),
+        prefix=prefix,
+        tls_ca=tls_ca,
+        tls_certificate=tls_certificate,
+        tls_key=tls_key,
+    )
     try:
-        return connect_within(1.0)
+        return connect_with(settings, timeout=1.0)
     except ConnectError as exc:
         if not wait:
             raise
-        tell(f"{exc}; waiting")
-    return connect_within(float("inf"))
+        write_stderr(f"{exc}; waiting")
+    return connect_with(settings, timeout=float("inf"))
 
 
 _BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
 
 
-def tell(text: str) -> None:
-    """Say something to a person, beside the output."""
+def write_stderr(text: str) -> None:
+    """Write a line for a person to stderr, at once."""
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
 
@@ -136,34 +136,35 @@ def write(line: str) -> None:
     sys.stdout.flush()
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """What of the bus a command is about."""
+def choose(
+    argument: str | None, *, topic: str | None, vehicle: str, instance: int | None, default: str = DEFAULT_TOPIC
+) -> Selection:
+    """Return the selection of the options, or of an argument as `nedbus list` prints it: [VEHICLE/]TOPIC[/INSTANCE].
 
-    topic: str
-    vehicle: str
-    instance: int | None
+    `default` is the topic if none is given.
 
-
-def choose(argument: str | None, *, topic: str, vehicle: str, instance: int | None) -> Choice:
-    """Return what was asked for: by options, or by an argument as `nedbus list` prints it, [VEHICLE/]TOPIC[/INSTANCE].
-
-    Raises ConfigError when both say something.
+    Raises ConfigError when both give a topic, AddressError for a selection that is invalid.
     """
     if argument is None:
-        return Choice(topic, vehicle, instance)
-    if topic != ANY:
-        raise ConfigError("--topic", f"the topic is given as {argument!r} already: take one away")
+        return Selection(default if topic is None else topic, vehicle, instance)
+    if topic is not None:
+        raise ConfigError("--topic", f"the topic is given as {argument!r} already: remove one of the two")
     chunks = argument.strip("/").split("/")
     if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
         vehicle = chunks.pop(0)
     if len(chunks) == 2 and chunks[1].isdecimal():
         instance = int(chunks.pop())
-    return Choice("/".join(chunks), vehicle, instance)
+    return Selection("/".join(chunks), vehicle, instance)
 
 
-def _fail(error: NedbusError, code: int) -> typer.Exit:
+def _exit_with(error: NedbusError, code: int) -> typer.Exit:
+    """Return the exit for an error that is reported in one line; raise the error itself with --debug."""
     if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
         raise error
-    tell(f"nedbus: {error}")
+    write_stderr(f"nedbus: {error}")
     return typer.Exit(code)
+
+
+def _discard_stdout() -> None:
+    """Redirect stdout to the null device, so that flushing it at exit does not fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""What `nedbus serve` shows while it runs: a live display on a terminal, plain log lines elsewhere."""
+"""Show the state of `nedbus serve` while it runs: a live display on a terminal, plain log lines elsewhere."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ import sys
 import time
 from typing import TYPE_CHECKING, Final, Self
 
-from nedbus.daemon import Daemon
-from nedbus.session import DEFAULT_ENDPOINT
-from nedbus.worker import WorkerStatus
+from nedbus.daemon import Daemon, SourceStatus
+from nedbus.transport import DEFAULT_ENDPOINT
+from nedbus_msgs import DEFAULT_TOPIC
 
-from .text import to_line
+from .format import to_line
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _log = logging.getLogger("nedbus")
-_PAUSES: Final = (10.0,) * 6 + (60.0,)  # s between reports in a plain log; the last one stays
-_SHOWN: Final = 3  # messages that a report shows
+_REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports in a plain log; then the last one
+_REPORTED: Final = 3  # messages in a report
 
 _HINT: Final = """In a second terminal:
-  nedbus list{where}                        what is published
-  nedbus echo{where}                        every message, a line each
-  nedbus hz{where}                          rate, jitter, latency, loss
-  nedbus get{where} vehicle_local_position  all fields of the last message"""
+  nedbus list{where}  what is published
+  nedbus echo{where}  messages as they arrive, a line each
+  nedbus hz{where}    rate, jitter, latency, loss
+  nedbus get{where}   all fields of the last message"""
 
 
 class Display:
-    """Show what a daemon does; `update` is called several times a second."""
+    """Show the state of a daemon; `update` is called several times a second."""
 
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon
-        self._greeted = False
+        self._hinted = False
         self._reports = 0
         self._last = time.monotonic()
         self._progress: Progress | None = None
@@ -49,35 +49,35 @@ class Display:
             self._progress.stop()
 
     def update(self) -> None:
-        """Bring what is shown up to date."""
+        """Show the current state."""
         if not self._daemon.ready.is_set():
             return
-        if not self._greeted:
-            self._greeted = True
-            for worker in self._daemon.workers:
-                self._rate(worker)  # from here on it is measured
+        if not self._hinted:
+            self._hinted = True
+            for status in self._daemon.sources:
+                self._rate(status)  # measured from here on
             if not self._daemon.until_done and (self._daemon.role == "router" or sys.stderr.isatty()):
-                known = DEFAULT_ENDPOINT in self._daemon.endpoints
-                where = "" if known else f" -c {self._daemon.endpoints[0]}"
-                self._tell(_HINT.format(where=where))
+                is_default = DEFAULT_ENDPOINT in self._daemon.endpoints
+                where = "" if is_default else f" -c {self._daemon.endpoints[0]}"
+                self._print(_HINT.format(where=where))
         if self._progress is not None:
-            for worker in self._daemon.workers:
-                self._show(self._progress, worker)
-        elif time.monotonic() - self._last >= _PAUSES[min(self._reports, len(_PAUSES) - 1)]:
+            for status in self._daemon.sources:
+                self._show(self._progress, status)
+        elif time.monotonic() - self._last >= _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
             self._last = time.monotonic()
             self._reports += 1
             self._report()
 
     def _report(self) -> None:
-        """Log how far each source is, and some of what it published last."""
-        for worker in self._daemon.workers:
-            if worker.state == "running":
-                _log.info("%s: %s", worker.source.rstrip(":"), self._numbers(worker))
-        shown = [sample for sample in self._daemon.newest() if sample.topic == "vehicle_local_position"]
-        for sample in shown[:_SHOWN]:
+        """Log the progress of each source, and the newest messages of some vehicles."""
+        for status in self._daemon.sources:
+            if status.state == "running":
+                _log.info("%s: %s", status.source.rstrip(":"), self._numbers(status))
+        newest = [sample for sample in self._daemon.newest() if sample.topic == DEFAULT_TOPIC]
+        for sample in newest[:_REPORTED]:
             _log.info("%s", to_line(sample))
 
-    def _tell(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         if self._progress is not None:
             self._progress.console.print(text, highlight=False)
         else:
@@ -99,30 +99,30 @@ class Display:
         self._progress = Progress(*columns, console=console, refresh_per_second=4)
         self._progress.start()
 
-    def _show(self, progress: Progress, worker: WorkerStatus) -> None:
-        if worker.source not in self._tasks:
-            self._tasks[worker.source] = progress.add_task(worker.source, total=None, state="", numbers="")
-        numbers = self._numbers(worker)
-        if worker.error:
-            numbers += f", {worker.error}"
-        total = worker.total or (1 if worker.ended else None)
-        done = worker.done if worker.total else int(worker.ended)
-        progress.update(self._tasks[worker.source], completed=done, total=total, state=worker.state, numbers=numbers)
+    def _show(self, progress: Progress, status: SourceStatus) -> None:
+        if status.source not in self._tasks:
+            self._tasks[status.source] = progress.add_task(status.source, total=None, state="", numbers="")
+        numbers = self._numbers(status)
+        if status.error:
+            numbers += f", {status.error}"
+        total = status.total or (1 if status.ended else None)
+        done = status.done if status.total else int(status.ended)
+        progress.update(self._tasks[status.source], completed=done, total=total, state=status.state, numbers=numbers)
 
-    def _numbers(self, worker: WorkerStatus) -> str:
-        count = f"{worker.done} of {worker.total}" if worker.total else f"{worker.published}"
-        rejected = f", {worker.rejected} rejected" if worker.rejected else ""
-        lost = f", {worker.lost} lost" if worker.lost else ""
-        silent = f", silent: {', '.join(worker.silent)}" if worker.silent else ""
-        return f"{count} messages, {self._rate(worker):.0f}/s{rejected}{lost}{silent}"
+    def _numbers(self, status: SourceStatus) -> str:
+        count = f"{status.done} of {status.total}" if status.total else f"{status.published}"
+        rejected = f", {status.rejected} rejected" if status.rejected else ""
+        lost = f", {status.lost} lost" if status.lost else ""
+        stale = f", stale: {', '.join(status.stale)}" if status.stale else ""
+        return f"{count} messages, {self._rate(status):.0f}/s{rejected}{lost}{stale}"
 
-    def _rate(self, worker: WorkerStatus) -> float:
-        """Return messages a second, as an average that follows within about a second."""
+    def _rate(self, status: SourceStatus) -> float:
+        """Return messages a second, averaged over the last one to two seconds."""
         now = time.monotonic()
-        then, published = self._rates.setdefault(worker.source, (now, worker.published))
+        then, published = self._rates.setdefault(status.source, (now, status.published))
         if now - then > 2.0:
-            self._rates[worker.source] = (
+            self._rates[status.source] = (
                 now - 1.0,
-                worker.published - round((worker.published - published) / (now - then)),
+                status.published - round((status.published - published) / (now - then)),
             )
-        return (worker.published - published) / (now - then) if now > then else 0.0
+        return (status.published - published) / (now - then) if now > then else 0.0

@@ -1,31 +1,25 @@
-"""Commands that run until they are told to end: serve, router."""
+"""Commands that run until they are stopped: serve, router."""
 
 from __future__ import annotations
 
 import logging
-import os
-import signal
-import sys
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
 from nedbus import __version__
 from nedbus.daemon import Daemon
-from nedbus.session import DEFAULT_ENDPOINT, open_router
 from nedbus.settings import load_settings
+from nedbus.transport import DEFAULT_ENDPOINT, open_router, router_endpoints
 
 from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
 from .progress import Display
+from .run import run_until_signal, run_until_stopped
 
 _log = logging.getLogger("nedbus")
 
-_LIMIT: Final = 1.6  # s after a signal by which the process is gone
 ListenOption = Annotated[
     list[str] | None,
     typer.Option("--listen", "-l", metavar="ENDPOINT", help=f"Where the router listens (default: {DEFAULT_ENDPOINT})"),
@@ -58,7 +52,7 @@ def serve(
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Publish sources, validated; the service is a router itself unless --connect names one."""
+    """Publish sources, validated; the service is a router itself unless it is to join one (--connect)."""
     settings = load_settings(
         config,
         source=source and tuple(source),
@@ -74,9 +68,9 @@ def serve(
     )
     daemon = Daemon(settings, version=__version__)
     with Display(daemon) as display:
-        ends = run_until_signal(daemon.run, daemon.stop, beside=display.update)
-    if ends is not None:
-        raise typer.Exit(ends)
+        exit_code = run_until_signal(daemon.run, daemon.stop, on_tick=display.update)
+    if exit_code is not None:
+        raise typer.Exit(exit_code)
 
 
 @command
@@ -91,64 +85,17 @@ def router(
     ] = None,
     config: ConfigOption = None,
 ) -> None:
-    """Run a Zenoh router, without sources, for services and scripts to meet at.
+    """Run a Zenoh router, without sources, that services and scripts connect to.
 
     Endpoints that are given replace those of the file, as the flags of zenohd do.
     """
     endpoints = load_settings(config, listen=listen).listen
-    stop = threading.Event()
 
-    def run() -> bool:
+    def run(stop: threading.Event) -> None:
         session = open_router(listen=endpoints, connect=tuple(connect or ()), config_file=config_file)
         joined = f", joined to {', '.join(connect)}" if connect else ""
-        _log.info("router on %s%s", ", ".join(endpoints) or config_file or DEFAULT_ENDPOINT, joined)
+        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joined)
         stop.wait()
         session.close()
-        return True
 
-    ends = run_until_signal(run, stop.set, beside=lambda: None)
-    if ends is not None:
-        raise typer.Exit(ends)
-
-
-def run_until_signal(
-    run: Callable[[], bool], stop: Callable[[], object], *, beside: Callable[[], object]
-) -> int | None:
-    """Run something in a thread until it ends or a signal comes; return the exit code, None for success.
-
-    The main thread only waits: a signal is then handled at once, whatever Zenoh is busy with.
-    """
-    outcome: list[bool | BaseException] = []
-    signals: list[int] = []
-
-    def body() -> None:
-        try:
-            outcome.append(run())
-        except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
-            outcome.append(exc)
-
-    def on_signal(number: int, _: FrameType | None) -> None:
-        if signals:
-            os._exit(130 if number == signal.SIGINT else 1)  # the second time there is no patience
-        signals.append(number)
-        stop()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
-    thread = threading.Thread(target=body, name="nedbus-run", daemon=True)
-    thread.start()
-    while thread.is_alive() and not signals:
-        beside()
-        thread.join(0.1)
-    deadline = time.monotonic() + _LIMIT
-    while thread.is_alive() and time.monotonic() < deadline:
-        thread.join(0.05)
-    if thread.is_alive():
-        _log.error("not everything ended in time, perhaps because a reader does not read: what it holds is given up")
-        sys.stderr.flush()
-        os._exit(1)
-    if isinstance(outcome[0], BaseException):
-        raise outcome[0]
-    if signals and signals[0] == signal.SIGINT:
-        return 130
-    return None if outcome[0] else 1
+    run_until_stopped(run)

@@ -1,17 +1,19 @@
-"""Where messages come from: `open_source` makes a source of a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
+"""Sources of messages: `parse_source` reads a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
-from .record import Flight, Home, Live, Record, Refusal, Replay, Source
-from .spec import SOURCE_KINDS, SourceSpec, parse_source
+from .source import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
+from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 
 __all__ = [
     "SOURCE_KINDS",
-    "Flight",
-    "Home",
-    "Live",
-    "Record",
-    "Refusal",
-    "Replay",
+    "LiveSource",
+    "Rejection",
+    "ReplayRun",
+    "ReplaySource",
     "Source",
+    "SourceContext",
+    "SourceKind",
+    "SourceMessage",
     "SourceSpec",
     "parse_source",
+    "source_text_of_file",
 ]

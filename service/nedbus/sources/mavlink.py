@@ -1,4 +1,4 @@
-"""Vehicles that speak MAVLink: all system ids on one link, each a vehicle of its own."""
+"""Receive from vehicles that speak MAVLink: every system id on a link is a vehicle."""
 
 from __future__ import annotations
 
@@ -11,88 +11,88 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus_msgs import Address
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .mavlink_link import Link, Peer, check_link, open_link
 from .mavlink_vehicle import OutOfOrderError, Vehicle
-from .record import Home, Record, Refusal
-from .spec import MavlinkOptions
+from .options import MavlinkOptions
+from .source import Rejection, SourceContext, SourceMessage
 
 _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
-_HEARTBEAT: Final = 1.0  # s
-_BUFFER: Final = 2**16  # bytes that a stream's parser may keep
-_SYSTEM: Final = 245  # who we are: a companion computer, as losing one is no failsafe, which losing a ground station is
+_HEARTBEAT_INTERVAL: Final = 1.0  # s
+_MAX_BUFFER: Final = 2**16  # bytes that a stream's parser may keep
+# Ours: a companion computer, as losing one triggers no failsafe, which losing a ground station does.
+_SYSTEM: Final = 245
 _AUTOPILOT: Final = 1
-_TOPIC: Final = "vehicle_local_position"
-_OTHERS: Final = 255  # autopilots with another component id that are kept in mind
+_MAX_AUTOPILOTS: Final = 255  # with another component id
 
 
 class MavlinkSource:
     """A link with one or many vehicles.
 
-    What MAVLink does not tell is not provided: resets, variances of heading and tilt, accelerations, limits.
+    What MAVLink does not transmit is not provided: resets, variances of heading and tilt, accelerations, limits.
     Validity is an approximation from ESTIMATOR_STATUS: LOCAL_POSITION_NED itself is sent whether valid or not.
     """
 
-    def __init__(self, link: str, options: MavlinkOptions, _: Home) -> None:
+    def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         check_link(link)
         self._link = link
         self._options = options
-        self._us = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
 
-    def listen(self) -> Iterator[Record | Refusal | None]:
-        """Listen; raise SourceError when the link cannot be opened, or breaks."""
+    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+        """Receive; raise SourceError when the link cannot be opened, or breaks."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                yield from _Conversation(link, self._options, self._us, name=self._link).run()
+                yield from _LinkSession(link, self._options, self._sender, name=self._link).run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
                 raise SourceError(f"mavlink:{self._link}", f"the link broke ({reason})") from exc
 
 
-class _Conversation:
-    """What is said on an open link, until it breaks."""
+class _LinkSession:
+    """One open link: parse what arrives, request streams, send heartbeats."""
 
-    def __init__(self, link: Link, options: MavlinkOptions, us: Any, *, name: str) -> None:
+    def __init__(self, link: Link, options: MavlinkOptions, sender: Any, *, name: str) -> None:
         self._link = link
         self._options = options
-        self._us = us
+        self._sender = sender
         self._name = name
         self._parser = _new_parser()
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
         self._autopilots: set[tuple[int, int]] = set()  # besides component 1 of any system
 
-    def run(self) -> Iterator[Record | Refusal | None]:
-        tick = beat = 0.0
+    def run(self) -> Iterator[SourceMessage | Rejection | None]:
+        next_requests = next_heartbeat = 0.0
         while True:
             for data, peer in self._link.read(_TICK):
                 for message in self._parse(data):
-                    yield self._take(message, peer)
+                    yield self._handle(message, peer)
                 if not self._link.stream and self._parser.buf_len():
-                    yield Refusal(self._name, f"{self._parser.buf_len()} bytes of a message that is cut")
+                    yield Rejection(self._name, f"{self._parser.buf_len()} bytes of a truncated message")
             yield None
             now = time.monotonic()
-            if now >= tick:
-                tick = now + _TICK
-                self._ask(now)
-            if now >= beat:
-                beat = now + _HEARTBEAT
-                self._say_hello()
+            if now >= next_requests:
+                next_requests = now + _TICK
+                self._send_requests(now)
+            if now >= next_heartbeat:
+                next_heartbeat = now + _HEARTBEAT_INTERVAL
+                self._send_heartbeat()
 
     def _parse(self, data: bytes) -> list[Any]:
-        if not self._link.stream or len(self._parser.buf) > _BUFFER:
-            # Half a message in one datagram must not swallow the next one, which is somebody else's.
+        if not self._link.stream or len(self._parser.buf) > _MAX_BUFFER:
+            # Half a message in one datagram must not consume the next one, which may have another sender.
             self._parser = _new_parser()
         return self._parser.parse_buffer(data) or []
 
-    def _take(self, message: Any, peer: Peer) -> Record | Refusal | None:
+    def _handle(self, message: Any, peer: Peer) -> SourceMessage | Rejection | None:
         raw = bytes(message.get_msgbuf())
         if message.get_type() == "BAD_DATA":
-            return Refusal(self._name, f"{len(raw)} bytes that are no MAVLink")
-        # Of a message that the dialect does not know only the head can be read.
+            return Rejection(self._name, f"{len(raw)} bytes that are not MAVLink")
+        # Of a message that is not in the dialect only the header can be parsed.
         sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
         if not system or not self._is_autopilot(message, system, component):
             return None
@@ -101,49 +101,49 @@ class _Conversation:
         if vehicle is None:
             vehicle = self._vehicles[system] = Vehicle(self._options.rate)
         self._peers[system] = peer
-        vehicle.count(component, sequence, now)
-        address = Address(self._vehicle_of(system), _TOPIC)
+        vehicle.track_sequence(component, sequence, now)
+        address = Address(self._vehicle_of(system), DEFAULT_TOPIC)
         if message.get_type() == "COMMAND_ACK":
-            self._take_answer(vehicle, message, address, now)
+            self._handle_ack(vehicle, message, address, now)
             return None
         try:
-            fields = vehicle.take(message, now)
+            fields = vehicle.handle(message, now)
         except OutOfOrderError as exc:
-            return Refusal(str(address), f"out of order: {exc}", address)
+            return Rejection(str(address), f"out of order: {exc}", address)
         if fields is None:
             return None
-        lost, restarted = vehicle.lost, vehicle.restarted
-        vehicle.lost, vehicle.restarted = 0, False
-        if restarted:
-            _log.warning("%s: started again", address)
-        return Record(0.0, address, fields, lost, restarted)
+        lost, rebooted = vehicle.lost, vehicle.rebooted
+        vehicle.lost, vehicle.rebooted = 0, False
+        if rebooted:
+            _log.warning("%s: the vehicle rebooted", address)
+        return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _vehicle_of(self, system: int) -> str:
-        named = self._options.vehicles
-        plain = f"system{system}" if str(system) in named.values() else str(system)
-        return named.get(str(system), plain)
+        configured = self._options.vehicles
+        default = f"system{system}" if str(system) in configured.values() else str(system)
+        return configured.get(str(system), default)
 
     def _is_autopilot(self, message: Any, system: int, component: int) -> bool:
-        """Return whether this may tell where the vehicle is: a camera, a gimbal or a ground station may not."""
+        """Return whether this is from an autopilot, not from a camera, a gimbal or a ground station."""
         if component == _AUTOPILOT or (system, component) in self._autopilots:
             return True
         if message.get_type() == "HEARTBEAT" and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
-            if len(self._autopilots) < _OTHERS:
+            if len(self._autopilots) < _MAX_AUTOPILOTS:
                 self._autopilots.add((system, component))
             return True
         return False
 
-    def _take_answer(self, vehicle: Vehicle, message: Any, address: Address, now: float) -> None:
+    def _handle_ack(self, vehicle: Vehicle, message: Any, address: Address, now: float) -> None:
         if message.command not in (dialect.MAV_CMD_SET_MESSAGE_INTERVAL, dialect.MAV_CMD_REQUEST_MESSAGE):
             return
         if message.target_system not in (0, _SYSTEM) or message.result == dialect.MAV_RESULT_IN_PROGRESS:
             return
-        number = vehicle.answered(now)
+        number = vehicle.acknowledge(now)
         if number is not None and message.result != dialect.MAV_RESULT_ACCEPTED:
-            _log.info("%s: does not send %s at a rate that is asked for", address, dialect.mavlink_map[number].msgname)
-        self._ask(now)
+            _log.info("%s: does not send %s at a requested rate", address, dialect.mavlink_map[number].msgname)
+        self._send_requests(now)
 
-    def _ask(self, now: float) -> None:
+    def _send_requests(self, now: float) -> None:
         for system, vehicle in self._vehicles.items():
             for number, rate in vehicle.requests(now):
                 command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL if rate else dialect.MAV_CMD_REQUEST_MESSAGE
@@ -155,17 +155,17 @@ class _Conversation:
                     self._peers[system],
                 )
 
-    def _say_hello(self) -> None:
-        """Let routers and vehicles know that somebody is here."""
-        hello = dialect.MAVLink_heartbeat_message(
+    def _send_heartbeat(self) -> None:
+        """Announce this component: routers and vehicles send nothing to one that they do not know."""
+        heartbeat = dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
         )
         for peer in {self._link.peer} - {None} or set(self._peers.values()):
-            self._send(hello, peer)
+            self._send(heartbeat, peer)
 
     def _send(self, message: Any, peer: Peer) -> None:
-        self._link.send(message.pack(self._us), peer)
-        self._us.seq = (self._us.seq + 1) % 256
+        self._link.send(message.pack(self._sender), peer)
+        self._sender.seq = (self._sender.seq + 1) % 256
 
 
 def _new_parser() -> Any:

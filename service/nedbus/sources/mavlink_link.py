@@ -1,4 +1,4 @@
-"""The ways to a MAVLink vehicle: UDP, TCP, or a serial port; bytes in, bytes out, and who sent them."""
+"""The links to a MAVLink vehicle: UDP, TCP, or a serial port; bytes in with their sender, bytes out."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from typing import Any, Final, Protocol
 
 from nedbus.errors import ConfigError, SourceError
 
-_AT_ONCE: Final = 100  # datagrams that are read before something else is done
-_DATAGRAM: Final = 65535
-_OPEN: Final = 3.0  # s that opening may take
-_FORM = re.compile(r"(udpin|udp|udpout|tcp):(.+):(\d{1,5})|serial:(/.+)|(/dev/.+)")
-FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
+_MAX_DATAGRAMS: Final = 100  # that one read returns
+_MAX_READ: Final = 65535  # bytes
+_CONNECT_TIMEOUT: Final = 3.0  # s
+_LINK = re.compile(r"(udpin|udp|udpout|tcp):(.+):(\d{1,5})|serial:(/.+)|(/dev/.+)")
+_FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
-Peer = Any  # what a socket calls the address of the other side; nobody looks into it
+Peer = Any  # the address of the other side, in the form that its socket uses
 
 
 class Link(Protocol):
-    """An open way to one or several vehicles; whatever fails raises OSError, or SourceError with a reason."""
+    """An open connection to one or several vehicles; what fails raises OSError."""
 
-    stream: bool  # whether messages may be cut into pieces
+    stream: bool  # messages may arrive in pieces
 
-    def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield what has arrived and from whom, waiting so long for the first."""
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        """Yield what has arrived and its sender; wait up to `timeout` seconds for the first."""
         ...
 
     def send(self, data: bytes, peer: Peer) -> None:
-        """Send, if that is possible at this moment."""
+        """Send now, or drop it if that is not possible."""
         ...
 
     @property
     def peer(self) -> Peer:
-        """The other side where there is only one; None where it must first say something."""
+        """The other side where it is known from the start; None where it must send first."""
         ...
 
     def close(self) -> None:
@@ -45,13 +45,13 @@ class Link(Protocol):
 
 
 def check_link(text: str) -> None:
-    """Raise ConfigError unless this names a link."""
-    _split(text)
+    """Raise ConfigError for an invalid link."""
+    _parse(text)
 
 
 def open_link(text: str, *, baud: int) -> Link:
-    """Open a link; raise SourceError when that is not possible, ConfigError for what names none."""
-    kind, host, port = _split(text)
+    """Open a link; raise SourceError when that fails, ConfigError for an invalid one."""
+    kind, host, port = _parse(text)
     try:
         if kind == "serial":
             return _Serial(host, baud)
@@ -64,11 +64,11 @@ def open_link(text: str, *, baud: int) -> Link:
         raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
 
 
-def _split(text: str) -> tuple[str, str, int]:
+def _parse(text: str) -> tuple[str, str, int]:
     """Return the kind of a link, its host or device, and its port."""
-    found = _FORM.fullmatch(text)
+    found = _LINK.fullmatch(text)
     if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
-        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is no link: write {FORMS}")
+        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
     if found[1]:
         return found[1], found[2].strip("[]"), int(found[3])
     return "serial", found[4] or found[5], 0
@@ -89,15 +89,15 @@ class _Udp:
                 self.close()
                 raise
 
-    def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if not _is_ready(self._socket, seconds):
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        if not _is_ready(self._socket, timeout):
             return
-        with suppress(BlockingIOError, ConnectionError):  # nobody listens at the other side, yet
-            for _ in range(_AT_ONCE):
-                yield self._socket.recvfrom(_DATAGRAM)
+        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen, yet
+            for _ in range(_MAX_DATAGRAMS):
+                yield self._socket.recvfrom(_MAX_READ)
 
     def send(self, data: bytes, peer: Peer) -> None:
-        with suppress(OSError):  # a route that is away comes back, or the silence is noticed
+        with suppress(OSError):  # a missing route comes back, or the vehicle times out
             self._socket.sendto(data, peer)
 
     def close(self) -> None:
@@ -108,12 +108,12 @@ class _Tcp:
     stream = True
 
     def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=_OPEN)
+        self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
         self.peer: Peer = (host, port)
 
-    def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if _is_ready(self._socket, seconds):
-            data = self._socket.recv(_DATAGRAM)
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        if _is_ready(self._socket, timeout):
+            data = self._socket.recv(_MAX_READ)
             if not data:
                 raise ConnectionResetError(None, "the other side closed the connection")
             yield data, self.peer
@@ -134,9 +134,9 @@ class _Serial:
         self._port = Serial(device, baud, timeout=0, write_timeout=1.0)
         self.peer: Peer = device
 
-    def read(self, seconds: float) -> Iterator[tuple[bytes, Peer]]:
-        if _is_ready(self._port, seconds):
-            yield self._port.read(_DATAGRAM), self.peer
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        if _is_ready(self._port, timeout):
+            yield self._port.read(_MAX_READ), self.peer
 
     def send(self, data: bytes, peer: Peer) -> None:
         self._port.write(data)
@@ -145,8 +145,8 @@ class _Serial:
         self._port.close()
 
 
-def _is_ready(file: Any, seconds: float) -> bool:
-    """Wait until something can be read, or the other side is gone; unlike select, for any number of open files."""
+def _is_ready(file: Any, timeout: float) -> bool:
+    """Wait until there is data or the other side has closed; unlike select, with any number of open files."""
     poll = select.poll()
     poll.register(file, select.POLLIN)
-    return bool(poll.poll(seconds * 1000))
+    return bool(poll.poll(timeout * 1000))

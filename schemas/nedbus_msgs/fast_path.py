@@ -1,0 +1,59 @@
+"""The fast path of validation: all fields as one tuple, which takes a fifth of the time of the model.
+
+It uses the model's types and rules, and accepts only what the model accepts.
+What it does not accept goes to the model, which decides and gives the reasons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from operator import itemgetter
+from typing import Final, cast
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import CoreConfig, SchemaValidator, core_schema
+
+from .float32 import round_to_float32
+from .px4_types import TYPES
+from .rows import FIELD_TYPES, NAMES, Values
+from .rules import make_fast_check
+
+_SCHEMAS: Final = {name: TypeAdapter(annotation).core_schema for name, annotation in TYPES.items()}
+_VALIDATE: Final = SchemaValidator(
+    core_schema.tuple_positional_schema([_SCHEMAS[kind] for kind in FIELD_TYPES.values()]), CoreConfig(strict=True)
+).validate_python
+
+_passes_rules = make_fast_check({name: index for index, name in enumerate(NAMES)})
+_get_all = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
+
+
+def check_row(values: Values) -> Values | None:
+    """Return the values of all fields, validated but not rounded; None if the model has to decide."""
+    try:
+        row: Values = _VALIDATE(values)
+    except ValidationError:
+        return None
+    return row if _passes_rules(row) else None
+
+
+def row_of(fields: Mapping[str, object]) -> Values | None:
+    """Return the values of all fields in their order, validated but not rounded; None if the model has to decide."""
+    if len(fields) != len(NAMES):
+        return None
+    try:
+        return check_row(_get_all(fields))
+    except KeyError:  # another name among as many
+        return None
+
+
+def validate_fields(fields: Mapping[str, object]) -> dict[str, object] | None:
+    """Return all fields in their order, validated and rounded to float32; None if the model has to decide."""
+    row = row_of(fields)
+    if row is None:
+        return None
+    values = dict(zip(NAMES, row, strict=True))
+    try:
+        round_to_float32(values)
+    except OverflowError:
+        return None
+    return values

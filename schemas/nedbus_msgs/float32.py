@@ -1,0 +1,35 @@
+"""Rounding to float32: the nearest one, as a C float would hold it."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from operator import itemgetter
+from typing import Any, Final, cast
+
+from .rows import FIELD_TYPES
+
+FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+
+_SCALARS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32")
+_PAIR, _OTHER_PAIR = (name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
+_get_scalars = cast("Callable[[Mapping[str, object]], tuple[object, ...]]", itemgetter(*_SCALARS))
+_FLOATS = struct.Struct(f"<{len(_SCALARS) + 4}f")
+
+
+def round_to_float32(values: dict[str, Any]) -> None:
+    """Put the nearest float32 into every float32 field; raise OverflowError for what is beyond its range."""
+    floats = _FLOATS.unpack(_FLOATS.pack(*_get_scalars(values), *values[_PAIR], *values[_OTHER_PAIR]))
+    values.update(zip(_SCALARS, floats, strict=False))  # the last four are the pairs'
+    values[_PAIR], values[_OTHER_PAIR] = floats[-4:-2], floats[-2:]
+
+
+def float32_overflows(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
+    """Yield the field and the reason for every number that is beyond the range of its float32 field."""
+    for name, kind in FIELD_TYPES.items():
+        value = values[name]
+        numbers = (value,) if kind == "float32" else value if kind == "float32[2]" else ()
+        for number in cast("tuple[float, ...]", numbers):
+            if math.isfinite(number) and abs(number) > FLOAT32_MAX:
+                yield name, f"is beyond the range of float32 (+-{FLOAT32_MAX:.9g})"

@@ -1,0 +1,65 @@
+"""The provenance of messages, carried by their Zenoh encoding: the source, and the fields that it does not provide.
+
+    application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
+
+`missing` is a hexadecimal mask with a bit for each field in PX4's order, the lowest for `timestamp`; without it no
+field is missing.
+Almost all messages of a publisher have the same encoding, so both directions are cached.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+from .errors import AddressError
+from .rows import NAMES
+from .topics import ENCODING
+
+_SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
+_MISSING = re.compile(r"[0-9a-f]{1,14}")
+_CACHE_SIZE: Final = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """The source of a message, as far as its publisher reports it.
+
+    `source`: the kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if it is unknown.
+    `missing`: the fields that the source does not provide; they hold NaN, false or 0.
+
+    Raises AddressError for a source that is not 1 to 32 of a-z 0-9 _ -.
+    """
+
+    source: str | None = None
+    missing: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        if self.source is not None and not _SOURCE.fullmatch(self.source):
+            raise AddressError("source", self.source, "1 to 32 of a-z 0-9 _ -")
+
+
+@lru_cache(_CACHE_SIZE)
+def encoding_of(source: str | None, provided: frozenset[str] | None = None) -> str:
+    """Return the Zenoh encoding of messages of a source that provides these fields; None stands for all fields."""
+    mask = 0 if provided is None else sum(1 << index for index, name in enumerate(NAMES) if name not in provided)
+    parts = [ENCODING]
+    if source is not None:
+        parts.append(f"source={source}")
+    if mask:
+        parts.append(f"missing={mask:x}")
+    return ";".join(parts)
+
+
+@lru_cache(_CACHE_SIZE)
+def provenance_of(encoding: str) -> Provenance:
+    """Return the provenance in an encoding; unknown or invalid parts are ignored, as other programs publish too."""
+    parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
+    source, missing = parts.get("source", ""), parts.get("missing", "")
+    mask = int(missing, 16) if _MISSING.fullmatch(missing) else 0
+    return Provenance(
+        source if _SOURCE.fullmatch(source) else None,
+        frozenset(name for index, name in enumerate(NAMES) if mask >> index & 1),
+    )

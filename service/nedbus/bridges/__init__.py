@@ -1,0 +1,18 @@
+"""Bridges: what is on a bus, for ROS 2 nodes and for Foxglove, while it arrives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from nedbus.extras import lazy_exports
+
+if TYPE_CHECKING:
+    from .foxglove import FoxgloveServer
+    from .ros2 import Ros2Bridge
+
+__all__ = ["FOXGLOVE_PORT", "FoxgloveServer", "Ros2Bridge"]
+
+FOXGLOVE_PORT: Final = 8765
+"""The port that the Foxglove app proposes."""
+
+__getattr__ = lazy_exports(__name__, {"FoxgloveServer": ("foxglove", "foxglove"), "Ros2Bridge": ("", "ros2")})

@@ -1,0 +1,153 @@
+"""Serve live vehicles to Foxglove: all fields for plots, poses and frames for the 3D view, positions for the map.
+
+    /<vehicle>/<topic>     px4_msgs/msg/VehicleLocalPosition, every field
+    /<vehicle>/pose        foxglove.PoseInFrame, ENU and FLU, of vehicle_local_position
+    /<vehicle>/location    foxglove.LocationFix, while the position is valid and has a global origin
+    /tf                    foxglove.FrameTransforms: map -> <vehicle>/local -> <vehicle>
+
+Vehicles with different origins share the frame `map`, whose origin is that of the first vehicle that has one.
+"""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from typing import Final
+
+import foxglove
+from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
+
+from nedbus.client import Bus, Sample
+from nedbus.errors import ListenError, NoDataError
+from nedbus_msgs import (
+    CURRENT,
+    DEFAULT_TOPIC,
+    ROS2_TYPE,
+    Address,
+    Selection,
+    VehicleLocalPosition,
+    downgrade,
+    encode_cdr,
+    message_definition,
+)
+
+from . import FOXGLOVE_PORT
+from .foxglove_messages import MapFrame, has_position, to_location, to_pose, to_transforms
+
+_POLL: Final = 1.0  # s between two queries for the addresses that are published
+_HINT: Final = "choose another port with --port"
+
+
+class FoxgloveServer:
+    """Serve what is on a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
+
+    Fields are encoded only for channels with a subscriber; a client that is too slow misses the oldest messages.
+
+    Raises ListenError when the port is in use.
+    """
+
+    def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
+        self._bus = bus
+        self._context = foxglove.Context()
+        self._schema = foxglove.Schema(
+            name=ROS2_TYPE, encoding="ros2msg", data=message_definition(CURRENT.name).encode()
+        )
+        self._fields: dict[Address, foxglove.Channel] = {}
+        self._poses: dict[str, PoseInFrameChannel] = {}
+        self._locations: dict[str, LocationFixChannel] = {}
+        self._map = MapFrame()
+        _require_free(host, port)
+        try:
+            self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
+        except RuntimeError as exc:
+            raise ListenError([f"ws://{host}:{port}"], "it is in use", hint=_HINT) from exc
+        self._transforms = FrameTransformsChannel("/tf", context=self._context)
+        self.url = f"ws://{host}:{self._server.port}"
+
+    def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
+        """Serve until `stop` is set: all addresses, or those of a selection.
+
+        Raises ClosedError when the bus is closed meanwhile.
+        """
+        with self._bus.subscribe_to(selection or Selection()) as subscription:
+            next_poll = time.monotonic() + _POLL
+            while not stop.is_set():
+                if time.monotonic() >= next_poll:
+                    self._close_unpublished()
+                    next_poll = time.monotonic() + _POLL
+                try:
+                    self.show(subscription.receive(0.1))
+                except NoDataError:
+                    continue
+
+    def show(self, sample: Sample) -> None:
+        """Show one sample on all channels of its address, and of its vehicle."""
+        time_ns = sample.sent or sample.received
+        self._show_fields(sample.address, sample.message, time_ns)
+        if sample.topic == DEFAULT_TOPIC:
+            self._open_channels(sample.vehicle)
+            self._show_pose(sample.vehicle, sample.message, time_ns)
+            self._show_location(sample.vehicle, sample.message, time_ns)
+
+    def close(self) -> None:
+        """Stop the server; it closes the connections of its clients."""
+        self._server.stop()
+
+    def __enter__(self) -> FoxgloveServer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _show_fields(self, address: Address, message: VehicleLocalPosition, time_ns: int) -> None:
+        channel = self._fields.get(address)
+        if channel is None:
+            channel = self._fields[address] = foxglove.Channel(
+                f"/{address}", schema=self._schema, message_encoding="cdr", context=self._context
+            )
+        if channel.has_sinks():
+            payload = encode_cdr(downgrade(message, CURRENT.name), layout=CURRENT.name)
+            channel.log(payload, log_time=time_ns)
+
+    def _open_channels(self, vehicle: str) -> None:
+        if vehicle not in self._poses:
+            self._poses[vehicle] = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
+            self._locations[vehicle] = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+
+    def _show_pose(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
+        if not has_position(message):
+            return
+        self._poses[vehicle].log(to_pose(vehicle, message, time_ns=time_ns), log_time=time_ns)
+        local_in_map = self._map.locate(vehicle, message)
+        transforms = to_transforms(vehicle, message, local_in_map=local_in_map, time_ns=time_ns)
+        self._transforms.log(transforms, log_time=time_ns)
+
+    def _show_location(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
+        location = to_location(vehicle, message, time_ns=time_ns)
+        if location is not None:
+            self._locations[vehicle].log(location, log_time=time_ns)
+
+    def _close_unpublished(self) -> None:
+        """Close the channels of addresses that are no longer published."""
+        published = {address for addresses in self._bus.vehicles().values() for address in addresses}
+        if not self._bus.connected:
+            return  # without a link the answers are incomplete
+        for address in self._fields.keys() - published:
+            self._fields.pop(address).close()
+        vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
+        for vehicle in self._poses.keys() - vehicles:
+            self._poses.pop(vehicle).close()
+            self._locations.pop(vehicle).close()
+            self._map.forget(vehicle)
+
+
+def _require_free(host: str, port: int) -> None:
+    """Raise ListenError unless the port can be listened on: the SDK does not report the reason."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except OSError as exc:
+        raise ListenError([f"ws://{host}:{port}"], (exc.strerror or str(exc)).lower(), hint=_HINT) from exc

@@ -1,0 +1,122 @@
+"""Convert a VehicleLocalPosition to Foxglove's messages: pose, transforms and location; no I/O and no clock."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from foxglove.messages import (
+    FrameTransform,
+    FrameTransforms,
+    LocationFix,
+    LocationFixPositionCovarianceType,
+    Pose,
+    PoseInFrame,
+    Quaternion,
+    Timestamp,
+    Vector3,
+)
+
+from nedbus_msgs import MapProjection, VehicleLocalPosition, ned_to_enu, to_global, yaw_ned_to_enu
+
+_MAP: Final = "map"
+
+
+class MapFrame:
+    """The frame `map`: its origin is the first global origin of any vehicle."""
+
+    def __init__(self) -> None:
+        self._projection: MapProjection | None = None
+        self._altitude = math.nan
+        self._located: dict[str, tuple[tuple[float, float, float], Vector3]] = {}  # by vehicle: origin, translation
+
+    def locate(self, vehicle: str, message: VehicleLocalPosition) -> Vector3:
+        """Return the translation of a vehicle's local frame in the map, ENU in metres; zero without a global origin."""
+        origin = (message.ref_lat, message.ref_lon, message.ref_alt)
+        if vehicle in self._located and self._located[vehicle][0] == origin:
+            return self._located[vehicle][1]
+        if not message.xy_global:
+            return Vector3(x=0.0, y=0.0, z=0.0)
+        if self._projection is None:
+            self._projection = MapProjection(message.ref_lat, message.ref_lon)
+        if math.isnan(self._altitude) and message.z_global:
+            self._altitude = message.ref_alt
+        north, east = self._projection.project(message.ref_lat, message.ref_lon)
+        up = message.ref_alt - self._altitude
+        translation = Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
+        self._located[vehicle] = origin, translation
+        return translation
+
+    def forget(self, vehicle: str) -> None:
+        """Drop what is known of a vehicle that is no longer published."""
+        self._located.pop(vehicle, None)
+
+
+def has_position(message: VehicleLocalPosition) -> bool:
+    """Return whether there is a local position to show."""
+    return math.isfinite(message.x + message.y + message.z)
+
+
+def to_pose(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) -> PoseInFrame:
+    """Return the pose of a vehicle in its local frame; without a heading it faces east."""
+    pose = Pose(position=_position(message), orientation=_orientation(message))
+    return PoseInFrame(timestamp=_stamp(time_ns), frame_id=_local(vehicle), pose=pose)
+
+
+def to_transforms(
+    vehicle: str, message: VehicleLocalPosition, *, local_in_map: Vector3, time_ns: int
+) -> FrameTransforms:
+    """Return where the local frame is in the map, and where the vehicle is in its local frame."""
+    local = FrameTransform(
+        timestamp=_stamp(time_ns),
+        parent_frame_id=_MAP,
+        child_frame_id=_local(vehicle),
+        translation=local_in_map,
+        rotation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    body = FrameTransform(
+        timestamp=_stamp(time_ns),
+        parent_frame_id=_local(vehicle),
+        child_frame_id=vehicle,
+        translation=_position(message),
+        rotation=_orientation(message),
+    )
+    return FrameTransforms(transforms=[local, body])
+
+
+def to_location(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) -> LocationFix | None:
+    """Return the global position, None while there is no valid one."""
+    position = to_global(message)
+    if not position or not message.xy_valid:
+        return None
+    variance = message.eph**2 / 2
+    is_known = math.isfinite(variance + message.epv)
+    covariance_types = LocationFixPositionCovarianceType
+    return LocationFix(
+        timestamp=_stamp(time_ns),
+        frame_id=vehicle,
+        latitude=position.latitude,
+        longitude=position.longitude,
+        altitude=position.altitude,
+        position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, message.epv**2] if is_known else [],
+        position_covariance_type=covariance_types.Approximated if is_known else covariance_types.Unknown,
+    )
+
+
+def _local(vehicle: str) -> str:
+    return f"{vehicle}/local"
+
+
+def _position(message: VehicleLocalPosition) -> Vector3:
+    east, north, up = ned_to_enu((message.x, message.y, message.z))
+    return Vector3(x=east, y=north, z=up)
+
+
+def _orientation(message: VehicleLocalPosition) -> Quaternion:
+    yaw = yaw_ned_to_enu(message.heading)
+    half = yaw / 2 if math.isfinite(yaw) else 0.0
+    return Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+
+
+def _stamp(time_ns: int) -> Timestamp:
+    return Timestamp(sec=time_ns // 10**9, nsec=time_ns % 10**9)

@@ -1,0 +1,192 @@
+"""Publish what is on a bus to ROS 2: CDR over rmw_zenoh, in the layout of the workspace."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+
+from nedbus.client import Bus, Sample, Subscription
+from nedbus.errors import NoDataError
+from nedbus.transport import (
+    NO_HASH,
+    Attachment,
+    Session,
+    TopicKey,
+    alive_keys,
+    make_gid,
+    node_token,
+    publisher_token,
+    publishers_key_expr,
+    while_open,
+)
+from nedbus_msgs import (
+    CURRENT,
+    LAYOUTS,
+    ROS2_TYPE,
+    Address,
+    LayoutError,
+    Selection,
+    dds_type,
+    downgrade,
+    encode_cdr,
+    type_hash,
+)
+
+from .ros2_arbiter import Decision, Ros2Arbiter
+
+_log = logging.getLogger(__name__)
+
+_POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
+
+
+class Ros2Bridge:
+    """Publish addresses of a bus to ROS 2, for nodes that use rmw_zenoh on the router of `session`.
+
+    `ros2 topic list` shows each topic for as long as its vehicle is published, as `/fmu/out/<topic>`, with a namespace
+    before it for every vehicle but `plain`: that of `namespaces`, else the vehicle's name, or `px4_<name>` where ROS 2
+    requires a leading letter.
+    Instances are `estimator_local_position_0`, `_1` and so on.
+    A topic that another node publishes is left to that node: a PX4 that speaks Zenoh itself is not published twice.
+    `selection` is what to publish, all addresses without it.
+    `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
+
+    Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        session: Session,
+        *,
+        selection: Selection | None = None,
+        layout: str = CURRENT.name,
+        domain: int = 0,
+        hashed: bool = True,
+        plain: str = "1",
+        namespaces: Mapping[str, str] | None = None,
+    ) -> None:
+        if layout not in LAYOUTS:
+            raise LayoutError(f"no layout {layout!r}: choose from {', '.join(LAYOUTS)}")
+        self._bus = bus
+        self._session = session
+        self._selection = selection or Selection()
+        self._layout = layout
+        self._domain = domain
+        self._hash = type_hash(layout) if hashed else NO_HASH
+        self._node = f"nedbus_{os.getpid()}"
+        self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
+        self._publishers: dict[Address, _Ros2Publisher] = {}
+        self._entities = 0
+
+    def run(self, stop: threading.Event) -> None:
+        """Publish until `stop` is set.
+
+        Raises ClosedError when the bus or the session is closed meanwhile.
+        """
+        with while_open(self._session):
+            token = self._session.liveliness().declare_token(node_token(self._domain, self._zid, self._node))
+        try:
+            with self._bus.subscribe_to(self._selection, mode="every") as subscription:
+                self._forward(subscription, stop)
+        finally:
+            for publisher in self._publishers.values():
+                publisher.close()
+            self._publishers.clear()
+            token.undeclare()
+
+    def _forward(self, subscription: Subscription, stop: threading.Event) -> None:
+        next_poll = 0.0
+        while not stop.is_set():
+            if time.monotonic() >= next_poll:
+                self._poll()
+                next_poll = time.monotonic() + _POLL
+            try:
+                sample = subscription.receive(0.1)
+            except NoDataError:
+                continue
+            if self._arbiter.forwards(sample.address, latency=sample.latency):
+                self._put(sample)
+
+    def _poll(self) -> None:
+        """Query what is on the bus and in ROS 2, and do what the arbiter decides."""
+        addresses = [
+            address
+            for addresses in self._bus.vehicles().values()
+            for address in addresses
+            if self._selection.matches(address)
+        ]
+        if not (self._bus.connected and self._session.info.routers_zid()):
+            return  # without a link the answers are incomplete
+        nodes = {address: self._other_publisher(self._key(self._arbiter.topic_of(address))) for address in addresses}
+        others = {address: node for address, node in nodes.items() if node is not None}
+        for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
+            self._apply(decision)
+
+    def _apply(self, decision: Decision) -> None:
+        address, topic, other = decision.address, decision.topic, decision.other
+        if decision.action == "publish":
+            self._open(address, topic)
+            _log.info("%s -> /%s, %s of layout %s", address, topic, ROS2_TYPE, self._layout)
+        elif decision.action == "conflict":
+            _log.warning("%s is not published: %s has the topic /%s already: set --namespace", address, other, topic)
+        else:
+            if address in self._publishers:
+                self._publishers.pop(address).close()
+            if decision.action == "defer":
+                _log.warning("%s: node %s publishes /%s already: left to that node", address, other, topic)
+            else:
+                _log.info("%s is no longer published: /%s is withdrawn", address, topic)
+
+    def _other_publisher(self, key: TopicKey) -> str | None:
+        """Return the name of another node that publishes this topic."""
+        for token in alive_keys(self._session, publishers_key_expr(key), timeout=0.5):
+            _, _, session, *_, node = token.split("/")[:9]
+            if session != self._zid:
+                return node
+        return None
+
+    def _open(self, address: Address, topic: str) -> None:
+        key = self._key(topic)
+        self._entities += 1
+        with while_open(self._session):
+            self._publishers[address] = _Ros2Publisher(
+                make_gid(),
+                self._session.declare_publisher(str(key), congestion_control=zenoh.CongestionControl.DROP),
+                self._session.liveliness().declare_token(publisher_token(key, self._zid, self._node, self._entities)),
+            )
+
+    def _put(self, sample: Sample) -> None:
+        publisher = self._publishers[sample.address]
+        payload = encode_cdr(downgrade(sample.message, self._layout), layout=self._layout)
+        publisher.sequence += 1
+        attachment = bytes(Attachment(publisher.sequence, time.time_ns(), publisher.gid))
+        with while_open(self._session):
+            publisher.publisher.put(payload, attachment=attachment)
+
+    def _key(self, topic: str) -> TopicKey:
+        return TopicKey(self._domain, topic, dds_type(ROS2_TYPE), self._hash)
+
+    @property
+    def _zid(self) -> str:
+        return str(self._session.info.zid())
+
+
+@dataclass(slots=True, eq=False)
+class _Ros2Publisher:
+    """One topic of ROS 2: the id and the sequence of its publisher, and its liveliness token."""
+
+    gid: bytes
+    publisher: zenoh.Publisher
+    token: zenoh.LivelinessToken
+    sequence: int = 0
+
+    def close(self) -> None:
+        self.token.undeclare()
+        self.publisher.undeclare()

@@ -1,0 +1,132 @@
+"""Commands about files: record, convert, plot."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from nedbus import recording
+from nedbus.client import Bus
+from nedbus.errors import AddressError, ConfigError
+from nedbus.sources import LiveSource, parse_source, source_text_of_file
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection
+
+from .options import (
+    DurationOption,
+    InstanceOption,
+    TopicArgument,
+    TopicOption,
+    VehicleOption,
+    choose,
+    command,
+    on_bus,
+    write,
+    write_stderr,
+)
+from .run import run_until_signal
+
+FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
+OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")]
+
+
+@on_bus
+def record(
+    bus: Bus,
+    topic: TopicArgument = None,
+    *,
+    output: OutputOption,
+    topic_option: TopicOption = None,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    duration: DurationOption = None,
+) -> None:
+    """Record every message to an MCAP file, until Ctrl-C; a power cut costs at most the last second."""
+    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
+    open_recorder = recording.Recorder
+    stop = threading.Event()
+    with bus.subscribe_to(selection, mode="every") as subscription:
+        recorder = open_recorder(subscription, output)
+
+        def run() -> bool:
+            recorder.run(stop, duration=duration)
+            return True
+
+        with _progress() as show:
+            run_until_signal(run, stop.set, on_tick=lambda: show(recorder.status, None, None))
+    write_stderr(f"{output}: {recorder.status}")
+
+
+@command
+def convert(
+    source: FlightArgument,
+    output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording to write", show_default=False)],
+    *,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of a log of one vehicle")] = None,
+) -> None:
+    """Convert a flight log to a recording, validated, with all local position topics."""
+    spec = parse_source(source_text_of_file(source, vehicle))
+    replay = spec.open_source(vehicle="1")
+    if isinstance(replay, LiveSource):
+        raise ConfigError(str(source), "not a file")
+    run = replay.open()
+    for warning in run.warnings:
+        write_stderr(f"{source}: {warning}")
+    with _progress() as show:
+        report = recording.convert(
+            ((each.address, each.fields) for each in run.messages),
+            output,
+            source=spec.kind,
+            on_progress=lambda done: show(f"{output}", done, run.total),
+        )
+    write_stderr(f"{output}: {report}")
+
+
+@command
+def plot(
+    source: FlightArgument,
+    *,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.png", help="The picture (default: beside the flight)")
+    ] = None,
+    topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')] = DEFAULT_TOPIC,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+) -> None:
+    """Draw a flight: track, altitude, speed, flags, and resets of the estimator."""
+    draw, limit = recording.draw, recording.MAX_STREAMS
+    selection = Selection(topic, vehicle, instance)
+    recorded = recording.addresses_of(source)
+    selected = [address for address in recorded if selection.matches(address)]
+    if not selected:
+        raise AddressError("topic", topic, f"one of {', '.join(map(str, recorded))}")
+    if len(selected) > limit:
+        write_stderr(f"{source}: {len(selected)} streams, of which the first {limit} are drawn: choose with -v, -t, -i")
+    streams = []
+    for address in selected[:limit]:
+        messages = recording.read(source, address.topic, vehicle=address.vehicle, instance=address.instance)
+        if len(messages):
+            streams.append((address, messages))
+    target = output or source.with_suffix(".png")
+    draw(streams, target, title=source.name)
+    write(str(target))
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
+    """Show the progress of something, on a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda text, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=24), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)

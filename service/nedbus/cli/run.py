@@ -1,0 +1,76 @@
+"""Run a command in a thread until it ends or a signal comes, also as the first process of a container."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Final
+
+import typer
+
+_log = logging.getLogger("nedbus")
+
+_LIMIT: Final = 1.6  # s after a signal by which the process has ended
+
+
+def run_until_stopped(body: Callable[[threading.Event], object]) -> None:
+    """Run a body that ends when its event is set, by Ctrl-C or SIGTERM; raise typer.Exit with 130 after Ctrl-C."""
+    stop = threading.Event()
+
+    def run() -> bool:
+        body(stop)
+        return True
+
+    exit_code = run_until_signal(run, stop.set)
+    if exit_code is not None:
+        raise typer.Exit(exit_code)
+
+
+def run_until_signal(
+    run: Callable[[], bool], stop: Callable[[], object], *, on_tick: Callable[[], object] = lambda: None
+) -> int | None:
+    """Run something in a thread until it ends or a signal comes; return the exit code, None for success.
+
+    `run` returns whether it succeeded, `stop` makes it end, `on_tick` is called ten times a second meanwhile.
+    The main thread only waits: a signal is then handled at once, even while Zenoh blocks.
+    """
+    outcome: list[bool | BaseException] = []
+    signals: list[int] = []
+
+    def body() -> None:
+        try:
+            outcome.append(run())
+        except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
+            outcome.append(exc)
+
+    def on_signal(number: int, _: FrameType | None) -> None:
+        if signals:
+            os._exit(130 if number == signal.SIGINT else 1)  # a second signal ends the process at once
+        signals.append(number)
+        stop()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    thread = threading.Thread(target=body, name="nedbus-run", daemon=True)
+    thread.start()
+    while thread.is_alive() and not signals:
+        on_tick()
+        thread.join(0.1)
+    deadline = time.monotonic() + _LIMIT
+    while thread.is_alive() and time.monotonic() < deadline:
+        thread.join(0.05)
+    if thread.is_alive():
+        _log.error("not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost")
+        sys.stderr.flush()
+        os._exit(1)
+    if isinstance(outcome[0], BaseException):
+        raise outcome[0]
+    if signals and signals[0] == signal.SIGINT:
+        return 130
+    return None if outcome[0] else 1

@@ -1,0 +1,44 @@
+"""The client: connect to a router, subscribe, ask for last messages, publish; blocking and with asyncio."""
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+from .async_bus import AsyncBus
+from .async_publisher import AsyncPublisher
+from .async_subscription import AsyncSubscription
+from .bus import Bus
+from .connect import connect, connect_async, connect_with
+from .health import Health, Monitor, StreamHealth
+from .publisher import HEARTBEAT, Publisher
+from .publisher_registry import PublisherRegistry
+from .query_server import QueryServer
+from .sample import Counts, Mode, Sample
+from .subscription import Subscription
+
+if TYPE_CHECKING:
+    from .batch import Batch
+else:
+    __getattr__ = lazy_exports(__name__, {"Batch": ("", "batch")})  # NumPy takes longer to load than all the rest
+
+__all__ = [
+    "HEARTBEAT",
+    "AsyncBus",
+    "AsyncPublisher",
+    "AsyncSubscription",
+    "Batch",
+    "Bus",
+    "Counts",
+    "Health",
+    "Mode",
+    "Monitor",
+    "Publisher",
+    "PublisherRegistry",
+    "QueryServer",
+    "Sample",
+    "StreamHealth",
+    "Subscription",
+    "connect",
+    "connect_async",
+    "connect_with",
+]

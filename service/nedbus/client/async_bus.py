@@ -1,0 +1,85 @@
+"""The bus for asyncio: the twin of Bus."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Self
+
+from nedbus.errors import ClosedError
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection
+
+from .async_publisher import AsyncPublisher
+from .async_subscription import AsyncSubscription
+from .bus import Bus
+from .sample import Mode, Sample
+
+
+class AsyncBus:
+    """The twin of Bus for asyncio, from `connect_async`: the same methods, awaited where they wait."""
+
+    def __init__(self, open_bus: Callable[[], Bus]) -> None:
+        self._open_bus = open_bus
+        self._bus: Bus | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a link to a router at this moment."""
+        return self._opened().connected
+
+    def subscribe(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, mode: Mode = "latest"
+    ) -> AsyncSubscription:
+        """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
+        bus = self._opened()
+        receive_queue = bus._make_queue(mode)
+        key_expr = Selection(topic, vehicle, instance).key_expr(prefix=bus.prefix)
+        return AsyncSubscription(lambda: bus._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr)
+
+    async def latest(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, timeout: float = 2.0
+    ) -> list[Sample]:
+        """Return the last sample of each key as `Bus.latest` does."""
+        bus = self._opened()
+        return await asyncio.to_thread(bus.latest, topic, vehicle=vehicle, instance=instance, timeout=timeout)
+
+    async def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
+        """Return the vehicles that are published now as `Bus.vehicles` does."""
+        return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
+
+    async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+        """Return the status of every nedbus service as `Bus.services` does."""
+        return await asyncio.to_thread(self._opened().services, timeout=timeout)
+
+    async def publisher(
+        self,
+        topic: str,
+        *,
+        vehicle: str,
+        instance: int | None = None,
+        lossless: bool = False,
+        source: str | None = None,
+    ) -> AsyncPublisher:
+        """Return a publisher as `Bus.publisher` does, whose methods are awaited."""
+        publisher = await asyncio.to_thread(
+            self._opened().publisher, topic, vehicle=vehicle, instance=instance, lossless=lossless, source=source
+        )
+        return AsyncPublisher(publisher)
+
+    async def close(self) -> None:
+        """Close the bus as `Bus.close` does."""
+        if self._bus is not None:
+            await asyncio.to_thread(self._bus.close)
+
+    async def __aenter__(self) -> Self:
+        self._bus = await asyncio.to_thread(self._open_bus)
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        if self._bus is not None:
+            await asyncio.to_thread(self._bus.__exit__, *exc)
+
+    def _opened(self) -> Bus:
+        if self._bus is None:
+            raise ClosedError
+        return self._bus

@@ -1,0 +1,176 @@
+"""The bus as scripts see it: subscribe, ask, publish; blocking."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from functools import partial
+from typing import Self
+
+from nedbus.errors import ClosedError, NedbusError
+from nedbus.transport import Session, Tls, open_client, query
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, decode
+
+from .decoder import Decoder
+from .discovery import find_layout, find_services, find_vehicles
+from .layout_lookup import LayoutLookup
+from .publisher import Publisher
+from .publisher_registry import PublisherRegistry
+from .query_server import QueryServer
+from .receive_queue import ReceiveQueue
+from .sample import Mode, Sample
+from .subscription import Subscription
+from .zenoh_subscriber import ZenohSubscriber
+
+
+class Bus:
+    """A connection to a router, from `connect`.
+
+    Topics, vehicles and instances are selected by name; "*" and None stand for any.
+    All methods may be called from any thread; an invalid name raises AddressError, a closed bus ClosedError.
+    """
+
+    def __init__(self, session: Session, *, routers: Sequence[str], prefix: str, tls: Tls | None) -> None:
+        self.prefix = prefix
+        self.routers = tuple(routers)
+        self._tls = tls
+        self._session = session
+        self._queries = QueryServer(session)
+        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix)
+        self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
+        self._finalizer = weakref.finalize(self, _close, session, self._queries, self._subscribers)
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a link to a router at this moment."""
+        self._require_open()
+        return bool(self._session.info.routers_zid())
+
+    def subscribe(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, mode: Mode = "latest"
+    ) -> Subscription:
+        """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
+
+        Without a topic it is vehicle_local_position; "*" is all four topics.
+        `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
+        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s.
+        Either way `counts` has what was lost, dropped or invalid.
+
+        Raises ConnectError when mode "every" cannot open its session, because the router is away at this moment.
+        """
+        self._require_open()
+        return self.subscribe_to(Selection(topic, vehicle, instance), mode=mode)
+
+    def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> Subscription:
+        """Subscribe to a selection of addresses, as `subscribe` does."""
+        receive_queue = self._make_queue(mode)
+        key_expr = selection.key_expr(prefix=self.prefix)
+        return Subscription(self._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr, owner=self)
+
+    def latest(
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, timeout: float = 2.0
+    ) -> list[Sample]:
+        """Return the last sample of each key, sorted by address; `latency` is then its age.
+
+        Without a topic it is vehicle_local_position; "*" is all four topics.
+        It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
+        """
+        self._require_open()
+        key_expr = Selection(topic, vehicle, instance).key_expr(prefix=self.prefix)
+        decoder = self._make_decoder()
+        answers = query(self._session, key_expr, timeout=timeout)
+        samples = (decoder.decode(raw, str(raw.key_expr), decode) for raw in answers)
+        return sorted((sample for sample in samples if sample is not None), key=lambda sample: sample.address)
+
+    def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
+        """Return the vehicles that are published now, and the addresses of each; `latest` has their messages."""
+        self._require_open()
+        return find_vehicles(self._session, prefix=self.prefix, timeout=timeout)
+
+    def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+        """Return the status of every nedbus service on this network, as it reports it."""
+        self._require_open()
+        return find_services(self._session, prefix=self.prefix, timeout=timeout)
+
+    def publisher(
+        self,
+        topic: str,
+        *,
+        vehicle: str,
+        instance: int | None = None,
+        lossless: bool = False,
+        source: str | None = None,
+    ) -> Publisher:
+        """Return a publisher of one address; raise AddressInUseError if this bus has one already.
+
+        `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, `close` until
+        they have all of it, and a stuck one holds up all others for 5 s, until it is disconnected.
+        `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
+        """
+        self._require_open()
+        return self._publishers.publisher(
+            Address(vehicle, topic, instance), lossless=lossless, source=source, owner=self
+        )
+
+    def open_session(self, endpoint: str | None = None, *, timeout: float = 3.0) -> Session:
+        """Open another Zenoh session at the same routers, or at another one; the caller closes it."""
+        return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
+
+    def close(self) -> None:
+        """Close the bus, its subscriptions and its publishers; a second call does nothing.
+
+        Lossless publishers flush before; not so where a `with` block ends by an exception.
+        """
+        if self._finalizer.alive:
+            with suppress(NedbusError):
+                self._publishers.flush(each for each in self._publishers.publishers if each.lossless)
+        self._finalizer()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, exc: object, *_: object) -> None:
+        if exc is None:
+            self.close()
+        else:
+            self._finalizer()
+
+    def _require_open(self) -> None:
+        if not self._finalizer.alive:
+            raise ClosedError
+
+    def _make_queue(self, mode: Mode) -> ReceiveQueue:
+        """Return the queue of a new subscription; AsyncBus uses it too."""
+        self._require_open()
+        return ReceiveQueue(mode, self._make_decoder())
+
+    def _open_subscriber(self, key_expr: str, receive_queue: ReceiveQueue) -> ZenohSubscriber:
+        """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
+        self._require_open()
+        if receive_queue.newest_only:
+            subscriber = ZenohSubscriber(self._session, key_expr, receive_queue)
+        else:
+            own = self.open_session()
+            try:
+                subscriber = ZenohSubscriber(own, key_expr, receive_queue)
+            except NedbusError:
+                own.close()
+                raise
+        self._subscribers.add(subscriber)
+        if not self._finalizer.alive:  # closed meanwhile, by another thread
+            subscriber.close()
+            raise ClosedError
+        return subscriber
+
+    def _make_decoder(self) -> Decoder:
+        layouts = LayoutLookup(partial(find_layout, self._session, prefix=self.prefix))
+        return Decoder(layouts, prefix=self.prefix)
+
+
+def _close(session: Session, queries: QueryServer, subscribers: weakref.WeakSet[ZenohSubscriber]) -> None:
+    with ExitStack() as closing:  # whatever fails, the rest is closed as well
+        closing.callback(session.close)
+        closing.callback(queries.close)
+        for subscriber in list(subscribers):
+            closing.callback(subscriber.close)

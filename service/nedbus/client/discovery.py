@@ -1,0 +1,66 @@
+"""What others on the network answer: vehicles, the status of services, layouts. No answer is trusted."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from typing import Final
+
+from nedbus.transport import RawSample, Session, alive_keys, query
+from nedbus_msgs import ANY, Address, AddressError, address_of_alive_key, alive_key_expr, schema_key, status_key
+
+_log = logging.getLogger(__name__)
+
+_MAX_FIELDS: Final = 256  # of a layout
+_MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
+
+
+def find_vehicles(session: Session, *, prefix: str, timeout: float) -> dict[str, list[Address]]:
+    """Return the vehicles that are published now, and the addresses of each."""
+    found: dict[str, list[Address]] = {}
+    for key in alive_keys(session, alive_key_expr(prefix=prefix), timeout=timeout):
+        try:
+            address = address_of_alive_key(key, prefix=prefix)
+        except AddressError as exc:
+            _log.warning("%s: %s", key, exc)
+            continue
+        found.setdefault(address.vehicle, []).append(address)
+    return found
+
+
+def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
+    """Return the status of every nedbus service, as it reports it."""
+    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
+    return [status for raw in answers if isinstance(status := _parse_json(raw), dict)]
+
+
+def find_layout(session: Session, number: int, *, prefix: str) -> Sequence[str] | None:
+    """Ask publishers for the field names of a layout; None if none knows it."""
+    for raw in query(session, schema_key(prefix=prefix), timeout=0.5, newest=False):
+        content = _parse_json(raw)
+        layouts = content.get("layouts") if isinstance(content, dict) else None
+        for layout in layouts if isinstance(layouts, list) else ():
+            names = _field_names(layout, number)
+            if names is not None:
+                return names
+    return None
+
+
+def _parse_json(raw: RawSample) -> object:
+    if len(raw.payload) > _MAX_ANSWER:
+        return None
+    try:
+        return json.loads(raw.payload.to_bytes())
+    except (ValueError, RecursionError):
+        _log.warning("%r: an answer that is not JSON", str(raw.key_expr))
+        return None
+
+
+def _field_names(layout: object, number: int) -> Sequence[str] | None:
+    """Return the field names of this layout, if it is the one with that number and well formed."""
+    if not isinstance(layout, dict) or layout.get("wire") != number or not isinstance(layout.get("fields"), list):
+        return None
+    named = [field.get("name") for field in layout["fields"] if isinstance(field, dict)]
+    names = [name for name in named if isinstance(name, str)]
+    return names if len(set(names)) == len(layout["fields"]) <= _MAX_FIELDS else None

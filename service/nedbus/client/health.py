@@ -1,0 +1,178 @@
+"""The health of a stream: rate, jitter, age, gaps, order, reboots, and the share of its flags; no I/O.
+
+The same object serves `nedbus hz`, the status of a service, and scripts.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Final
+
+from nedbus_msgs import DOUBT_FLAGS, TOPICS, Address, Message
+
+from .sample import Sample
+
+_REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
+_GAP: Final = 3.0  # times the usual step of PX4's time
+_SETTLED: Final = 5  # steps from which on there is a usual one
+_WEIGHT: Final = 0.05  # of a new step in the usual one
+_MAX_LATENCIES: Final = 1000  # that are kept of a window
+_WINDOW: Final = 1_000_000_000  # ns
+_STALE: Final = 3.0  # s without a message after which a stream has no rate
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """The health of one stream; None where there were too few messages to measure it.
+
+    Of the last full second: `rate` [Hz], `jitter` (standard deviation of the intervals of arrival) [s], `latency`
+    (median) and `latency_max` [s], and `flags`, the share of the messages with each flag set, 0 to 1.
+    Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's own time of more than three usual ones),
+    `out_of_order`, `reboots` (that time went back by more than 1 s), and `flags_ever`.
+    `nominal`: the rate that PX4 has for this topic [Hz]; logs and links have less.
+    `age`: seconds since the last message.
+    """
+
+    rate: float | None
+    nominal: float
+    jitter: float | None
+    latency: float | None
+    latency_max: float | None
+    age: float | None
+    messages: int
+    lost: int
+    gaps: int
+    out_of_order: int
+    reboots: int
+    flags: dict[str, float] | None
+    flags_ever: dict[str, float] | None
+
+
+@dataclass(slots=True, eq=False)
+class _Window:
+    """One second of a stream, or more where it is slow."""
+
+    start: int
+    messages: int = 0
+    intervals: int = 0
+    mean: float = 0.0
+    spread: float = 0.0
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_LATENCIES))
+    flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(DOUBT_FLAGS, 0))
+
+    def add_interval(self, seconds: float) -> None:
+        """Follow mean and spread as Welford does."""
+        self.intervals += 1
+        deviation = seconds - self.mean
+        self.mean += deviation / self.intervals
+        self.spread += deviation * (seconds - self.mean)
+
+
+class StreamHealth:
+    """Follow one stream, message by message, in a fixed amount of memory."""
+
+    def __init__(self, topic: str) -> None:
+        self._nominal = TOPICS[topic].rate
+        self._messages = self._lost = self._gaps = self._disorders = self._reboots = 0
+        self._received: int | None = None
+        self._time: int | None = None
+        self._usual = 0.0  # us between two messages
+        self._steps = 0
+        self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
+        self._window = self._last_window = _Window(0)
+
+    def add(self, message: Message, *, received: int, latency: float | None = None, lost: int = 0) -> None:
+        """Add a message that was received at this time [ns]."""
+        window = self._window
+        if received - window.start >= _WINDOW:
+            self._last_window = window if window.messages else self._last_window
+            window = self._window = _Window(received)
+        self._messages += 1
+        self._lost += lost
+        window.messages += 1
+        if self._received is not None:
+            window.add_interval((received - self._received) / 1e9)
+        self._received = received
+        self._add_time(message.timestamp)
+        if latency is not None:
+            window.latencies.append(latency)
+        for flag in DOUBT_FLAGS:
+            if getattr(message, flag):
+                window.flags[flag] += 1
+                self._ever[flag] += 1
+
+    def snapshot(self, now: int | None = None) -> Health:
+        """Return the health at this time [ns]."""
+        now = time.time_ns() if now is None else now
+        age = None if self._received is None else (now - self._received) / 1e9
+        window = self._last_window if self._last_window.messages else self._window
+        is_live = window.intervals and window.mean > 0 and age is not None and age < max(_STALE, 2 * window.mean)
+        return Health(
+            rate=1 / window.mean if is_live else None,
+            nominal=self._nominal,
+            jitter=math.sqrt(window.spread / window.intervals) if is_live else None,
+            latency=_median(window.latencies),
+            latency_max=max(window.latencies, default=None),
+            age=age,
+            messages=self._messages,
+            lost=self._lost,
+            gaps=self._gaps,
+            out_of_order=self._disorders,
+            reboots=self._reboots,
+            flags=_shares(window.flags, window.messages),
+            flags_ever=_shares(self._ever, self._messages),
+        )
+
+    def _add_time(self, timestamp: int) -> None:
+        last = self._time
+        if last is None or timestamp < last - _REBOOT:
+            self._reboots += last is not None
+            self._time, self._steps = timestamp, 0
+        elif timestamp < last:
+            self._disorders += 1
+        else:
+            step = timestamp - last
+            self._time = timestamp
+            if self._steps >= _SETTLED and step > _GAP * self._usual:
+                self._gaps += 1
+                return
+            self._steps += 1
+            weight = max(_WEIGHT, 1 / self._steps)
+            self._usual += weight * (step - self._usual)
+
+
+class Monitor:
+    """Follow all streams of a subscription.
+
+    The first sample of each address does not count: it may be the last value that a subscription starts with.
+    """
+
+    def __init__(self) -> None:
+        self._streams: dict[Address, StreamHealth | None] = {}
+
+    def add(self, sample: Sample[Message]) -> bool:
+        """Add a sample; return whether it counts."""
+        if sample.address not in self._streams:
+            self._streams[sample.address] = None
+            return False
+        stream = self._streams[sample.address]
+        if stream is None:
+            stream = self._streams[sample.address] = StreamHealth(sample.topic)
+        stream.add(sample.message, received=sample.received, latency=sample.latency, lost=sample.lost)
+        return True
+
+    def snapshot(self) -> dict[Address, Health]:
+        """Return the health of each stream, sorted by address."""
+        return {address: stream.snapshot() for address in sorted(self._streams) if (stream := self._streams[address])}
+
+
+def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:
+    return {flag: count / total for flag, count in counts.items()} if total else None
+
+
+def _median(values: Collection[float]) -> float | None:
+    return sorted(values)[len(values) // 2] if values else None

@@ -1,0 +1,178 @@
+"""A publisher of one address: validate, encode, put."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, Self
+
+import zenoh
+
+from nedbus.errors import ClosedError, NedbusError
+from nedbus.transport import Session, translate_error, while_open
+from nedbus_msgs import (
+    FIELD_TYPES,
+    PAYLOAD_SIZE,
+    Address,
+    Provenance,
+    Row,
+    VehicleLocalPosition,
+    encode,
+    encode_fields,
+    encode_row,
+    encoding_of,
+)
+
+from .acknowledgement import Acknowledgement
+from .qos import TOPIC_QOS
+
+if TYPE_CHECKING:
+    from nedbus_msgs.arrays import MessageArray
+
+HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
+FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
+_FIELDS: Final = len(FIELD_TYPES)
+
+
+class Publisher:
+    """Publish the messages of one address; get one from `bus.publisher(...)`.
+
+    Messages are kept for about 20 s for readers that missed some, and the last one for readers that ask.
+    `publish` never waits for a slow reader, unless the publisher is lossless.
+    Usable from one thread at a time; as a context manager it closes itself.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        address: Address,
+        *,
+        prefix: str,
+        lossless: bool,
+        source: str | None,
+        on_close: Callable[[], object],
+        owner: object,
+    ) -> None:
+        self.address = address
+        self.key = address.key(prefix=prefix)
+        self.published = 0
+        self.source = Provenance(source).source
+        self.lossless = lossless
+        self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
+        self._session = session
+        self._on_close = on_close
+        self._owner = owner  # the bus stays open for as long as somebody may publish
+        self._closed = False
+        self._encoding = encoding_of(source)
+        qos = TOPIC_QOS[address.topic]
+        control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        # A heartbeat together with BLOCK and recovering readers can stall a saturated link for 5 s.
+        misses = zenoh.ext.MissDetectionConfig(heartbeat=None if lossless else HEARTBEAT, sporadic_heartbeat=None)
+        with while_open(session):
+            self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
+            self._publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                self.key,
+                encoding=self._encoding,
+                congestion_control=control,
+                priority=qos.priority,
+                cache=zenoh.ext.CacheConfig(qos.cache),
+                sample_miss_detection=misses,
+                publisher_detection=True,
+            )
+        self._acknowledgement = Acknowledgement(session, self.key, self._publisher, priority=qos.priority)
+
+    def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
+        """Validate a message, or the fields of one by name, and publish it.
+
+        A message that exists was validated when it was made; it is not validated again.
+        Readers see which fields it was made without: `sample.missing`.
+
+        Raises pydantic.ValidationError for invalid fields, EncodeError for a message whose validation was bypassed,
+        ClosedError once the publisher or its bus is closed.
+        """
+        if isinstance(message, VehicleLocalPosition):
+            self._put(encode(message), message.__pydantic_fields_set__)
+        else:
+            self._put(encode_fields(message), message.keys())
+
+    def publish_row(self, values: Sequence[object] | Row) -> None:
+        """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and publish them.
+
+        The same as `publish` with these fields, and faster: no message is made of them.
+        """
+        self._put(encode_row(values), FIELD_TYPES)
+
+    def publish_many(self, messages: MessageArray) -> None:
+        """Validate messages in a structured array of shape (n,) and dtype DTYPE, and publish them; all or none.
+
+        Raises TypeError for another dtype, pydantic.ValidationError for the first message that is invalid.
+        """
+        from nedbus_msgs.arrays import DTYPE, FEW, encode_array, to_message, to_row, valid_mask
+
+        if messages.dtype != DTYPE:
+            raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
+        if len(messages) < FEW:
+            for payload in [encode_row(to_row(element)) for element in messages]:
+                self._put(payload, FIELD_TYPES)
+            return
+        for element in messages[~valid_mask(messages)]:
+            to_message(element)  # raises, with the reason
+        if self._closed:
+            raise ClosedError
+        payloads = encode_array(messages)
+        put, new_timestamp = self._publisher.put, self._session.new_timestamp
+        with while_open(self._session):
+            for start in range(0, len(payloads), PAYLOAD_SIZE):
+                payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
+                put(payload, timestamp=stamp)
+                self.last = payload, stamp, self._encoding
+                self.published += 1
+
+    def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
+        """Wait until all readers of mode "every" have what was published; return False if one has not in time.
+
+        What is still in transit to a slow reader when a publisher's process ends is lost, and not counted anywhere.
+        A reader that was disconnected learns how much it missed, and is sent again what is still kept.
+
+        Raises ClosedError once the bus is closed.
+        """
+        return self._acknowledgement.wait(self.published, timeout=timeout)
+
+    def close(self) -> None:
+        """Stop publishing this address: it is no longer listed, and free for another publisher.
+
+        A lossless publisher flushes before.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        if self.lossless:
+            with suppress(NedbusError):
+                self.flush()
+        self._on_close()
+        with suppress(zenoh.ZError):  # closed already with the session
+            self._publisher.undeclare()
+            self._token.undeclare()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _put(self, payload: bytes, provided: Collection[str]) -> None:
+        if self._closed:
+            raise ClosedError
+        encoding = self._encoding
+        try:
+            stamp = self._session.new_timestamp()
+            if len(provided) == _FIELDS:
+                self._publisher.put(payload, timestamp=stamp)
+            else:
+                encoding = encoding_of(self.source, frozenset(provided))
+                self._publisher.put(payload, timestamp=stamp, encoding=encoding)
+        except zenoh.ZError as exc:
+            raise translate_error(exc, self._session) from exc
+        self.last = payload, stamp, encoding
+        self.published += 1

@@ -1,0 +1,111 @@
+"""All publishers of a session by address, and what is known of others that publish or read the same."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Final, cast
+
+import zenoh
+from pydantic_core import to_json
+
+from nedbus.errors import AddressInUseError
+from nedbus.transport import Session, alive_keys, while_open
+from nedbus_msgs import Address, json_schema, layout_table, schema_key
+
+from .publisher import FLUSH_TIMEOUT, Publisher
+from .query_server import JSON, Answer, QueryServer
+
+_log = logging.getLogger(__name__)
+
+_ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
+
+
+class PublisherRegistry:
+    """Make the publishers of a session, at most one for each address, and answer queries for their last messages."""
+
+    def __init__(self, session: Session, queries: QueryServer, *, prefix: str) -> None:
+        self.prefix = prefix
+        self._session = session
+        self._queries = queries
+        self._publishers: dict[Address, Publisher] = {}
+        self._vehicles: set[str] = set()  # whose queries are answered
+        self._lock = threading.Lock()
+
+    @property
+    def publishers(self) -> list[Publisher]:
+        """All publishers that are open."""
+        return list(self._publishers.values())
+
+    def publisher(
+        self, address: Address, *, lossless: bool = False, source: str | None = None, owner: object = None
+    ) -> Publisher:
+        """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one."""
+        with self._lock:
+            if address in self._publishers:
+                raise AddressInUseError(address)
+            publisher = Publisher(
+                self._session,
+                address,
+                prefix=self.prefix,
+                lossless=lossless,
+                source=source,
+                on_close=lambda: self._publishers.pop(address, None),
+                owner=owner,
+            )
+            self._publishers[address] = publisher
+            if not self._vehicles:
+                self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
+            if address.vehicle not in self._vehicles:
+                self._vehicles.add(address.vehicle)
+                key_expr = f"{self.prefix}/{address.vehicle}/**"
+                self._queries.answer(key_expr, partial(self._last_messages, address.vehicle))
+        return publisher
+
+    def reject(self, address: Address, report: Mapping[str, object]) -> None:
+        """Publish why a message of this address was rejected; what JSON cannot hold is written as text."""
+        payload = to_json(report, inf_nan_mode="strings", fallback=repr)
+        with while_open(self._session):
+            self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
+
+    def is_alive(self, address: Address) -> bool:
+        """Return whether this address is published already, by this process or another."""
+        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=0.5))
+
+    def is_read(self, addresses: Iterable[Address]) -> bool:
+        """Return whether there is a subscriber for any of these addresses."""
+        probes = [self._session.declare_publisher(address.key(prefix=self.prefix)) for address in addresses]
+        try:
+            # Zenoh's stubs call the status a bool; it is an object, always true.
+            return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
+        finally:
+            for probe in probes:
+                probe.undeclare()
+
+    def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
+        """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
+        end = time.monotonic() + FLUSH_TIMEOUT
+        for publisher in publishers:
+            logged = False
+            while not publisher.flush(_ASK_AGAIN):
+                if (stop and stop.is_set()) or time.monotonic() > end:
+                    _log.warning("%s: a reader does not have all of it", publisher.address)
+                    return
+                if not logged:
+                    _log.info("%s: waiting for a slow reader", publisher.address)
+                logged = True
+
+    def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
+        for publisher in self.publishers:
+            if publisher.last is None or publisher.address.vehicle != vehicle:
+                continue
+            if query.key_expr.intersects(publisher.key):
+                payload, stamp, encoding = publisher.last
+                yield publisher.key, payload, encoding, stamp
+
+
+def _schema() -> Mapping[str, object]:
+    return {"json_schema": json_schema(), "layouts": layout_table()}

@@ -1,0 +1,95 @@
+"""What a reader gets: a Sample for each message, and the Counts of a subscription."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Generic, Literal
+
+from typing_extensions import TypeVar
+
+from nedbus_msgs import FIELD_TYPES, Address, Provenance, Row, VehicleLocalPosition
+
+if TYPE_CHECKING:
+    import zenoh
+
+Mode = Literal["latest", "every"]
+"""How a reader that is slower than the data is treated: it gets the newest message of each key, or every message."""
+
+M_co = TypeVar("M_co", bound=VehicleLocalPosition | Row, default=VehicleLocalPosition, covariant=True)
+
+_UNKNOWN: Final = Provenance()
+
+
+@dataclass(slots=True)
+class Sample(Generic[M_co]):
+    """One message that arrived.
+
+    `message`: the validated message; a Row, which has the same fields, from `rows()`.
+    `address`: vehicle, topic and instance, also as attributes of their own.
+    `received`: when it was decoded here, ns since the epoch.
+    `stamp`: Zenoh's timestamp, None if its publisher set none.
+    `lost`: messages of this key that were lost in transit just before this one.
+    `provenance`: the source and the fields that it did not provide, also as `source` and `missing`.
+    """
+
+    message: M_co
+    address: Address
+    received: int
+    stamp: zenoh.Timestamp | None = None
+    lost: int = 0
+    provenance: Provenance = _UNKNOWN
+
+    @property
+    def sent(self) -> int | None:
+        """When its publisher sent it, ns since the epoch by the publisher's clock; None without a timestamp."""
+        return None if self.stamp is None else self.stamp.get_time_as_ntp64().as_nanos()
+
+    @property
+    def vehicle(self) -> str:
+        """The vehicle."""
+        return self.address.vehicle
+
+    @property
+    def topic(self) -> str:
+        """The uORB topic."""
+        return self.address.topic
+
+    @property
+    def instance(self) -> int | None:
+        """The uORB instance, for estimator_local_position."""
+        return self.address.instance
+
+    @property
+    def source(self) -> str | None:
+        """The kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if its publisher set none."""
+        return self.provenance.source
+
+    @property
+    def missing(self) -> frozenset[str]:
+        """The fields that the source did not provide; they hold NaN, false or 0."""
+        message = self.message
+        if isinstance(message, VehicleLocalPosition):  # of an older layout perhaps, by another encoder
+            return self.provenance.missing | (FIELD_TYPES.keys() - message.model_fields_set)
+        return self.provenance.missing
+
+    @property
+    def latency(self) -> float | None:
+        """Seconds from sent to received, None without a timestamp; as good as the two hosts' clocks agree."""
+        sent = self.sent
+        return None if sent is None else (self.received - sent) / 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What became of the messages of a subscription.
+
+    `received`: handed to the reader.
+    `lost`: lost in transit, and not recovered.
+    `dropped`: arrived, but superseded because this reader was slower (mode "latest" only).
+    `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
+    """
+
+    received: int = 0
+    lost: int = 0
+    dropped: int = 0
+    invalid: int = 0

@@ -1,0 +1,129 @@
+"""Which messages of a publisher's sequence are absent: the one place where losses are counted. Pure, without I/O."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+_NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
+_LARGEST_GAP: Final = 2**30  # a step of more is not a gap: the publisher started again
+_REORDERED: Final = 2**16  # a number that is so much too low is late or a duplicate; more is a restart
+_MAX_PUBLISHERS: Final = 10_000
+SETTLED: Final = 1000
+"""Messages of one publisher in a row after which a stream is followed by number alone."""
+
+
+@dataclass(slots=True, eq=False)
+class _Sequence:
+    """The sequence of one publisher: the number that comes next, and losses that were announced before their gap."""
+
+    publisher: str
+    expected: int
+    announced: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Stream:
+    """One key: the publisher of its last message, and how many in a row came from it."""
+
+    sequence: _Sequence
+    run: int = 0
+
+
+class SequenceTracker:
+    """Follow the sequence numbers of all publishers that a reader hears, and count what is absent.
+
+    There are two sources of knowledge: gaps in the numbers that arrive, and announcements (Zenoh's miss listener) of
+    losses that recovery gave up on, which come before the gap, or without one at the end of a stream.
+    Each message is counted once.
+
+    With `queue_drops` a queue before this tracker drops what its reader is too slow for: then only announced losses
+    are lost in transit, and the rest of a gap was dropped.
+
+    Memory is bounded: the least recently heard of more than `max_publishers` is forgotten, with what was announced for
+    it counted as lost.
+    Not thread-safe.
+    """
+
+    def __init__(self, *, queue_drops: bool = False, max_publishers: int = _MAX_PUBLISHERS) -> None:
+        self.dropped = 0
+        self._queue_drops = queue_drops
+        self._max = max_publishers
+        self._lost = 0
+        self._announced = 0  # the sum of what is announced and not yet seen as a gap
+        self._publishers: OrderedDict[str, _Sequence] = OrderedDict()  # the most recently heard last
+        self._streams: dict[str, _Stream] = {}  # by key
+
+    @property
+    def lost(self) -> int:
+        """Messages that were lost in transit, all publishers together."""
+        return self._lost + self._announced
+
+    def announce(self, publisher: str, count: int) -> None:
+        """Note that messages of a publisher are lost; the gap in its sequence may follow."""
+        sequence = self._publishers.get(publisher)
+        if sequence is None:
+            self._lost += count
+        else:
+            sequence.announced += count
+            self._announced += count
+
+    def arrived(self, stream: str, number: int, publisher: Callable[[], str]) -> int:
+        """Note a message of a stream with its publisher's sequence number; return how many were lost just before it.
+
+        `publisher` returns the publisher's id, which costs more than all the rest; a stream of which 1,000 messages in
+        a row came from one publisher is followed without it, for as long as each number is the expected one.
+        """
+        known = self._streams.get(stream)
+        if known is None or known.run < SETTLED or number != known.sequence.expected:
+            return self._identify(stream, number, publisher())
+        sequence = known.sequence
+        sequence.expected = (number + 1) % _NUMBERS
+        if sequence.publisher in self._publishers:
+            self._publishers.move_to_end(sequence.publisher)
+        return 0
+
+    def skip(self) -> None:
+        """Forget all positions, as messages were taken without a look at their numbers; announced losses stay."""
+        self._lost += self._announced
+        self._announced = 0
+        self._publishers.clear()
+        self._streams.clear()
+
+    def _identify(self, stream: str, number: int, publisher: str) -> int:
+        sequence = self._publishers.get(publisher)
+        if sequence is None:
+            sequence = self._publishers[publisher] = _Sequence(publisher, number)
+            if len(self._publishers) > self._max:
+                self._forget_oldest()
+        self._publishers.move_to_end(publisher)
+        known = self._streams.get(stream)
+        if known is None:
+            known = self._streams[stream] = _Stream(sequence)
+            if len(self._streams) > self._max:
+                del self._streams[next(iter(self._streams))]
+        step = (number - sequence.expected) % _NUMBERS
+        expected = known.sequence is sequence and step == 0
+        known.sequence, known.run = sequence, known.run + 1 if expected else 0
+        if step <= _LARGEST_GAP:
+            sequence.expected = (number + 1) % _NUMBERS
+            return self._close_gap(sequence, step)
+        if _NUMBERS - step > _REORDERED:
+            sequence.expected = (number + 1) % _NUMBERS
+        return 0
+
+    def _close_gap(self, sequence: _Sequence, gap: int) -> int:
+        announced = min(gap, sequence.announced)
+        lost = announced if self._queue_drops else gap
+        sequence.announced -= announced
+        self._announced -= announced
+        self._lost += lost
+        self.dropped += gap - lost
+        return lost
+
+    def _forget_oldest(self) -> None:
+        _, oldest = self._publishers.popitem(last=False)
+        self._lost += oldest.announced
+        self._announced -= oldest.announced

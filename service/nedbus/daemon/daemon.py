@@ -1,0 +1,184 @@
+"""The service: sources in, validated messages out, its status on demand, a clean end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import socket
+import threading
+import time
+from dataclasses import asdict
+from typing import Final
+
+from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, Sample
+from nedbus.errors import ConfigError, ConnectError
+from nedbus.settings import Settings
+from nedbus.sources import LiveSource, Source, parse_source
+from nedbus.transport import Session, dial_endpoint, open_client, open_router
+from nedbus_msgs import decode, provenance_of, status_key
+
+from .clock import SystemClock
+from .status import Role, ServiceStatus, SourceStatus
+from .worker import Worker
+
+_log = logging.getLogger(__name__)
+
+_GRACE: Final = 1.0  # s that a source has to end
+
+
+class Daemon:
+    """Publish the sources of the settings until they are done or `stop` is called.
+
+    `run` blocks and is meant for a thread of its own, so that signals always reach the main thread.
+
+    Raises ConfigError at once for an invalid source.
+    """
+
+    def __init__(self, settings: Settings, *, version: str) -> None:
+        if not settings.source:
+            raise ConfigError(
+                "source", "nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"
+            )
+        self._settings = settings
+        self._version = version
+        self._started = time.time()
+        self._stop = threading.Event()
+        self._changed = threading.Event()
+        self._workers: list[Worker] = []
+        self._registry: PublisherRegistry | None = None
+        # In containers every service may be process 1 of the same host name.
+        self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
+        self.ready = threading.Event()
+        self.role: Role = "client" if settings.is_client else "router"
+        self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
+        self._sources = [(text, self._open_source(text)) for text in settings.source]
+        if settings.until_done and not any(_is_finite(source) for _, source in self._sources):
+            raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
+
+    @property
+    def until_done(self) -> bool:
+        """Whether it ends when its finite sources have ended."""
+        return self._settings.until_done
+
+    @property
+    def status(self) -> ServiceStatus:
+        """The status of the service now."""
+        return ServiceStatus(
+            service=self.id,
+            host=socket.gethostname(),
+            version=self._version,
+            started=self._started,
+            now=time.time(),
+            role=self.role,
+            endpoints=self.endpoints,
+            sources=self.sources,
+        )
+
+    @property
+    def sources(self) -> tuple[SourceStatus, ...]:
+        """The status of each source now."""
+        return tuple(worker.status for worker in self._workers)
+
+    def newest(self) -> list[Sample]:
+        """Return the last message of each address that was published."""
+        publishers = self._registry.publishers if self._registry else []
+        last = [(publisher.address, *publisher.last) for publisher in publishers if publisher.last]
+        return [
+            Sample(decode(payload), address, time.time_ns(), stamp, provenance=provenance_of(encoding))
+            for address, payload, stamp, encoding in last
+        ]
+
+    def stop(self) -> None:
+        """Ask it to end; callable from anywhere, a signal handler included."""
+        self._stop.set()
+        self._changed.set()
+
+    def run(self) -> bool:
+        """Publish until done or stopped; return whether no source failed for good.
+
+        Raises ListenError when the embedded router cannot listen, ConfigError for a mistake in its file.
+        """
+        if self.role == "client":
+            self._log_client()
+        session = self._open()
+        if session is None:
+            return True
+        if self.role == "router":
+            self._log_router()
+        queries = QueryServer(session)
+        registry = self._registry = PublisherRegistry(session, queries, prefix=self._settings.prefix)
+        threads: list[threading.Thread] = []
+        try:
+            queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
+            clock, retry = SystemClock(self._stop), not self._settings.until_done
+            self._workers = [
+                Worker(text, source, registry, clock=clock, retry=retry, on_end=self._changed.set)
+                for text, source in self._sources
+            ]
+            threads = [threading.Thread(target=worker.run, name=worker.text, daemon=True) for worker in self._workers]
+            for thread in threads:
+                thread.start()
+            self.ready.set()
+            self._wait(registry)
+        finally:
+            self._stop.set()
+            deadline = time.monotonic() + _GRACE
+            for thread in threads:
+                thread.join(max(0.0, deadline - time.monotonic()))
+            queries.close()
+            session.close()
+        return not any(worker.status.state == "failed" for worker in self._workers)
+
+    def _open_source(self, text: str) -> Source:
+        settings = self._settings
+        return parse_source(text).open_source(
+            vehicle=settings.vehicle, routers=tuple(map(dial_endpoint, self.endpoints)), tls=settings.tls
+        )
+
+    def _log_client(self) -> None:
+        """Log whose client it is, and what made it one: NEDBUS_CONNECT may be set for scripts."""
+        setter = self._settings.set_by("connect")
+        hint = "" if setter == "connect" else f", as set by {setter}: it starts no router of its own without --listen"
+        _log.info("client of %s%s", ", ".join(self.endpoints), hint)
+
+    def _log_router(self) -> None:
+        connect = self._settings.connect
+        joined = f", joined to {', '.join(connect)}" if connect else ""
+        _log.info("router on %s%s", ", ".join(self.endpoints), joined)
+
+    def _open(self) -> Session | None:
+        """Open the session; a client waits for its router for as long as it takes."""
+        if self.role == "router":
+            settings = self._settings
+            return open_router(listen=settings.listen, connect=settings.connect, config_file=settings.router_config)
+        logged = False
+        while not self._stop.is_set():
+            try:
+                return open_client(self.endpoints, timeout=1.0, tls=self._settings.tls, stop=self._stop)
+            except ConnectError as exc:
+                if not logged:
+                    _log.warning("%s; still trying", exc)
+                logged = True
+        return None
+
+    def _wait(self, registry: PublisherRegistry) -> None:
+        """Wait for `stop`, or for the end of all finite sources and for their readers to have all of it."""
+        while not self._stop.is_set():
+            if self._settings.until_done:
+                finite = [worker for worker in self._workers if _is_finite(worker.source)]
+                if all(worker.status.ended for worker in finite):
+                    # A reader that missed the very last message learns it from a heartbeat.
+                    self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
+                    registry.flush(registry.publishers, stop=self._stop)
+                    return
+            self._changed.wait()
+            self._changed.clear()
+
+
+def _is_finite(source: Source) -> bool:
+    return not isinstance(source, LiveSource) and source.finite
+
+
+def _is_paced(source: Source) -> bool:
+    return isinstance(source, LiveSource) or source.speed is not None

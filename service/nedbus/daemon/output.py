@@ -1,0 +1,160 @@
+"""The output of one source: its messages validated, then published or rejected, with the state of each stream."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from pydantic import ValidationError
+
+from nedbus.client import Publisher, PublisherRegistry, StreamHealth
+from nedbus.errors import AddressInUseError
+from nedbus.sources import Rejection, SourceMessage
+from nedbus_msgs import Address, describe, upgrade
+
+from .clock import Clock
+from .status import StreamStatus
+
+_log = logging.getLogger(__name__)
+
+_STALE: Final = 3.0  # s without a message after which a live address is no longer published
+_MAX_ADDRESSES: Final = 1000  # of one live source
+_MAX_STREAMS: Final = 100  # in a status: it must fit a message
+_MAX_WARNINGS: Final = 50  # rejections that are remembered, one for each `where`
+_MAX_TEXT: Final = 300  # characters of a rejection that are logged: any peer may have sent it
+_MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
+
+
+@dataclass(slots=True, eq=False)
+class _Stream:
+    """One address: its publisher while it is published, its health, and when a live source heard it last."""
+
+    health: StreamHealth
+    publisher: Publisher | None = None
+    heard: float | None = None
+
+
+class SourceOutput:
+    """Publish what a source delivers; `name` is how the log calls the source, `text` how the user wrote it."""
+
+    def __init__(self, name: str, text: str, registry: PublisherRegistry, clock: Clock) -> None:
+        self.published = self.rejected = self.lost = self.reboots = 0
+        self._name = name
+        self._text = text
+        self._kind = text.partition(":")[0]
+        self._registry = registry
+        self._clock = clock
+        self._streams: dict[Address, _Stream] = {}
+        self._warnings: dict[str, str] = {}  # by `where`
+        self._invalid = self._live = 0
+
+    @property
+    def addresses(self) -> list[Address]:
+        """What is published now."""
+        return [address for address, stream in list(self._streams.items()) if stream.publisher is not None]
+
+    @property
+    def stale(self) -> list[Address]:
+        """What a live source published, until nothing arrived any more."""
+        streams = list(self._streams.items())
+        return [address for address, stream in streams if stream.publisher is None and stream.heard is not None]
+
+    @property
+    def streams(self) -> tuple[StreamStatus, ...]:
+        """The health of up to 100 streams."""
+        streams = list(self._streams.items())[:_MAX_STREAMS]
+        return tuple(StreamStatus(str(address), stream.health.snapshot()) for address, stream in streams)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why something was rejected, once for each place that it came from."""
+        return tuple(self._warnings.values())
+
+    def claim(self, address: Address, *, lossless: bool = False) -> None:
+        """Make sure that an address has a publisher; raise AddressInUseError if another source of ours has it."""
+        stream = self._streams.get(address)
+        if stream is None:
+            stream = self._streams[address] = _Stream(StreamHealth(address.topic))
+        if stream.publisher is not None:
+            return
+        if self._registry.is_alive(address):
+            _log.warning("%s: %s is published by another process too: readers get both", self._name, address)
+        stream.publisher = self._registry.publisher(address, lossless=lossless, source=self._kind)
+
+    def release(self, *, keep: Iterable[Address] = ()) -> None:
+        """Close the publishers of all addresses but those to keep."""
+        kept = set(keep)
+        for address, stream in self._streams.items():
+            if address not in kept and stream.publisher is not None:
+                stream.publisher.close()
+                stream.publisher = None
+
+    def publish(self, message: SourceMessage) -> None:
+        """Validate a message whose address is claimed, and publish or reject it."""
+        stream = self._streams[message.address]
+        if stream.publisher is None:
+            raise KeyError(message.address)
+        try:
+            valid = upgrade(message.fields)
+        except ValidationError as exc:
+            self._reject_invalid(message, describe(exc))
+            return
+        stream.publisher.publish(valid)
+        self.published += 1
+        stream.health.add(valid, received=self._clock.time_ns(), lost=message.lost)
+
+    def publish_live(self, message: SourceMessage) -> None:
+        """Publish a message of a live source, and claim its address if need be."""
+        self.lost += message.lost
+        self.reboots += message.rebooted
+        address = message.address
+        stream = self._streams.get(address)
+        if stream is None or stream.publisher is None:
+            back = stream is not None and stream.heard is not None
+            if not back and self._live >= _MAX_ADDRESSES:
+                self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is left out"))
+                return
+            try:
+                self.claim(address)
+            except AddressInUseError as exc:
+                self.reject(Rejection(str(address), str(exc)))
+                return
+            self._live += not back
+            _log.info("%s: %s %s", self._name, address, "is back" if back else "is published")
+        self._streams[address].heard = self._clock.now()
+        self.publish(message)
+
+    def expire_stale(self) -> bool:
+        """Stop publishing live addresses from which nothing arrived for 3 s; return whether any is left."""
+        now = self._clock.now()
+        fresh = {
+            address
+            for address, stream in self._streams.items()
+            if stream.heard is not None and now - stream.heard < _STALE
+        }
+        for address in self.addresses:
+            if address not in fresh:
+                _log.warning("%s: %s is stale: nothing arrived for %.0f s", self._name, address, _STALE)
+        self.release(keep=fresh)
+        return bool(fresh)
+
+    def reject(self, rejection: Rejection) -> None:
+        """Count something that is not a message, log it once for each place, and report it if it has an address."""
+        self.rejected += rejection.count
+        where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
+        if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
+            self._warnings[where] = f"{where}: {reason}"
+            _log.warning("%s: %s: rejected: %s", self._name, where, reason)
+        if rejection.address is not None:
+            self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
+
+    def _reject_invalid(self, message: SourceMessage, reason: str) -> None:
+        self.rejected += 1
+        self._invalid += 1
+        if self._invalid <= _MAX_LOGGED:
+            last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
+            _log.warning("%s: %s rejected: %s%s", self._name, message.address, reason, last)
+        report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
+        self._registry.reject(message.address, report)

@@ -1,0 +1,69 @@
+"""The status of a service, as `nedbus info` shows it and `nedbus/@service/<id>/status` answers it in JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from nedbus.client import Health
+
+State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
+Role = Literal["router", "client"]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatus:
+    """The health of one stream that is published."""
+
+    address: str
+    health: Health
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatus:
+    """The status of one source.
+
+    `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
+    `lost`: messages that were lost before they reached a live source, as far as it can count; `reboots` of vehicles.
+    `stale`: addresses that a live source published, until nothing arrived for 3 s.
+    `retries`: how often it failed and was started again; `error`: why it failed last.
+    `streams`: the health of each stream that is published, of up to 100 of them.
+    """
+
+    source: str
+    state: State
+    addresses: tuple[str, ...]
+    stale: tuple[str, ...]
+    published: int
+    rejected: int
+    lost: int
+    reboots: int
+    done: int
+    total: int | None
+    retries: int
+    summary: str
+    warnings: tuple[str, ...]
+    error: str | None
+    streams: tuple[StreamStatus, ...]
+
+    @property
+    def ended(self) -> bool:
+        """Whether it will publish no more."""
+        return self.state in {"done", "failed"}
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceStatus:
+    """The status of a service.
+
+    Times are seconds since the epoch; `host` is the name of its host, or of its container.
+    """
+
+    service: str
+    host: str
+    version: str
+    started: float
+    now: float
+    role: Role
+    endpoints: tuple[str, ...]
+    sources: tuple[SourceStatus, ...]

@@ -1,0 +1,158 @@
+"""The states of one source: starting, waiting, running, retrying after a failure, done or failed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from nedbus.client import PublisherRegistry
+from nedbus.errors import ClosedError, NedbusError
+from nedbus.sources import LiveSource, ReplayRun, ReplaySource, Source, SourceMessage
+
+from .clock import Clock
+from .live import listen
+from .output import SourceOutput
+from .replay import replay
+from .status import SourceStatus, State
+
+_log = logging.getLogger(__name__)
+
+_BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a source that failed is started again
+_MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must not be read thousands of times a second
+_POLL: Final = 0.05  # s between two checks for a reader
+
+
+class Worker:
+    """Run one source until it ends or its clock is stopped; `run` is meant for a thread of its own.
+
+    With `retry` a source that fails is started again, with growing pauses; `on_end` is called when `run` returns.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        source: Source,
+        registry: PublisherRegistry,
+        *,
+        clock: Clock,
+        retry: bool,
+        on_end: Callable[[], object],
+    ) -> None:
+        self.text = text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
+        self.source = source
+        self._name = self.text.rstrip(":")  # as the log calls it
+        self._registry = registry
+        self._clock = clock
+        self._retry = retry
+        self._on_end = on_end
+        self._output = SourceOutput(self._name, self.text, registry, clock)
+        self._run: ReplayRun | None = None
+        self._state: State = "starting"
+        self._error: str | None = None
+        self._done = self._retries = 0
+
+    @property
+    def status(self) -> SourceStatus:
+        """The status of the source now."""
+        run, output = self._run, self._output
+        return SourceStatus(
+            source=self.text,
+            state=self._state,
+            addresses=tuple(map(str, run.addresses if run else output.addresses)),
+            stale=tuple(map(str, output.stale)),
+            published=output.published,
+            rejected=output.rejected,
+            lost=output.lost,
+            reboots=output.reboots,
+            done=self._done,
+            total=run.total if run else None,
+            retries=self._retries,
+            summary=run.summary if run else "",
+            warnings=run.warnings if run else output.warnings,
+            error=self._error,
+            streams=output.streams,
+        )
+
+    def run(self) -> None:
+        """Run the source, again if it loops or fails, until it is done or stopped."""
+        failures = 0
+        try:
+            while not self._clock.stopped:
+                start = self._clock.now()
+                try:
+                    self._run_once()
+                except ClosedError:
+                    return
+                except NedbusError as exc:
+                    self._fail(str(exc))
+                except Exception as exc:  # noqa: BLE001 - a fault in one source must not stop the others
+                    _log.exception("%s: an unexpected error", self._name)
+                    self._fail(f"an unexpected {type(exc).__name__}: {exc}")
+                else:
+                    if isinstance(self.source, LiveSource) or not self.source.loop:
+                        self._end("done")
+                        return
+                    failures = 0
+                    self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
+                    continue
+                if not self._retry:
+                    self._end("failed")
+                    return
+                if self._clock.now() - start > _BACKOFF[-1]:
+                    failures = 0  # it worked for a while
+                self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
+                failures += 1
+        finally:
+            self._on_end()
+
+    def _run_once(self) -> None:
+        if isinstance(self.source, LiveSource):
+            listen(self.source, self._output, on_state=self._set_state, clock=self._clock)
+        else:
+            self._run_replay(self.source)
+
+    def _run_replay(self, source: ReplaySource) -> None:
+        run = source.open()
+        first = self._run is None
+        if self._run is None or self._run.summary != run.summary:
+            _log.info("%s: %s", self._name, run.summary)
+            for warning in run.warnings:
+                _log.warning("%s: %s", self._name, warning)
+        self._run, self._done = run, 0
+        if source.wait and first:
+            self._wait_for_reader(run)
+        self._output.release(keep=run.addresses)
+        for address in run.addresses:
+            self._output.claim(address, lossless=source.speed is None)
+        self._set_state("running")
+        replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
+
+    def _publish(self, message: SourceMessage) -> None:
+        self._output.publish(message)
+        self._done += 1
+
+    def _wait_for_reader(self, run: ReplayRun) -> None:
+        self._state = "waiting"
+        _log.info("%s: waiting for a subscriber", self._name)
+        while not self._registry.is_read(run.addresses) and not self._clock.wait(_POLL):
+            pass
+
+    def _set_state(self, state: State) -> None:
+        if state == "waiting" and self._state in {"starting", "retrying"}:
+            _log.info("%s: listening", self._name)
+        self._state, self._error = state, None
+
+    def _end(self, state: State) -> None:
+        if not self._clock.stopped:
+            self._state = state
+            output = self._output
+            _log.info("%s: %s, %d published, %d rejected", self._name, state, output.published, output.rejected)
+
+    def _fail(self, reason: str) -> None:
+        """Note why it failed, and release all addresses: another source may need them meanwhile."""
+        self._error = reason
+        self._state = "retrying"
+        self._retries += 1
+        _log.error("%s", reason)
+        self._output.release()

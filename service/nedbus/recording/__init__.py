@@ -1,0 +1,58 @@
+"""Recordings and logs as files: write and read MCAP, read .ulg, load either as arrays, and plot them.
+
+Each name loads its module when it is first used: MCAP files and plots need extras, and NumPy is slow to import.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+if TYPE_CHECKING:
+    from .arrays import addresses_of, read
+    from .conversion import convert
+    from .formats import SUFFIXES, format_of
+    from .plot import MAX_STREAMS, draw
+    from .reader import RecordedMessage, RecordedStream, RecordingReader
+    from .recorder import Recorder
+    from .ulog import UlogColumns, read_ulog
+    from .writer import RecordingWriter
+else:
+    # No submodule has the name of an export: importing it would replace the export.
+    __getattr__ = lazy_exports(
+        __name__,
+        {
+            "MAX_STREAMS": ("plot", "plot"),
+            "SUFFIXES": ("", "formats"),
+            "RecordedMessage": ("mcap", "reader"),
+            "RecordedStream": ("mcap", "reader"),
+            "Recorder": ("mcap", "recorder"),
+            "RecordingReader": ("mcap", "reader"),
+            "RecordingWriter": ("mcap", "writer"),
+            "UlogColumns": ("", "ulog"),
+            "addresses_of": ("", "arrays"),
+            "convert": ("mcap", "conversion"),
+            "draw": ("plot", "plot"),
+            "format_of": ("", "formats"),
+            "read": ("", "arrays"),
+            "read_ulog": ("", "ulog"),
+        },
+    )
+
+__all__ = [
+    "MAX_STREAMS",
+    "SUFFIXES",
+    "RecordedMessage",
+    "RecordedStream",
+    "Recorder",
+    "RecordingReader",
+    "RecordingWriter",
+    "UlogColumns",
+    "addresses_of",
+    "convert",
+    "draw",
+    "format_of",
+    "read",
+    "read_ulog",
+]

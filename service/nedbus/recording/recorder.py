@@ -1,0 +1,66 @@
+"""Record what a subscription receives."""
+
+from __future__ import annotations
+
+import threading
+import time
+from itertools import repeat
+from pathlib import Path
+from typing import Final
+
+from nedbus.client import Batch, Subscription
+from nedbus.errors import ClosedError, NoDataError
+
+from .writer import RecordingWriter
+
+_FLUSH_INTERVAL: Final = 1.0  # s: what a power cut costs at most
+_POLL_INTERVAL: Final = 0.2  # s between two checks of whether to stop
+
+
+class Recorder:
+    """Write every message of a subscription of mode "every" to a new MCAP file.
+
+    Raises OutputError when the file exists already or cannot be written.
+    """
+
+    def __init__(self, subscription: Subscription, path: Path) -> None:
+        self._subscription = subscription
+        self._writer = RecordingWriter(path)
+
+    @property
+    def status(self) -> str:
+        """What was recorded so far, in one line."""
+        counts = self._subscription.counts
+        trouble = ", ".join(
+            f"{count} {name}" for count, name in ((counts.lost, "lost"), (counts.invalid, "invalid")) if count
+        )
+        return f"{self._writer.messages} messages" + (f", {trouble}" if trouble else "")
+
+    def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
+        """Record until `stop` is set, for `duration` seconds, or until the subscription is closed."""
+        now = time.monotonic()
+        end = float("inf") if duration is None else now + duration
+        next_flush = now + _FLUSH_INTERVAL
+        with self._writer:
+            while not stop.is_set() and now < end:
+                try:
+                    self._write(self._subscription.receive_batch(min(_POLL_INTERVAL, end - now)))
+                except NoDataError:
+                    pass
+                except ClosedError:
+                    return
+                now = time.monotonic()
+                if now >= next_flush:
+                    self._writer.flush()
+                    next_flush = now + _FLUSH_INTERVAL
+
+    def _write(self, batch: Batch) -> None:
+        received = batch.received
+        addresses = (batch.addresses[index] for index in batch.address_index.tolist())
+        self._writer.write(
+            batch.messages,
+            zip(addresses, batch.provenances, strict=True),
+            logged=repeat(received),
+            published=[time if time > 0 else received for time in batch.sent.tolist()],
+            sequence=batch.sequence.tolist(),
+        )

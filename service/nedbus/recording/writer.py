@@ -1,0 +1,165 @@
+"""Write MCAP files that Foxglove, PlotJuggler and any MCAP reader open: CDR messages with their definition.
+
+A file is complete after every flush: its end is written behind the last chunk, and overwritten by the next one.
+So a power cut costs the messages since the last flush, and never the file.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterable
+from itertools import repeat
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Final, Self, cast
+
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from nedbus.errors import OutputError
+from nedbus_msgs import CURRENT, ROS2_TYPE, Address, Provenance, message_definition
+from nedbus_msgs.arrays import MessageArray, encode_cdr_array
+
+_CHUNK: Final = 2**23  # bytes; a flush every second makes smaller ones
+_MAX_PENDING: Final = 2**24  # bytes that wait for a flush
+_END: Final = (
+    struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
+)
+
+
+class RecordingWriter:
+    """Write messages to a new MCAP file; a context manager that finishes it.
+
+    The file is in the layout of PX4 1.16 to main, one channel for each address and provenance.
+
+    Raises OutputError when the file exists already, or cannot be written: then what was flushed can still be read.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.messages = 0
+        try:
+            self._file = _AppendFile(self.path)
+        except OSError as exc:
+            raise OutputError(self.path, exc) from exc
+        # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
+        self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=_CHUNK)
+        self._writer.start(profile="ros2", library="nedbus")
+        self._schema = self._writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(CURRENT.name).encode())
+        self._channels: dict[tuple[Address, Provenance], int] = {}
+
+    def write(
+        self,
+        messages: MessageArray,
+        streams: Iterable[tuple[Address, Provenance]],
+        *,
+        logged: Iterable[int],
+        published: Iterable[int],
+        sequence: Iterable[int] = repeat(0),
+    ) -> None:
+        """Write messages, each with its address and provenance, and when it was recorded and published [ns]."""
+        payloads = encode_cdr_array(messages)
+        size = payloads.itemsize
+        data = payloads.tobytes()
+        starts = range(0, len(data), size)
+        add = self._writer.add_message
+        try:
+            for start, stream, log_time, time, number in zip(
+                starts, streams, logged, published, sequence, strict=False
+            ):
+                channel = self._channels.get(stream) or self._open_channel(*stream)
+                add(channel, log_time, data[start : start + size], time, max(0, number) % 2**32)
+        except OSError as exc:
+            raise OutputError(self.path, exc) from exc
+        self.messages += len(messages)
+
+    def flush(self) -> None:
+        """Sync everything to the disk, so that a power cut loses none of it."""
+        try:
+            self._writer.flush()
+            self._file.sync()
+        except OSError as exc:
+            raise OutputError(self.path, exc) from exc
+
+    def close(self) -> None:
+        """Finish the file; a second call does nothing."""
+        if self._file.closed:
+            return
+        try:
+            self._writer.finish()
+            self._file.sync(end=b"")
+        except OSError as exc:
+            raise OutputError(self.path, exc) from exc
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, OutputError):
+            self._file.close()  # finishing it would fail again
+        else:
+            self.close()
+
+    def _open_channel(self, address: Address, provenance: Provenance) -> int:
+        # ROS 2 tools recognise their bags by the first key.
+        metadata = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
+        if address.instance is not None:
+            metadata["instance"] = str(address.instance)
+        if provenance.source is not None:
+            metadata["source"] = provenance.source
+        if provenance.missing:
+            metadata["missing"] = " ".join(sorted(provenance.missing))
+        topic = f"/{address}"
+        channel = self._writer.register_channel(topic, "cdr", self._schema, metadata)
+        self._channels[address, provenance] = channel
+        return channel
+
+
+class _AppendFile:
+    """A file for the MCAP writer that has a valid end after each `sync`."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("xb", buffering=0)
+        self._pending = bytearray()
+        self._offset = 0
+        self.closed = False
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        if len(self._pending) > _MAX_PENDING:
+            self.sync()
+        return len(data)
+
+    def tell(self) -> int:
+        return self._offset + len(self._pending)
+
+    def flush(self) -> None:
+        """Do nothing: `sync` writes to the disk."""
+
+    def sync(self, end: bytes = _END) -> None:
+        """Write what is pending, and an end behind it, to the disk; restore the previous end if that fails."""
+        pending = bytes(self._pending)
+        self._pending.clear()
+        try:
+            self._write_at_offset(pending + end)
+            self._file.truncate(self._offset + len(pending) + len(end))
+        except OSError:
+            self._file.truncate(self._offset)
+            self._write_at_offset(_END)
+            raise
+        os.fsync(self._file.fileno())
+        self._offset += len(pending)
+
+    def _write_at_offset(self, data: bytes) -> None:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.pwrite(self._file.fileno(), rest, self._offset + len(data) - len(rest)) :]
+
+    def close(self) -> None:
+        self.closed = True
+        self._file.close()

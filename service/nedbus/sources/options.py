@@ -1,0 +1,102 @@
+"""The options of each kind of source, as Pydantic models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+from nedbus_msgs import LAYOUTS, check_vehicle
+
+
+def _check_vehicle(name: str) -> str:
+    check_vehicle(name)
+    return name
+
+
+def _parse_vehicles(text: object) -> object:
+    """Parse `NAME:VEHICLE,NAME:VEHICLE`."""
+    if not isinstance(text, str):
+        return text
+    parts = [part.strip().rpartition(":") for part in text.split(",")]
+    vehicles = {name.strip("/"): vehicle for name, _, vehicle in parts}
+    for vehicle in vehicles.values():
+        check_vehicle(vehicle)
+    if "" in vehicles or len(vehicles) < len(parts):
+        raise ValueError(text)
+    return vehicles
+
+
+def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
+    """Raise ValueError unless all names are MAVLink system ids and no vehicle occurs twice."""
+    is_valid = all(name.isdecimal() and 0 < int(name) < 256 for name in vehicles)
+    if not is_valid or len(set(vehicles.values())) < len(vehicles):
+        raise ValueError(vehicles)
+    return vehicles
+
+
+def _check_layout(name: str) -> str:
+    if name not in LAYOUTS:
+        raise ValueError(name)
+    return name
+
+
+Vehicle = Annotated[str, AfterValidator(_check_vehicle)]
+Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
+
+
+class Options(BaseModel):
+    """What the options of all kinds have in common."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ReplayOptions(Options):
+    """Options of every replay."""
+
+    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
+    speed: Annotated[float, Field(ge=0.001, le=1000)] | Literal["max"] = Field(
+        1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive it"
+    )
+    wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
+
+
+class RecordedOptions(ReplayOptions):
+    """Options of `ulog:` and `mcap:`."""
+
+    loop: bool = Field(False, description="1 to start again at the end, or 0")
+
+
+class SimulatorOptions(ReplayOptions):
+    """Options of `sim:`."""
+
+    seed: int = Field(0, description="a whole number: same seed, same flight")
+    duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
+        None, description="seconds, 0.01 to 1e8; endless without it"
+    )
+
+
+class Px4ZenohOptions(Options):
+    """Options of `px4-zenoh:`."""
+
+    domain: Annotated[int, Field(ge=0, le=232)] | None = Field(
+        None, description="a ROS domain, 0 to 232; all without it"
+    )
+    vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
+    vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
+    layout: Annotated[str, AfterValidator(_check_layout)] | None = Field(
+        None, description=f"the layout of keys without a type hash: {', '.join(LAYOUTS)}"
+    )
+
+
+class MavlinkOptions(Options):
+    """Options of `mavlink:`."""
+
+    rate: Annotated[float, Field(ge=0.1, le=200)] = Field(
+        30.0, description="positions a second to request from the vehicle, 0.1 to 200"
+    )
+    baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(57600, description="of a serial port, 300 to 12000000")
+    vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
+        {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
+    )

@@ -1,0 +1,202 @@
+"""The simulated estimator: errors, an outage of GPS and resets, and the messages that it sends.
+
+Every lap of 120 s has what estimates have in real flights:
+
+    t = 15 s         the heading is aligned: a heading reset
+    t = 60 to 75 s   no GPS: dead reckoning, growing error, xy invalid after 10 s; at its end resets of xy and vxy
+    t = 90 s         a reset of z
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from random import Random
+from typing import Final
+
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, wrap
+
+from .simulated_trajectory import Truth
+
+TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
+LAP: Final = 120.0  # s
+
+_HEADING_RESET: Final = 15.0  # s into a lap
+_OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
+_MAX_DEAD_RECKONING: Final = 10.0  # s after which the position is no longer valid
+_Z_RESET: Final = 90.0  # s into a lap
+_HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap: the error that the next heading reset corrects
+_ORIGIN_SET: Final = 2.0  # s after the start: the global origin is known
+_REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
+_BOOT: Final = 10_000_000  # us since boot at the start
+_DELAY: Final = 5_000  # us from the sensor data to the estimate
+_SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
+
+
+@dataclass(slots=True)
+class _Resets:
+    """The reset counters and the last deltas of an estimate."""
+
+    delta_xy: tuple[float, float] = (0.0, 0.0)
+    xy: int = 0
+    delta_z: float = 0.0
+    z: int = 0
+    delta_vxy: tuple[float, float] = (0.0, 0.0)
+    vxy: int = 0
+    delta_heading: float = 0.0
+    heading: int = 0
+
+
+@dataclass(slots=True)
+class Estimator:
+    """An estimate of the truth with errors that wander, drift without GPS, and are reset.
+
+    `noise`: standard deviation of its position error [m]; `aided`: it has position aiding in the outage too.
+    """
+
+    name: str
+    seed: int
+    noise: float
+    aided: bool = False
+    _resets: _Resets = field(default_factory=_Resets)
+    _random: Random = field(init=False)
+    _error: list[float] = field(init=False)
+    _drift: list[float] = field(init=False)
+    _heading_error: float = field(init=False)
+    _gyro: float = 0.0
+    _last_heading: float | None = None
+    _dead_reckoning: float = 0.0  # s since the last position aiding
+
+    def __post_init__(self) -> None:
+        self._random = Random(f"{self.seed}/{self.name}")
+        self._error = [self._random.gauss(0.0, self.noise) for _ in range(3)]
+        self._drift = [0.0, 0.0]
+        self._heading_error = 0.0 if self.aided else self._random.choice((-1, 1)) * self._random.uniform(0.1, 0.3)
+
+    def step(self, lap_time: float, truth: Truth) -> None:
+        """Advance by one tick."""
+        if not self.aided and _OUTAGE[0] <= lap_time < _OUTAGE[1]:
+            self._drift_away()
+        elif self._dead_reckoning:
+            self._reset_position()
+        else:
+            self._wander()
+        if not self.aided and _is_at(lap_time, _HEADING_RESET):
+            self._resets.delta_heading, self._heading_error = -self._heading_error, 0.0
+            self._resets.heading = (self._resets.heading + 1) % 256
+        if not self.aided and _is_at(lap_time, _Z_RESET):
+            delta = self._random.gauss(0.0, 1.0) - self._error[2]
+            self._error[2] += delta
+            self._resets.delta_z = delta
+            self._resets.z = (self._resets.z + 1) % 256
+        if not self.aided and _is_at(lap_time, _HEADING_DISTURBED):
+            self._heading_error = self._random.gauss(0.0, 0.15)
+        turned = wrap(truth.heading - self._last_heading) if self._last_heading is not None else 0.0
+        self._gyro = wrap(self._gyro + turned + self._random.gauss(0.0, 2e-5))
+        self._last_heading = truth.heading
+
+    def fields(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the message of this moment; EKF2's limits are infinite."""
+        x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
+        vx, vy = truth.velocity[0] + self._drift[0], truth.velocity[1] + self._drift[1]
+        vz = truth.velocity[2]
+        xy_valid = self._dead_reckoning < _MAX_DEAD_RECKONING
+        spread = self.noise * 2 + 0.02 * self._dead_reckoning**2
+        resets = self._resets
+        unlimited = math.inf
+        return {
+            **_timestamps(time),
+            "xy_valid": xy_valid, "z_valid": True, "v_xy_valid": xy_valid, "v_z_valid": True,
+            "x": x, "y": y, "z": z,
+            "delta_xy": resets.delta_xy, "xy_reset_counter": resets.xy,
+            "delta_z": resets.delta_z, "z_reset_counter": resets.z,
+            "vx": vx, "vy": vy, "vz": vz, "z_deriv": vz + self._random.gauss(0.0, 0.02),
+            "delta_vxy": resets.delta_vxy, "vxy_reset_counter": resets.vxy,
+            "delta_vz": 0.0, "vz_reset_counter": 0,
+            **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
+            "heading": wrap(truth.heading + self._heading_error), "heading_var": 0.001 + self._heading_error**2,
+            "unaided_heading": self._gyro,
+            "delta_heading": resets.delta_heading, "heading_reset_counter": resets.heading,
+            "heading_good_for_control": resets.heading > 0 or self.aided, "tilt_var": 1e-4,
+            **_origin(known=time >= _ORIGIN_SET),
+            **_terrain(z),
+            "eph": spread, "epv": self.noise * 3,
+            "evh": self.noise / 2 + 0.05 * self._dead_reckoning, "evv": self.noise / 2,
+            "dead_reckoning": self._dead_reckoning > 0,
+            "vxy_max": unlimited, "vz_max": unlimited,
+            "hagl_min": unlimited, "hagl_max_z": unlimited, "hagl_max_xy": unlimited,
+        }  # fmt: skip
+
+    def _wander(self) -> None:
+        keep = math.exp(-TICK / 20.0)
+        kick = self.noise * math.sqrt(1.0 - keep * keep)
+        self._error = [keep * error + self._random.gauss(0.0, kick) for error in self._error]
+
+    def _drift_away(self) -> None:
+        self._dead_reckoning += TICK
+        for axis in (0, 1):
+            self._drift[axis] += self._random.gauss(0.02, 0.2) * TICK
+            self._error[axis] += self._drift[axis] * TICK
+
+    def _reset_position(self) -> None:
+        """Reset position and velocity to those of GPS, which is back."""
+        new = [self._random.gauss(0.0, self.noise) for _ in range(2)]
+        resets = self._resets
+        resets.delta_xy = (new[0] - self._error[0], new[1] - self._error[1])
+        resets.delta_vxy = (-self._drift[0], -self._drift[1])
+        resets.xy, resets.vxy = (resets.xy + 1) % 256, (resets.vxy + 1) % 256
+        self._error[:2], self._drift, self._dead_reckoning = new, [0.0, 0.0], 0.0
+
+
+def truth_fields(time: float, truth: Truth) -> dict[str, object]:
+    """Return the groundtruth message: variances and limits are 0, as simulators send them."""
+    zero = """z_deriv delta_z delta_vz heading_var delta_heading tilt_var eph epv evh evv
+              vxy_max vz_max hagl_min hagl_max_z hagl_max_xy"""
+    return {
+        **dict.fromkeys(zero.split(), 0.0),
+        **dict.fromkeys((name for name, kind in FIELD_TYPES.items() if kind == "uint8"), 0),
+        "dead_reckoning": False,
+        **_timestamps(time),
+        **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
+        **dict(zip(("x", "y", "z"), truth.position, strict=True)),
+        **dict(zip(("vx", "vy", "vz"), truth.velocity, strict=True)),
+        **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
+        "z_deriv": truth.velocity[2],
+        "delta_xy": (0.0, 0.0),
+        "delta_vxy": (0.0, 0.0),
+        "heading": truth.heading,
+        "unaided_heading": truth.heading,
+        **_origin(known=True),
+        **_terrain(truth.position[2]),
+    }
+
+
+def _timestamps(time: float) -> dict[str, object]:
+    timestamp = _BOOT + round(time * 1e6)
+    return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
+
+
+def _origin(*, known: bool) -> dict[str, object]:
+    latitude, longitude, altitude = _REFERENCE if known else (math.nan,) * 3
+    return {
+        "xy_global": known, "z_global": known, "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6) if known else 0,
+        "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
+    }  # fmt: skip
+
+
+def _terrain(z: float) -> dict[str, object]:
+    """Return the fields of a distance sensor above flat ground."""
+    distance = max(0.1, -z)
+    in_range = distance < _SENSOR_RANGE
+    return {
+        "dist_bottom_valid": in_range,
+        "dist_bottom": distance,
+        "dist_bottom_var": 0.01,
+        "delta_dist_bottom": 0.0,
+        "dist_bottom_reset_counter": 0,
+        "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
+    }
+
+
+def _is_at(lap_time: float, moment: float) -> bool:
+    return moment <= lap_time + TICK / 2 < moment + TICK

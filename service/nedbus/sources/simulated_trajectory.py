@@ -1,0 +1,70 @@
+"""The path of the simulated vehicle: take-off, then figures of eight at 20 m."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from random import Random
+from typing import Final
+
+from nedbus_msgs import wrap
+
+_ALTITUDE: Final = 20.0  # m
+_SIZE: Final = 40.0  # m
+_STEP: Final = 1e-3  # s, of the derivatives
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad]."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    heading: float
+
+
+class Trajectory:
+    """The path as a function of time; the seed sets its direction."""
+
+    def __init__(self, seed: int) -> None:
+        self._direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
+
+    def at(self, time: float) -> Truth:
+        """Return the truth at a time [s] since the start."""
+        before, now, after = (self._position(time + offset) for offset in (-_STEP, 0.0, _STEP))
+        north, east, down = zip(before, now, after, strict=True)
+        velocity = (_first_derivative(north), _first_derivative(east), _first_derivative(down))
+        acceleration = (_second_derivative(north), _second_derivative(east), _second_derivative(down))
+        moving = math.hypot(velocity[0], velocity[1]) > 0.5
+        heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(self._direction + math.pi / 4)
+        return Truth(now, velocity, acceleration, heading)
+
+    def _position(self, time: float) -> Vector:
+        climb = _smoothstep(time / 10.0)
+        # The phase starts slowly after the climb and then advances evenly, one figure a minute.
+        late = max(0.0, time - 8.0)
+        phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
+        along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
+        cos, sin = math.cos(self._direction), math.sin(self._direction)
+        return (
+            along * cos - across * sin,
+            along * sin + across * cos,
+            -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2),
+        )
+
+
+def _smoothstep(part: float) -> float:
+    """Rise from 0 to 1 with continuous acceleration."""
+    part = min(1.0, max(0.0, part))
+    return part**3 * (10 - 15 * part + 6 * part**2)
+
+
+def _first_derivative(points: tuple[float, ...]) -> float:
+    return (points[2] - points[0]) / (2 * _STEP)
+
+
+def _second_derivative(points: tuple[float, ...]) -> float:
+    return (points[2] - 2 * points[1] + points[0]) / _STEP**2

@@ -1,0 +1,114 @@
+"""The two kinds of sources, replays and live ones, and what they yield."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+from nedbus.transport import Tls
+from nedbus_msgs import Address
+
+
+@dataclass(frozen=True, slots=True)
+class SourceMessage:
+    """One message as a source has it, not validated yet.
+
+    `due`: in a replay, seconds since the start of its recording; a live message is due when it arrives.
+    `fields`: by name, of any PX4 layout.
+    `lost`: messages that were lost between the vehicle and the source, just before this one.
+    `rebooted`: this is the first message after the vehicle rebooted.
+    """
+
+    due: float
+    address: Address
+    fields: Mapping[str, object]
+    lost: int = 0
+    rebooted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """Input that a live source could not turn into a message.
+
+    `where`: the key, the link or the address that it came from; the log names each one once.
+    `count`: for how many messages it stands.
+    """
+
+    where: str
+    reason: str
+    address: Address | None = None
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRun:
+    """One run of a replay.
+
+    `messages`: in order of `due`; can be iterated once.
+    `addresses`: every address that occurs in the messages.
+    `total`: the number of messages, None if they never end.
+    `summary`: a description for the log; `warnings`: damage that does not prevent the replay.
+    """
+
+    messages: Iterator[SourceMessage]
+    addresses: tuple[Address, ...]
+    total: int | None
+    summary: str
+    warnings: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class SourceContext:
+    """What a source may need of the service that runs it.
+
+    `vehicle`: the default for a source that has no vehicle name of its own.
+    `routers`: endpoints of the service's router, and `tls` to connect to them.
+    """
+
+    vehicle: str
+    routers: tuple[str, ...] = ()
+    tls: Tls | None = None
+
+
+class ReplaySource(Protocol):
+    """A source that can be replayed, once or repeatedly."""
+
+    @property
+    def finite(self) -> bool:
+        """Whether it ends by itself."""
+        ...
+
+    @property
+    def loop(self) -> bool:
+        """Whether it starts again at its end."""
+        ...
+
+    @property
+    def speed(self) -> float | None:
+        """The factor of real time; None for as fast as readers receive it, without loss."""
+        ...
+
+    @property
+    def wait(self) -> bool:
+        """Whether to start only when there is a subscriber."""
+        ...
+
+    def open(self) -> ReplayRun:
+        """Open it for one run; raise SourceError when it cannot be opened or has no messages."""
+        ...
+
+
+@runtime_checkable
+class LiveSource(Protocol):
+    """A source that receives from vehicles; which addresses it has is known when messages arrive."""
+
+    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+        """Yield what arrives until the iterator is closed, and None at least twice a second when nothing does.
+
+        Raises SourceError when it cannot be opened, or when the connection breaks.
+        """
+        ...
+
+
+Source = ReplaySource | LiveSource

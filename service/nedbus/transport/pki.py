@@ -1,0 +1,138 @@
+"""Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
+
+The common name of a certificate is what the access control of `config/router-secure.json5` matches.
+Needs the package `cryptography`: `pip install "nedbus[pki]"`.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from nedbus.errors import PkiError
+
+CA_DAYS: Final = 3650
+DAYS: Final = 825
+
+_NAME_LENGTH: Final = 64  # X.509's limit of a common name
+
+
+def make_authority(folder: Path, *, days: int = CA_DAYS) -> list[Path]:
+    """Make the CA of a fleet, `ca.key` and `ca.crt`, and return both paths.
+
+    The key signs everything else and belongs to no vehicle and no router.
+
+    Raises PkiError when there is one already, or the folder cannot be written.
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _name("nedbus CA")
+    builder = _builder(name, name, key.public_key(), days)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    builder = builder.add_extension(_usage(sign_certificates=True), critical=True)
+    return _write(folder, "ca", key, builder.sign(key, hashes.SHA256()))
+
+
+def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int = DAYS) -> list[Path]:
+    """Make `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
+
+    `hosts` are the names and addresses under which a router is reached: clients check them.
+    A certificate without hosts is for a client only.
+
+    Raises PkiError when there is a key of that name already, no CA, or the folder cannot be written.
+    """
+    if not name or len(name) > _NAME_LENGTH or "/" in name or name.startswith("."):
+        raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {_NAME_LENGTH} characters without /")
+    authority, authority_key = _read_authority(folder)
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = _builder(_name(name), authority.subject, key.public_key(), days)
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(_usage(sign_certificates=False), critical=True)
+    # A router is a client of other routers too.
+    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
+    return _write(folder, name, key, builder.sign(authority_key, hashes.SHA256()))
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+) -> x509.CertificateBuilder:
+    now = dt.datetime.now(dt.UTC)
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        # A vehicle's clock may be behind when it boots.
+        .not_valid_before(now - dt.timedelta(days=1))
+        .not_valid_after(now + dt.timedelta(days=days))
+    )
+
+
+def _usage(*, sign_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not sign_certificates,
+        key_cert_sign=sign_certificates,
+        crl_sign=sign_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+
+
+def _name(common_name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)
+
+
+def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    try:
+        certificate = x509.load_pem_x509_certificate((folder / "ca.crt").read_bytes())
+        key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
+    except OSError as exc:
+        raise PkiError(f"{exc.filename}: {(exc.strerror or '').lower()}: make the CA first, 'nedbus pki ca'") from exc
+    except ValueError as exc:
+        raise PkiError(f"{folder}: ca.crt and ca.key are not a certificate and its key in PEM") from exc
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise PkiError(f"{folder / 'ca.key'} is not a key that 'nedbus pki ca' made")
+    return certificate, key
+
+
+def _write(folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> list[Path]:
+    """Write key and certificate; neither ever replaces a file, and nobody else may read the key."""
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    paths = [folder / f"{name}.key", folder / f"{name}.crt"]
+    for path in paths:
+        if path.exists():
+            raise PkiError(f"{path} exists: it is not overwritten; move it away, or take another folder or name")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, content, mode in zip(paths, (secret, public), (0o600, 0o644), strict=True):
+            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+                file.write(content)
+    except OSError as exc:
+        raise PkiError(f"{exc.filename}: {(exc.strerror or '').lower()}") from exc
+    return paths

@@ -1,0 +1,90 @@
+"""A Zenoh router in this process: with our settings, or with a configuration file that `zenohd` reads too."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import zenoh
+
+from nedbus.errors import ConfigError, ListenError
+
+from .endpoints import DEFAULT_ENDPOINT, check_endpoints
+from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings
+
+
+def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), config_file: Path | None = None) -> Session:
+    """Open a session that is itself a router, by default on loopback, or as a JSON5 file for `zenohd` configures it.
+
+    Endpoints that are given replace those of the file, as the flags of `zenohd` do.
+
+    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file.
+    """
+    check_endpoints(listen, where="listen")
+    check_endpoints(connect, where="connect")
+    if config_file is None:
+        settings = {
+            **COMMON_SETTINGS,
+            "mode": "router",
+            "scouting/delay": 0,  # scouting is off: there are no answers to wait 0.5 s for
+            "listen/endpoints": list(router_endpoints(listen)),
+            "connect/endpoints": list(connect),
+            "connect/retry": RETRY,
+            "adminspace/enabled": True,
+            "transport/unicast/accept_pending": 1000,
+            "transport/link/rx/max_message_size": 2**20,
+        }
+        config = insert_settings(zenoh.Config(), settings, where="listen")
+    else:
+        given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
+        config = _read_config(config_file)
+        insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as exc:
+        raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
+
+
+def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None) -> tuple[str, ...]:
+    """Return what a router with these settings listens on: what is given, else what the file says, else the default.
+
+    Raises ConfigError for a malformed file.
+    """
+    if listen or config_file is None:
+        return tuple(listen) or (DEFAULT_ENDPOINT,)
+    found = json.loads(_read_config(config_file).get_json("listen/endpoints"))
+    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ()) or (DEFAULT_ENDPOINT,)
+
+
+def _read_config(path: Path) -> zenoh.Config:
+    if path.suffix not in {".json5", ".json", ".yaml", ".yml"}:
+        raise ConfigError.in_file(path, "a Zenoh configuration is a .json5, .json, .yaml or .yml file")
+    if not path.is_file():
+        raise ConfigError.in_file(path, "there is no such file")
+    try:
+        config = zenoh.Config.from_file(path)
+        if config.get_json("mode") == "null":
+            config.insert_json5("mode", '"router"')  # as zenohd does
+    except zenoh.ZError as exc:
+        text = str(exc)
+        position = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
+        line, column = map(int, position.groups()) if position else (None, None)
+        raise ConfigError.in_file(path, _parser_message(text), line=line, column=column) from exc
+    for name, value in json.loads(config.get_json("transport/link/tls")).items():
+        # Zenoh would report only that there is no such file, and not which.
+        if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
+            raise ConfigError.in_file(
+                path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
+            )
+    return config
+
+
+def _parser_message(text: str) -> str:
+    """Return the message of Zenoh's parser, without its drawing and its source paths."""
+    found = re.search(r'msg: "(.*?)(?: at /|", location)', text, re.DOTALL) or re.search(
+        r"= (.*?) at /", text, re.DOTALL
+    )
+    return found[1].replace("`", "'") if found else "not a Zenoh configuration"

@@ -1,0 +1,108 @@
+"""Zenoh sessions of clients: opening them, and the one place where Zenoh's errors are translated."""
+
+from __future__ import annotations
+
+import json
+import re
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import chain, repeat
+from typing import Final
+
+import zenoh
+
+from nedbus.errors import ClosedError, ConfigError, ConnectError, NedbusError
+
+from .endpoints import check_endpoints
+from .tls import Tls
+
+Session = zenoh.Session
+RawSample = zenoh.Sample
+
+RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
+
+# What holds for every session of ours. Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
+# Gossip and multicast would let peers find each other and bypass the router.
+# Longer queues than Zenoh's own take up the bursts of a fleet, where two batches are full in a moment.
+# A peer that sends nothing for as long as its lease is closed: a frozen host, a cut cable.
+# Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a timestamp.
+COMMON_SETTINGS: Final = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "timestamping/enabled": False,
+    "transport/shared_memory/enabled": False,
+    "transport/link/tx/lease": 5000,
+    "transport/link/tx/queue/size/data_high": 4,
+    "transport/link/tx/queue/size/data": 4,
+}
+
+
+def open_client(
+    endpoints: Sequence[str], *, timeout: float, tls: Tls | None = None, stop: threading.Event | None = None
+) -> Session:
+    """Open a session as a client of the first router that answers; Ctrl-C, or setting `stop`, ends the wait.
+
+    It reconnects by itself whenever the link breaks.
+
+    Raises ConnectError when no endpoint answers within `timeout` seconds, ConfigError for a malformed endpoint or a
+    TLS file that cannot be read.
+    """
+    check_endpoints(endpoints, where="connect")
+    settings: dict[str, object] = {
+        **COMMON_SETTINGS,
+        **({"transport/link/tls": tls.zenoh_settings()} if tls is not None else {}),
+        "mode": "client",
+        "connect/endpoints": list(endpoints),
+        "connect/timeout_ms": 0,
+        "connect/retry": RETRY,
+        "listen/endpoints": [],
+        # No peer on the network is trusted: the largest answer that is expected is a status of many sources.
+        "transport/link/rx/max_message_size": 2**18,
+    }
+    start = time.monotonic()
+    stop = stop or threading.Event()
+    for pause in chain(_PAUSES, repeat(1.0)):
+        # An endpoint that accepts and then sends nothing may not use up more than the time that there is.
+        left = start + timeout - time.monotonic()
+        settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
+        try:
+            return zenoh.open(insert_settings(zenoh.Config(), settings, where="connect"))
+        except zenoh.ZError:
+            left = start + timeout - time.monotonic()
+            if left <= 0 or stop.wait(min(left, pause)):
+                break
+    raise ConnectError(endpoints, timeout)
+
+
+def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:
+    """Put settings into a Zenoh configuration and return it; raise ConfigError for a value that Zenoh rejects."""
+    for key, value in settings.items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as exc:
+            raise ConfigError(where, f"Zenoh rejects {value!r} as {key}") from exc
+    return config
+
+
+@contextmanager
+def while_open(session: Session) -> Iterator[None]:
+    """Translate what Zenoh raises: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
+    try:
+        yield
+    except zenoh.ZError as exc:
+        raise translate_error(exc, session) from exc
+
+
+def translate_error(error: zenoh.ZError, session: Session) -> NedbusError:
+    """Return what `while_open` raises for this error."""
+    return ClosedError() if session.is_closed() else NedbusError(f"Zenoh reports: {error_reason(error)}")
+
+
+def error_reason(error: zenoh.ZError) -> str:
+    """Return the reason that the operating system gave, or else the whole text without source paths."""
+    text = re.sub(r" at /\S+", "", str(error)).strip()
+    found = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
+    return found[1].lower() if found else text

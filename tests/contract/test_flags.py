@@ -1,0 +1,84 @@
+"""The table of flags, and how doubts are shown."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nedbus_msgs import (
+    DOUBT_FLAGS,
+    FIELD_TYPES,
+    FLAGS,
+    Message,
+    Row,
+    VehicleLocalPosition,
+    describe_flags,
+    message_doubts,
+)
+
+from .strategies import FLAG_FIELDS, messages
+
+GOOD = {"xy_valid": 1.0, "z_valid": 1.0, "v_xy_valid": 1.0, "v_z_valid": 1.0, "dead_reckoning": 0.0}
+
+
+def test_table_has_every_bool_field() -> None:
+    """Each bool of the message has a row, and each other field that a row names is a float."""
+    assert set(FLAGS) == {name for name, kind in FIELD_TYPES.items() if kind == "bool"}
+    assert {name: flag.name for name, flag in FLAGS.items()} == {name: name for name in FLAGS}
+    assert {name: flag.fields for name, flag in FLAGS.items() if flag.fields} == FLAG_FIELDS
+    assert {name: flag.kind for name, flag in FLAGS.items() if flag.kind != "estimate"} == {
+        "xy_global": "reference",
+        "z_global": "reference",
+        "dist_bottom_valid": "terrain",
+    }
+
+
+def test_doubts_are_the_flags_with_a_label() -> None:
+    """Validity and dead reckoning are shown; global references, terrain and heading are not."""
+    assert DOUBT_FLAGS == ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning")
+    assert [FLAGS[name].label for name in DOUBT_FLAGS] == ["xy", "z", "vxy", "vz", "dead reckoning"]
+    assert [name for name in FLAGS if FLAGS[name].inverted] == ["dead_reckoning"]
+
+
+@pytest.mark.parametrize(
+    ("shares", "text"),
+    [
+        (GOOD, "ok"),
+        ({}, "ok"),
+        ({"heading_good_for_control": 0.0, "xy_global": 0.0, "dist_bottom_valid": 0.0}, "ok"),
+        (GOOD | {"xy_valid": 0.0}, "xy invalid"),
+        (GOOD | {"xy_valid": 0.0, "z_valid": 0.0, "dead_reckoning": 1.0}, "xy z invalid, dead reckoning"),
+        (dict.fromkeys(GOOD, 0.0), "xy z vxy vz invalid"),
+        (GOOD | {"xy_valid": 0.8}, "xy invalid 20 %"),
+        (GOOD | {"xy_valid": 0.8, "z_valid": 0.0, "dead_reckoning": 0.03},
+         "z invalid, xy invalid 20 %, dead reckoning 3 %"),
+        (GOOD | {"v_z_valid": 0.9999}, "vz invalid 1 %"),
+        (GOOD | {"v_z_valid": 0.0001}, "vz invalid 99 %"),
+    ],
+)  # fmt: skip
+def test_shares_are_described(shares: dict[str, float], text: str) -> None:
+    """What is bad in all messages is grouped; what is bad in some has its percentage, which is never 0 or 100."""
+    assert describe_flags(shares) == text
+
+
+def test_doubts_of_a_message() -> None:
+    """One message is described by its own flags."""
+    flags = dict.fromkeys(["xy_valid", "z_valid", "v_xy_valid", "v_z_valid"], True)
+    values = dict.fromkeys(["x", "y", "z", "vx", "vy", "vz"], 0.0)
+    good = VehicleLocalPosition.model_validate({"timestamp": 1, **flags, **values})
+    assert message_doubts(good) == "ok"
+    assert message_doubts(good.model_copy(update={"dead_reckoning": True})) == "dead reckoning"
+    assert message_doubts(good.model_copy(update={"xy_valid": False, "v_z_valid": False})) == "xy vz invalid"
+    assert message_doubts(VehicleLocalPosition(timestamp=1)) == "xy z vxy vz invalid"
+
+
+@given(messages(), st.booleans())
+def test_doubts_have_no_percentage_in_one_message(message: VehicleLocalPosition, as_row: bool) -> None:
+    """A message, or a row, either has a doubt or not."""
+    either: Message = Row._make(message.__dict__.values()) if as_row else message
+    text = message_doubts(either)
+    assert "%" not in text
+    assert ("dead reckoning" in text) == message.dead_reckoning
+    valid = message.xy_valid and message.z_valid and message.v_xy_valid and message.v_z_valid
+    assert ("invalid" in text) == (not valid)

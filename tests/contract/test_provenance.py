@@ -1,0 +1,54 @@
+"""Provenance of messages in their encoding."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nedbus_msgs import ENCODING, FIELD_TYPES, AddressError, Provenance, encoding_of, provenance_of
+
+
+@given(st.none() | st.from_regex(r"[a-z0-9_-]{1,32}", fullmatch=True), st.sets(st.sampled_from(list(FIELD_TYPES))))
+def test_provenance_round_trip(source: str | None, provided: set[str]) -> None:
+    """Any source and any set of fields can be written in an encoding and parsed again."""
+    encoding = encoding_of(source, frozenset(provided))
+    assert encoding.startswith(ENCODING)
+    assert provenance_of(encoding) == Provenance(source, frozenset(FIELD_TYPES.keys() - provided))
+
+
+def test_all_fields_add_nothing() -> None:
+    """A source of all fields adds only its name; without a source the encoding is the plain one."""
+    assert encoding_of(None) == ENCODING
+    assert encoding_of("sim") == f"{ENCODING};source=sim" == encoding_of("sim", frozenset(FIELD_TYPES))
+    assert encoding_of("x", frozenset(FIELD_TYPES.keys() - {"timestamp", "x"})) == f"{ENCODING};source=x;missing=41"
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "",
+        "zenoh/bytes",
+        *(
+            ENCODING + rest
+            for rest in ("", ";", ";source=", ";source=Ä", ";a=b;=;;", f";source={'x' * 33}", ";source=a b")
+        ),
+        f"{ENCODING};missing=-1",
+        f"{ENCODING};missing={'f' * 15}",
+    ],
+)
+def test_invalid_parts_are_ignored(encoding: str) -> None:
+    """An encoding may be another program's: its unknown or invalid parts are ignored."""
+    assert provenance_of(encoding) == Provenance()
+
+
+def test_bits_without_a_field_are_ignored() -> None:
+    """A mask may be of a newer layout."""
+    assert provenance_of(f"{ENCODING};missing={'f' * 14};new=1").missing == FIELD_TYPES.keys()
+
+
+@pytest.mark.parametrize("source", ["", "A", "a b", "x" * 33, "a;b"])
+def test_source_is_a_plain_name(source: str) -> None:
+    """A source that could not be written in an encoding is rejected."""
+    with pytest.raises(AddressError, match="1 to 32 of a-z"):
+        Provenance(source)

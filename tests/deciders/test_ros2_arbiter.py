@@ -1,0 +1,136 @@
+"""What the bridge publishes to ROS 2, decided without a network and at times that the test gives."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import pytest
+
+from nedbus.bridges.ros2_arbiter import MAX_LATENCY, TAKE_OVER_DELAY, Decision, Ros2Arbiter
+from nedbus.errors import AddressError
+from nedbus_msgs import Address
+
+VLP = "vehicle_local_position"
+ONE = Address("1", VLP)
+TOPIC = f"fmu/out/{VLP}"
+
+
+def make(namespaces: Mapping[str, str] | None = None) -> Ros2Arbiter:
+    return Ros2Arbiter(plain="1", namespaces=namespaces or {})
+
+
+def actions(
+    arbiter: Ros2Arbiter, addresses: Collection[Address], nodes: Mapping[Address, str] | None = None, *, now: float
+) -> list[tuple[str, str]]:
+    """Return action and topic of each decision."""
+    return [(each.action, each.topic) for each in arbiter.update(addresses, nodes or {}, now=now)]
+
+
+@pytest.mark.parametrize(
+    ("address", "topic"),
+    [
+        (ONE, TOPIC),
+        (Address("7", VLP), f"px4_7/fmu/out/{VLP}"),
+        (Address("wing", VLP), f"wing/fmu/out/{VLP}"),
+        (Address("wing-2", "estimator_local_position", 1), "wing_2/fmu/out/estimator_local_position_1"),
+        (Address("named", VLP), f"fleet/a/fmu/out/{VLP}"),
+        (Address("bare", VLP), TOPIC),
+    ],
+)
+def test_topic_has_a_namespace_by_vehicle(address: Address, topic: str) -> None:
+    """The plain vehicle has none, a given one wins, else it is the vehicle's name as ROS 2 allows it."""
+    assert make({"named": "/fleet/a/", "bare": ""}).topic_of(address) == topic
+
+
+@pytest.mark.parametrize("namespace", ["7up", "a b", "a//b", "a-b", "/1/"])
+def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
+    """Names in ROS 2 begin with a letter and have letters, digits and underscores."""
+    with pytest.raises(AddressError, match="namespace"):
+        make({"1": namespace})
+
+
+def test_address_is_published_once_and_withdrawn_when_gone() -> None:
+    """Only changes are decided: nothing while all stays as it is."""
+    arbiter = make()
+    assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
+    assert arbiter.update([ONE], {}, now=1.0) == []
+    assert arbiter.update([], {}, now=2.0) == [Decision("withdraw", ONE, TOPIC)]
+    assert arbiter.update([], {}, now=3.0) == []
+
+
+def test_topic_of_another_node_is_left_to_it() -> None:
+    """It is not published, and the node is named once."""
+    arbiter = make()
+    assert arbiter.update([ONE], {ONE: "px4"}, now=0.0) == [Decision("defer", ONE, TOPIC, "px4")]
+    assert arbiter.update([ONE], {ONE: "px4"}, now=1.0) == []
+    assert not arbiter.forwards(ONE, latency=0.0)
+
+
+def test_published_topic_is_left_to_a_node_that_comes_later() -> None:
+    """PX4 itself wins over the bridge."""
+    arbiter = make()
+    arbiter.update([ONE], {}, now=0.0)
+    assert arbiter.forwards(ONE, latency=0.0)
+    assert actions(arbiter, [ONE], {ONE: "px4"}, now=1.0) == [("defer", TOPIC)]
+    assert not arbiter.forwards(ONE, latency=0.0)
+
+
+def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
+    """The delay counts from when the node was seen last: a node that restarts keeps its topic."""
+    arbiter = make()
+    for now in (0.0, 4.0):
+        arbiter.update([ONE], {ONE: "px4"}, now=now)
+    assert actions(arbiter, [ONE], now=4.0 + TAKE_OVER_DELAY) == []
+    assert actions(arbiter, [ONE], now=4.1 + TAKE_OVER_DELAY) == [("publish", TOPIC)]
+    assert actions(arbiter, [ONE], {ONE: "px4"}, now=20.0) == [("defer", TOPIC)]
+
+
+def test_vehicle_that_was_gone_is_published_at_once() -> None:
+    """Nothing is remembered of an address that left the bus: the delay does not hold for its return."""
+    arbiter = make()
+    arbiter.update([ONE], {ONE: "px4"}, now=0.0)
+    arbiter.update([], {}, now=1.0)
+    assert actions(arbiter, [ONE], now=2.0) == [("publish", TOPIC)]
+
+
+def test_two_addresses_of_one_topic_conflict() -> None:
+    """The first in order has it; the other is named once, and follows when the first is gone."""
+    arbiter = make()
+    first, second = Address("a-b", VLP), Address("a_b", VLP)
+    topic = f"a_b/fmu/out/{VLP}"
+    assert arbiter.update([second, first], {}, now=0.0) == [
+        Decision("publish", first, topic),
+        Decision("conflict", second, topic, str(first)),
+    ]
+    assert arbiter.update([first, second], {}, now=1.0) == []
+    assert (arbiter.forwards(first, latency=0.0), arbiter.forwards(second, latency=0.0)) == (True, False)
+    assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
+    assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
+
+
+def test_published_address_keeps_its_topic_in_a_conflict() -> None:
+    """An address that comes later does not displace one that is published, whatever their order."""
+    arbiter = make()
+    arbiter.update([Address("a_b", VLP)], {}, now=0.0)
+    assert actions(arbiter, [Address("a-b", VLP), Address("a_b", VLP)], now=1.0) == [
+        ("conflict", f"a_b/fmu/out/{VLP}"),
+    ]
+
+
+def test_old_sample_is_not_forwarded() -> None:
+    """ROS 2 would use a recovered sample as the current estimate; one without a latency is current."""
+    arbiter = make()
+    arbiter.update([ONE], {}, now=0.0)
+    assert arbiter.forwards(ONE, latency=None)
+    assert arbiter.forwards(ONE, latency=-0.5)
+    assert arbiter.forwards(ONE, latency=MAX_LATENCY - 0.01)
+    assert not arbiter.forwards(ONE, latency=MAX_LATENCY)
+
+
+def test_sample_of_an_unpublished_address_is_not_forwarded() -> None:
+    """A sample can come before the first update, and after the address was withdrawn."""
+    arbiter = make()
+    assert not arbiter.forwards(ONE, latency=0.0)
+    arbiter.update([ONE], {}, now=0.0)
+    arbiter.update([], {}, now=1.0)
+    assert not arbiter.forwards(ONE, latency=0.0)

@@ -1,0 +1,1 @@
+"""What type checkers must accept and reject; read by mypy, never run."""

@@ -1,0 +1,82 @@
+"""Public calls as scripts make them: mypy accepts these, and rejects those that have an ignore.
+
+An ignore that is not needed is an error of mypy's, so a mistake that slips through fails `make check`.
+"""
+
+from __future__ import annotations
+
+from typing import assert_type
+
+import numpy as np
+import pandas as pd
+
+import nedbus
+
+
+def subscribe(bus: nedbus.Bus) -> None:
+    """The form of the iteration decides what `message` is."""
+    with bus.subscribe("vehicle_local_position", vehicle="7", mode="every") as subscription:
+        for sample in subscription:
+            assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
+            assert_type(sample.message.x, float)
+            sample.message.model_dump()
+        for row in subscription.rows():
+            assert_type(row, nedbus.Sample[nedbus.Row])
+            assert_type(row.message.delta_xy, tuple[float, float])
+            row.message._asdict()
+            row.message.model_dump()  # type: ignore[attr-defined] # a row is a tuple
+            row.message.y_valid  # type: ignore[attr-defined] # no such field
+        for batch in subscription.batches():
+            assert_type(batch, nedbus.Batch)
+            assert_type(batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray)
+        assert_type(subscription.receive(1.0), nedbus.Sample)
+    bus.subscribe(mode="newest")  # type: ignore[arg-type] # latest or every
+    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-arg] # the vehicle by name only
+
+
+def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.Row]) -> None:
+    """What takes a message takes a row as well."""
+    assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | nedbus.NoOrigin)
+    assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | nedbus.NoOrigin)
+    assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
+    nedbus.Monitor().add(row)
+    nedbus.Monitor().add(sample)
+    sample.message.x = 1.0  # type: ignore[misc] # messages are frozen
+    assert_type(sample.sent, int | None)
+
+
+def publish(bus: nedbus.Bus) -> None:
+    """A message, its fields by name, the values of a row, or an array."""
+    publisher = bus.publisher("external_ins_local_position", vehicle="mine", source="ins")
+    publisher.publish(nedbus.VehicleLocalPosition(timestamp=1, x=2.0))
+    publisher.publish({"timestamp": 1, "x": 2.0})
+    publisher.publish_many(np.zeros(3, nedbus.DTYPE))
+    publisher.publish(1.0)  # type: ignore[arg-type] # not a message
+    nedbus.VehicleLocalPosition(timestamp=1, X=2.0)  # type: ignore[call-arg] # no such field
+    bus.publisher("external_ins_local_position")  # type: ignore[call-arg] # of which vehicle?
+
+
+async def read_and_publish() -> None:
+    """The twin for asyncio: what waits is awaited."""
+    tls = nedbus.Tls("ca.crt", "reader.crt", "reader.key")
+    async with nedbus.connect_async("tls/10.0.0.1:7447", tls=tls) as bus:
+        async for sample in bus.subscribe():
+            assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
+        async for row in bus.subscribe().rows():
+            assert_type(row, nedbus.Sample[nedbus.Row])
+        for sample in bus.subscribe():  # type: ignore[attr-defined] # async for
+            pass
+        publisher = await bus.publisher("external_ins_local_position", vehicle="mine")
+        assert_type(publisher, nedbus.AsyncPublisher)
+        await publisher.publish(nedbus.VehicleLocalPosition(timestamp=1))
+        assert_type(await publisher.flush(), bool)
+        assert_type(await bus.latest(), list[nedbus.Sample])
+
+
+def read() -> None:
+    """An array, or a frame of the library that is asked for."""
+    assert_type(nedbus.read("flight.ulg"), nedbus.MessageArray)
+    assert_type(nedbus.read("flight.ulg", frame="pandas"), pd.DataFrame)
+    nedbus.read("flight.ulg", frame="arrow")  # type: ignore[call-overload] # pandas or polars
+    nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # tls=Tls(...)
+    nedbus.raed  # type: ignore[attr-defined] # no such name
