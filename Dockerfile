@@ -12,7 +12,7 @@ RUN mkdir -p service/nedbus schemas/nedbus_msgs \
     && /opt/nedbus/bin/pip install --no-cache-dir ".[mavlink,mcap,pki]" \
     && /opt/nedbus/bin/pip uninstall -y nedbus
 
-# What changes often: nedbus itself, as files that fit into the same place.
+# What changes often: nedbus itself, as files for the same virtual environment.
 FROM dependencies AS code
 COPY README.md ./
 COPY service service
@@ -20,7 +20,7 @@ COPY schemas schemas
 RUN /opt/nedbus/bin/pip install --no-cache-dir --no-deps --prefix /code .
 
 FROM ${NEDBUS_BASE_IMAGE}
-# The usual number of a first user: keys that this user made can be read inside as well.
+# The usual id of a host's first user: keys that this user made can be read inside as well.
 RUN useradd --uid 1000 --create-home nedbus
 COPY --from=dependencies /opt/nedbus /opt/nedbus
 COPY --from=code /code /opt/nedbus

@@ -1,4 +1,4 @@
-"""Read all vehicles by the thousand: mean speed of each, from NumPy arrays."""
+"""Read the messages of all vehicles as NumPy arrays, and print the mean speed of each."""
 
 import numpy as np
 

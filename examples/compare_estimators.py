@@ -1,4 +1,4 @@
-"""How far is each EKF instance from the truth? Every sample counts here, so every sample is asked for."""
+"""How far is each EKF instance from the truth? Every message counts here, so the mode is "every"."""
 
 import math
 
@@ -12,4 +12,4 @@ with nedbus.connect() as bus, bus.subscribe("*", vehicle="1", mode="every") as s
             truth = message
         elif sample.topic == "estimator_local_position" and truth is not None:
             error = math.dist((message.x, message.y, message.z), (truth.x, truth.y, truth.z))
-            print(f"estimator {sample.instance}: {error:6.2f} m off, says eph {message.eph:5.2f} m")
+            print(f"estimator {sample.instance}: {error:6.2f} m off, reports eph {message.eph:5.2f} m")

@@ -1,11 +1,11 @@
-"""Look once: which vehicles are there, where are they, and how old is what is known of them?"""
+"""Query once: which vehicles are there, where are they, and how old are their last messages?"""
 
 import nedbus
 
 with nedbus.connect() as bus:
     for vehicle, addresses in bus.vehicles().items():
         print(f"vehicle {vehicle}: {len(addresses)} streams")
-    for sample in bus.latest("vehicle_local_position"):
+    for sample in bus.latest():
         age = "unknown" if sample.latency is None else f"{sample.latency:.3f} s"
         doubt = ", dead reckoning" if sample.message.dead_reckoning else ""
         print(

@@ -1,4 +1,4 @@
-"""Watch how the streams are: say when one is slow, old, lossy or not to be trusted."""
+"""Print the health of all streams every two seconds: rate, loss, gaps, and the share of valid messages."""
 
 import time
 

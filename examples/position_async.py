@@ -18,7 +18,7 @@ async def report(subscription: nedbus.AsyncSubscription) -> None:
 
 async def main() -> None:
     async with nedbus.connect_async() as bus:
-        subscription = bus.subscribe("vehicle_local_position", mode="every")
+        subscription = bus.subscribe(mode="every")
         async with asyncio.TaskGroup() as group:
             group.create_task(show(subscription))
             group.create_task(report(subscription))
