@@ -13,7 +13,8 @@
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
     │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
-    │   └── ClosedError (RuntimeError)       the bus was closed
+    │   ├── ClosedError (RuntimeError)       the bus was closed
+    │   └── ForkError (RuntimeError)         this process was forked from one that was connected
     └── the data
         ├── DecodeError (ValueError)         a payload that is not a VehicleLocalPosition
         │   └── UnknownLayoutError           ... because its layout is newer than this reader
@@ -46,6 +47,7 @@ __all__ = [
     "ConnectError",
     "DecodeError",
     "EncodeError",
+    "ForkError",
     "LayoutError",
     "ListenError",
     "NedbusError",
@@ -142,6 +144,16 @@ class ClosedError(NedbusError, RuntimeError):
 
     def __init__(self) -> None:
         super().__init__("this is closed, or the bus that it came from is: connect again")
+
+
+class ForkError(NedbusError, RuntimeError):
+    """Raised when nedbus is used in a process that was forked from one that was connected: Zenoh would hang there."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "this process was forked from one with a Zenoh session: start processes with"
+            " multiprocessing.get_context('spawn') or subprocess, or connect after the fork only"
+        )
 
 
 class SourceError(NedbusError):

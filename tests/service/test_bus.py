@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import datetime as dt
 import gc
 import json
 import logging
 import math
+import signal
 import threading
 import time
+import weakref
 from functools import partial
 from typing import cast
 
@@ -19,9 +22,9 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.transport import Session
+from nedbus.transport import Session, open_router
 from nedbus_msgs import TOPICS, Address, encode
-from tests.conftest import DEADLINE, Client, free_endpoint, message, wait_for, wait_for_reader
+from tests.conftest import DEADLINE, Client, Start, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
 BOTH: list[Mode] = ["latest", "every"]
@@ -153,6 +156,32 @@ def test_vehicles_come_and_go(client: Client, endpoint: str) -> None:
         wait_for(lambda: len(client.vehicles().get("7", [])) == 2, what="vehicle 7")
         assert client.vehicles() == {"7": [Address("7", "estimator_local_position", 2), Address("7", VLP)]}
     wait_for(lambda: not client.vehicles(), what="vehicle 7 to go")
+
+
+def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
+    """More answers than a channel of Zenoh's holds (256) do not block, whoever asks: their own bus, or another."""
+    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
+        for number in range(600):
+            one.publisher(VLP, vehicle=str(number)).publish(message(1))
+        for asking in (one, other):
+            wait_for(partial(has_all, asking), what="600 vehicles, each with an answer")
+
+
+def has_all(bus: nedbus.Bus) -> bool:
+    return len(bus.vehicles()) == len(bus.latest()) == 600
+
+
+@pytest.mark.process
+def test_question_that_nobody_answers_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+    """A queryable that keeps its queries does not hold a script that asks: Ctrl-C ends the wait."""
+    kept: list[zenoh.Query] = []
+    queryable = raw.declare_queryable("nedbus/**", zenoh.handlers.Callback(kept.append, indirect=False))
+    code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+    wait_for(lambda: kept, what="the question")
+    process.signal(signal.SIGINT)
+    assert process.wait() == -signal.SIGINT, process.err
+    queryable.undeclare()
 
 
 def test_receive_times_out_with_words(client: Client) -> None:
@@ -577,3 +606,129 @@ def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
 
     wait_for(receive, what="the message, which a receive without patience gets once it is there")
     assert taken[0].message.timestamp == 1
+
+
+def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
+    """Receives that are cancelled while the subscription opens leave one subscriber, and no message comes twice."""
+    publisher = bus.publisher(VLP, vehicle="1")
+
+    async def scenario() -> list[int]:
+        async with nedbus.connect_async(endpoint) as other:
+            subscription = other.subscribe(mode="every")
+            for _ in range(3):
+                task = asyncio.create_task(subscription.receive())
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+                task.cancel()
+            publisher.publish(message(1))
+            taken = [(await subscription.receive(DEADLINE)).message.timestamp]
+            publisher.publish(message(2))
+            taken.append((await subscription.receive(DEADLINE)).message.timestamp)
+            assert len(other._opened()._subscribers) == 1
+            return taken
+
+    assert asyncio.run(scenario()) == [1, 2]
+
+
+def test_timeout_includes_the_opening() -> None:
+    """A receive with a timeout does not wait longer for the router, which is away, than for a message."""
+    where = free_endpoint()
+    router = open_router(listen=(where,))
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(where) as bus:
+            subscription = bus.subscribe(mode="every")
+            await asyncio.to_thread(router.close)
+            with pytest.raises(nedbus.NoDataError):  # and not ConnectError, after 3 s
+                await subscription.receive(0.01)
+
+    asyncio.run(scenario())
+
+
+def test_forgotten_bus_is_closed(endpoint: str, raw: Session) -> None:
+    """A bus that nobody refers to any more is closed, with its publishers, and not only when the process ends."""
+    forgotten = nedbus.connect(endpoint)
+    publisher = forgotten.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = forgotten.subscribe(mode="every")
+    gone = weakref.ref(forgotten)
+    wait_for(lambda: len(list(raw.liveliness().get("nedbus/*/@alive/**"))) == 1, what="the vehicle")
+    del forgotten, publisher, subscription
+    gc.collect()
+    assert gone() is None
+    wait_for(lambda: not list(raw.liveliness().get("nedbus/*/@alive/**")), what="the vehicle to go")
+
+
+def test_collecting_garbage_never_closes(endpoint: str) -> None:
+    """Garbage is collected in any thread, with any lock held: the closing, which waits, is done by another."""
+    subscription = nedbus.connect(endpoint).subscribe()
+    receive_queue = subscription._queue
+    with receive_queue._lock:  # as a thread holds it that is in the midst of something
+        del subscription
+        gc.collect()
+        assert not receive_queue.ended
+    wait_for(lambda: receive_queue.ended, what="the end of the subscription")
+
+
+@pytest.mark.parametrize(
+    "ask", ["bus.latest()", "bus.subscribe()", "publisher.publish({'timestamp': 2})", "next(subscription)"]
+)
+def test_forked_process_is_told_at_once(start: Start, endpoint: str, ask: str) -> None:
+    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child still ends."""
+    code = f"""
+import os, sys
+import nedbus
+bus = nedbus.connect()
+subscription = bus.subscribe()
+publisher = bus.publisher("vehicle_local_position", vehicle="1")
+publisher.publish({{"timestamp": 1}})
+if child := os.fork():
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+for ask in (lambda: {ask}, nedbus.connect):
+    try:
+        ask()
+    except nedbus.ForkError as exc:
+        print(exc)
+sys.exit(7)
+"""
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+    assert process.wait() == 7, process.err
+    assert process.out.count("start processes with multiprocessing.get_context('spawn')") == 2
+    assert "Traceback" not in process.err
+
+
+def test_live_answer_wins_over_a_stored_one(client: Client, bus: nedbus.Bus, raw: Session) -> None:
+    """A storage that kept a message with a later time, of the vehicle's last run, does not hide the live one."""
+    later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            for vehicle in "12":
+                query.reply(f"nedbus/{vehicle}/{VLP}", encode(message(99)), timestamp=later)
+
+    storage = raw.declare_queryable("nedbus/*/vehicle_local_position", zenoh.handlers.Callback(reply, indirect=False))
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+
+    def answers() -> list[tuple[str, int, bool]]:
+        return [(sample.vehicle, sample.message.timestamp, sample.stored) for sample in client.latest()]
+
+    wait_for(lambda: answers() == [("1", 1, False), ("2", 99, True)], what="the live one and the stored one")
+    storage.undeclare()
+
+
+def test_last_value_in_a_newer_layout_is_read(client: Client, raw: Session) -> None:
+    """What `subscribe` can read, `latest` reads as well: a layout that its publisher explains."""
+    layout = {"wire": 9, "fields": [{"name": name} for name in ("timestamp", "brand_new", "x")]}
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            if "@schema" in str(query.key_expr):
+                query.reply("nedbus/@schema/VehicleLocalPosition", json.dumps({"layouts": [layout]}))
+            else:
+                query.reply(f"nedbus/1/{VLP}", msgpack.packb([9, 5, True, 2.5]))
+
+    keys = ("nedbus/@schema/VehicleLocalPosition", f"nedbus/1/{VLP}")
+    queryables = [raw.declare_queryable(key, zenoh.handlers.Callback(reply, indirect=False)) for key in keys]
+    wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
+    for queryable in queryables:
+        queryable.undeclare()

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import weakref
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from nedbus.errors import ClosedError, NoDataError
+from nedbus.transport import require_unforked
 from nedbus_msgs import Row, VehicleLocalPosition, decode, decode_row
 
+from .closing import Finalizer
 from .receive_queue import ReceiveQueue
 from .sample import Counts, Sample
 from .zenoh_subscriber import ZenohSubscriber
@@ -36,9 +37,9 @@ class AsyncSubscription:
         self.name = name
         self._open_subscriber = open_subscriber
         self._queue = receive_queue
-        self._finalizer: Callable[[], object] | None = None
+        self._finalizer: Finalizer | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._opening = asyncio.Lock()
+        self._opening: asyncio.Task[None] | None = None
         self._arrival = asyncio.Event()
         self._taken = 0
 
@@ -72,10 +73,11 @@ class AsyncSubscription:
 
     async def close(self) -> None:
         """End the subscription; a second call does nothing."""
-        async with self._opening:
-            self._queue.end()
-            if self._finalizer is not None:
-                await asyncio.to_thread(self._finalizer)
+        self._queue.end()
+        if self._opening is not None:
+            await asyncio.wait([self._opening])
+        if self._finalizer is not None:
+            await asyncio.to_thread(self._finalizer.close_now)
 
     def __aiter__(self) -> AsyncIterator[Sample[VehicleLocalPosition]]:
         return self
@@ -94,12 +96,12 @@ class AsyncSubscription:
         await self.close()
 
     async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
-        await self._open()
         self._taken += 1
         if self._taken % _YIELD_AFTER == 0:
             await asyncio.sleep(0)  # a reader that always finds a sample would never yield to other tasks
         try:
             async with asyncio.timeout(timeout):
+                await self._open()
                 while True:
                     self._arrival.clear()
                     if self._queue.ended:
@@ -112,20 +114,31 @@ class AsyncSubscription:
             raise NoDataError(self.name, timeout or 0.0) from None
 
     async def _open(self) -> None:
+        """Wait until it is open; giving up the wait does not end the opening, which others, or `close`, wait for."""
+        require_unforked()
         loop = asyncio.get_running_loop()
-        if self._loop is None:
-            await self._open_in(loop)
-        elif self._loop is not loop:
+        if self._finalizer is not None and self._loop is loop:
+            return
+        if self._loop not in (None, loop):
             raise RuntimeError(f"the subscription to {self.name} belongs to another event loop: subscribe in this one")
+        if self._queue.ended:
+            return
+        if self._opening is None or (self._opening.done() and self._finalizer is None):
+            self._loop = loop
+            self._opening = loop.create_task(self._open_in(loop))
+            self._opening.add_done_callback(_retrieve)
+        await asyncio.shield(self._opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
-        async with self._opening:
-            if self._loop is not None or self._queue.ended:
-                return
-            self._queue.wake = _waker(loop, self._arrival)
-            subscriber = await asyncio.to_thread(self._open_subscriber)
-            self._finalizer = weakref.finalize(self, subscriber.close)
-            self._loop = loop
+        self._queue.wake = _waker(loop, self._arrival)
+        subscriber = await asyncio.to_thread(self._open_subscriber)
+        self._finalizer = Finalizer(self, subscriber.close)
+
+
+def _retrieve(opening: asyncio.Task[None]) -> None:
+    """Mark an error as seen: whoever waits gets it, and perhaps nobody waits any more."""
+    if not opening.cancelled():
+        opening.exception()
 
 
 def _waker(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> Callable[[], None]:

@@ -9,18 +9,20 @@ from functools import partial
 from typing import Self
 
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.transport import Session, Tls, open_client, query
+from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, decode
 
+from .closing import Finalizer
 from .decoder import Decoder
-from .discovery import find_layout, find_services, find_vehicles
+from .discovery import find_layout, find_services
 from .layout_lookup import LayoutLookup
 from .publisher import Publisher
-from .publisher_registry import PublisherRegistry
+from .publisher_registry import LIVE, PublisherRegistry
 from .query_server import QueryServer
 from .receive_queue import ReceiveQueue
 from .sample import Mode, Sample
 from .subscription import Subscription
+from .vehicle_directory import VehicleDirectory
 from .zenoh_subscriber import ZenohSubscriber
 
 
@@ -38,8 +40,9 @@ class Bus:
         self._session = session
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix)
+        self._directory = VehicleDirectory(session, prefix=prefix)
         self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
-        self._finalizer = weakref.finalize(self, _close, session, self._queries, self._subscribers)
+        self._finalizer = Finalizer(self, partial(_close, session, self._queries, self._subscribers))
 
     @property
     def connected(self) -> bool:
@@ -75,18 +78,29 @@ class Bus:
 
         Without a topic it is vehicle_local_position; "*" is all four topics.
         It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
+        The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
         self._require_open()
         key_expr = Selection(topic, vehicle, instance).key_expr(prefix=self.prefix)
         decoder = self._make_decoder()
-        answers = query(self._session, key_expr, timeout=timeout)
-        samples = (decoder.decode(raw, str(raw.key_expr), decode) for raw in answers)
-        return sorted((sample for sample in samples if sample is not None), key=lambda sample: sample.address)
+        newest: dict[Address, Sample] = {}
+        for raw in decoder.admit(query(self._session, key_expr, timeout=timeout, newest=False)):
+            sample = decoder.decode(raw, str(raw.key_expr), decode)
+            if sample is None:
+                continue
+            sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
+            other = newest.get(sample.address)
+            if other is None or _rank(sample) > _rank(other):
+                newest[sample.address] = sample
+        return sorted(newest.values(), key=lambda sample: sample.address)
 
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
-        """Return the vehicles that are published now, and the addresses of each; `latest` has their messages."""
+        """Return the vehicles that are published now, and the addresses of each; `latest` has their messages.
+
+        The first call asks, and waits at most `timeout` seconds; from then on the bus follows who comes and goes.
+        """
         self._require_open()
-        return find_vehicles(self._session, prefix=self.prefix, timeout=timeout)
+        return self._directory.vehicles(timeout=timeout)
 
     def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service on this network, as it reports it."""
@@ -125,7 +139,7 @@ class Bus:
         if self._finalizer.alive:
             with suppress(NedbusError):
                 self._publishers.flush(each for each in self._publishers.publishers if each.lossless)
-        self._finalizer()
+        self._finalizer.close_now()
 
     def __enter__(self) -> Self:
         return self
@@ -134,9 +148,10 @@ class Bus:
         if exc is None:
             self.close()
         else:
-            self._finalizer()
+            self._finalizer.close_now()
 
     def _require_open(self) -> None:
+        require_unforked()
         if not self._finalizer.alive:
             raise ClosedError
 
@@ -166,6 +181,11 @@ class Bus:
     def _make_decoder(self) -> Decoder:
         layouts = LayoutLookup(partial(find_layout, self._session, prefix=self.prefix))
         return Decoder(layouts, prefix=self.prefix)
+
+
+def _rank(sample: Sample) -> tuple[bool, int]:
+    """Order samples of one address: those of a publisher are above stored ones, later ones above earlier ones."""
+    return not sample.stored, sample.sent or 0
 
 
 def _close(session: Session, queries: QueryServer, subscribers: weakref.WeakSet[ZenohSubscriber]) -> None:

@@ -1,4 +1,4 @@
-"""What others on the network answer: vehicles, the status of services, layouts. No answer is trusted."""
+"""What others on the network answer: the status of services, and layouts. No answer is trusted."""
 
 from __future__ import annotations
 
@@ -7,26 +7,13 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
-from nedbus.transport import RawSample, Session, alive_keys, query
-from nedbus_msgs import ANY, Address, AddressError, address_of_alive_key, alive_key_expr, schema_key, status_key
+from nedbus.transport import RawSample, Session, query
+from nedbus_msgs import ANY, schema_key, status_key
 
 _log = logging.getLogger(__name__)
 
 _MAX_FIELDS: Final = 256  # of a layout
 _MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
-
-
-def find_vehicles(session: Session, *, prefix: str, timeout: float) -> dict[str, list[Address]]:
-    """Return the vehicles that are published now, and the addresses of each."""
-    found: dict[str, list[Address]] = {}
-    for key in alive_keys(session, alive_key_expr(prefix=prefix), timeout=timeout):
-        try:
-            address = address_of_alive_key(key, prefix=prefix)
-        except AddressError as exc:
-            _log.warning("%s: %s", key, exc)
-            continue
-        found.setdefault(address.vehicle, []).append(address)
-    return found
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:

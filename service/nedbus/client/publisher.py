@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 import zenoh
 
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.transport import Session, translate_error, while_open
+from nedbus.transport import Session, require_unforked, translate_error, while_open
 from nedbus_msgs import (
     FIELD_TYPES,
     PAYLOAD_SIZE,
@@ -120,6 +120,7 @@ class Publisher:
             to_message(element)  # raises, with the reason
         if self._closed:
             raise ClosedError
+        require_unforked()
         payloads = encode_array(messages)
         put, new_timestamp = self._publisher.put, self._session.new_timestamp
         with while_open(self._session):
@@ -164,6 +165,7 @@ class Publisher:
     def _put(self, payload: bytes, provided: Collection[str]) -> None:
         if self._closed:
             raise ClosedError
+        require_unforked()
         encoding = self._encoding
         try:
             stamp = self._session.new_timestamp()

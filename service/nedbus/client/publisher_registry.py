@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Mapping
-from functools import partial
+import weakref
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final, cast
 
 import zenoh
@@ -17,11 +17,15 @@ from nedbus.transport import Session, alive_keys, while_open
 from nedbus_msgs import Address, json_schema, layout_table, schema_key
 
 from .publisher import FLUSH_TIMEOUT, Publisher
-from .query_server import JSON, Answer, QueryServer
+from .query_server import JSON, Answer, QueryServer, Reply
 
 _log = logging.getLogger(__name__)
 
 _ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
+
+
+LIVE: Final = b"live"
+"""Attachment of a publisher's answer with its last message, which that of a storage does not have."""
 
 
 class PublisherRegistry:
@@ -62,7 +66,7 @@ class PublisherRegistry:
             if address.vehicle not in self._vehicles:
                 self._vehicles.add(address.vehicle)
                 key_expr = f"{self.prefix}/{address.vehicle}/**"
-                self._queries.answer(key_expr, partial(self._last_messages, address.vehicle))
+                self._queries.answer(key_expr, _weakly(self._last_messages, address.vehicle))
         return publisher
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
@@ -104,7 +108,18 @@ class PublisherRegistry:
                 continue
             if query.key_expr.intersects(publisher.key):
                 payload, stamp, encoding = publisher.last
-                yield publisher.key, payload, encoding, stamp
+                yield Answer(publisher.key, payload, encoding, stamp, LIVE)
+
+
+def _weakly(last_messages: Callable[[str, zenoh.Query], Iterable[Answer]], vehicle: str) -> Reply:
+    """Return an answer that does not keep the registry, its publishers and their bus alive."""
+    method = weakref.WeakMethod(last_messages)
+
+    def reply(query: zenoh.Query) -> Iterable[Answer]:
+        alive = method()
+        return alive(vehicle, query) if alive is not None else ()
+
+    return reply
 
 
 def _schema() -> Mapping[str, object]:

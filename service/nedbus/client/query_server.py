@@ -8,6 +8,7 @@ import queue
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -20,8 +21,20 @@ _MAX_PENDING: Final = 1000  # queries that wait for an answer
 JSON: Final = "application/json"
 """Encoding of answers that are JSON documents."""
 
-Answer = tuple[str, bytes, str, "zenoh.Timestamp | None"]
-"""Key, payload, encoding and timestamp of one reply."""
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """One reply to a query."""
+
+    key: str
+    payload: bytes
+    encoding: str
+    stamp: zenoh.Timestamp | None = None
+    attachment: bytes | None = None
+
+
+Reply = Callable[[zenoh.Query], Iterable[Answer]]
+"""What answers a query; it must not refer to the owner of the server, which may be dropped without a close."""
 
 
 class QueryServer:
@@ -29,13 +42,13 @@ class QueryServer:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._pending: queue.Queue[tuple[zenoh.Query, Callable[[zenoh.Query], Iterable[Answer]]] | None]
+        self._pending: queue.Queue[tuple[zenoh.Query, Reply] | None]
         self._pending = queue.Queue(_MAX_PENDING)
         self._queryables: list[zenoh.Queryable[None]] = []
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
 
-    def answer(self, key_expr: str, reply: Callable[[zenoh.Query], Iterable[Answer]]) -> None:
+    def answer(self, key_expr: str, reply: Reply) -> None:
         """Answer queries on a key expression with what `reply` returns; raise ClosedError once it is closed."""
         with self._lock:
             if self._thread is None:
@@ -54,7 +67,7 @@ class QueryServer:
 
     def answer_json(self, key: str, content: Callable[[], Mapping[str, object]]) -> None:
         """Answer queries on a key with a JSON document, made anew for each."""
-        self.answer(key, lambda _: [(key, json.dumps(content()).encode(), JSON, None)])
+        self.answer(key, lambda _: [Answer(key, json.dumps(content()).encode(), JSON)])
 
     def close(self) -> None:
         """Stop answering."""
@@ -71,7 +84,15 @@ class QueryServer:
             query, reply = item
             try:
                 with query:
-                    for key, payload, encoding, stamp in reply(query):
-                        query.reply(key, payload, encoding=encoding, timestamp=stamp)
+                    for each in reply(query):
+                        query.reply(
+                            each.key,
+                            each.payload,
+                            encoding=each.encoding,
+                            timestamp=each.stamp,
+                            attachment=each.attachment,
+                        )
             except zenoh.ZError as exc:
                 _log.debug("a query on %s could not be answered: %s", query.key_expr, exc)
+            except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
+                _log.exception("a query on %s is not answered", query.key_expr)

@@ -30,6 +30,7 @@ class Sample(Generic[M_co]):
     `stamp`: Zenoh's timestamp, None if its publisher set none.
     `lost`: messages of this key that were lost in transit just before this one.
     `provenance`: the source and the fields that it did not provide, also as `source` and `missing`.
+    `stored`: from `bus.latest()` only: no publisher answers for this address, but a storage that kept its last message.
     """
 
     message: M_co
@@ -38,6 +39,7 @@ class Sample(Generic[M_co]):
     stamp: zenoh.Timestamp | None = None
     lost: int = 0
     provenance: Provenance = _UNKNOWN
+    stored: bool = False
 
     @property
     def sent(self) -> int | None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Self, TypeVar
 
 from nedbus.errors import ClosedError, NoDataError
+from nedbus.transport import require_unforked
 from nedbus_msgs import Row, VehicleLocalPosition, decode, decode_row
 
+from .closing import Finalizer
 from .receive_queue import ReceiveQueue
 from .sample import Counts, Sample
 from .zenoh_subscriber import ZenohSubscriber
@@ -33,7 +34,7 @@ class Subscription:
         self.name = name
         self._queue = receive_queue
         self._owner = owner  # the bus stays open for as long as somebody may read
-        self._finalizer = weakref.finalize(self, subscriber.close)
+        self._finalizer = Finalizer(self, subscriber.close)
 
     @property
     def counts(self) -> Counts:
@@ -61,7 +62,7 @@ class Subscription:
 
     def close(self) -> None:
         """End the subscription; a second call does nothing."""
-        self._finalizer()
+        self._finalizer.close_now()
 
     def __iter__(self) -> Iterator[Sample[VehicleLocalPosition]]:
         return self
@@ -79,6 +80,7 @@ class Subscription:
         self.close()
 
     def _next(self, pop: Callable[[], _T | None], timeout: float | None) -> _T:
+        require_unforked()
         deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
         while True:
             if self._queue.ended:

@@ -5,19 +5,22 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
-from .queries import alive_keys, ask_all, query
+from .queries import MAX_ANSWERS, alive_keys, ask_all, follow_alive_keys, query
 from .rmw_zenoh import (
     NO_HASH,
     Attachment,
+    PublisherToken,
     TopicKey,
     is_nedbus_gid,
     make_gid,
     node_token,
     publisher_token,
     publishers_key_expr,
+    publishers_of_type_key_expr,
+    subscription_token,
 )
 from .router import open_router, router_endpoints
-from .session import RawSample, Session, open_client, translate_error, while_open
+from .session import RawSample, Session, is_forked, open_client, require_unforked, translate_error, while_open
 from .tls import Tls
 
 if TYPE_CHECKING:
@@ -31,8 +34,10 @@ __all__ = [
     "CA_DAYS",
     "DAYS",
     "DEFAULT_ENDPOINT",
+    "MAX_ANSWERS",
     "NO_HASH",
     "Attachment",
+    "PublisherToken",
     "RawSample",
     "Session",
     "Tls",
@@ -41,6 +46,8 @@ __all__ = [
     "ask_all",
     "check_endpoints",
     "dial_endpoint",
+    "follow_alive_keys",
+    "is_forked",
     "is_nedbus_gid",
     "make_authority",
     "make_certificate",
@@ -50,8 +57,11 @@ __all__ = [
     "open_router",
     "publisher_token",
     "publishers_key_expr",
+    "publishers_of_type_key_expr",
     "query",
+    "require_unforked",
     "router_endpoints",
+    "subscription_token",
     "translate_error",
     "while_open",
 ]

@@ -1,45 +1,103 @@
-"""Queries: what is answered on a key expression, and which liveliness tokens there are."""
+"""Queries: what is answered on a key expression, and which liveliness tokens there are.
+
+Replies are collected by a callback: a channel of Zenoh's holds 256 of them, and blocks the query for ever when it is
+full. The wait for the last reply is Python's, so Ctrl-C ends it, and so does its timeout.
+"""
 
 from __future__ import annotations
 
-from itertools import islice
+import threading
+from collections.abc import Callable
 from typing import Final
 
 import zenoh
 
 from .session import RawSample, Session, while_open
 
-_MAX_ANSWERS: Final = 10_000  # more are not sent by honest peers
+MAX_ANSWERS: Final = 10_000
+"""Answers that are kept of one query; more are not sent by honest peers."""
+
+_GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
 
 
 def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
     """Return what is answered within `timeout` seconds, at most 10,000: the newest answer for each key, or all."""
     mode = zenoh.ConsolidationMode.LATEST if newest else zenoh.ConsolidationMode.NONE
+    collector = _Collector()
     with while_open(session):
-        replies = session.get(
-            key_expr, target=zenoh.QueryTarget.ALL, consolidation=mode, timeout=_zenoh_timeout(timeout)
+        session.get(
+            key_expr,
+            collector.handler,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=mode,
+            timeout=_zenoh_timeout(timeout),
         )
-        return [reply.ok for reply in islice(replies, _MAX_ANSWERS) if reply.ok is not None]
+    return [reply.ok for reply in collector.wait(timeout) if reply.ok is not None]
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
-    """Return the keys of all liveliness tokens that match, each once, sorted."""
+    """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
+    collector = _Collector()
     with while_open(session):
-        replies = session.liveliness().get(key_expr, timeout=_zenoh_timeout(timeout))
-        return sorted({str(reply.ok.key_expr) for reply in islice(replies, _MAX_ANSWERS) if reply.ok is not None})
+        session.liveliness().get(key_expr, collector.handler, timeout=_zenoh_timeout(timeout))
+    return sorted({str(reply.ok.key_expr) for reply in collector.wait(timeout) if reply.ok is not None})
+
+
+def follow_alive_keys(
+    session: Session, key_expr: str, on_change: Callable[[str, bool], object]
+) -> Callable[[], object]:
+    """Call `on_change` with the key of each liveliness token that appears (True) or goes (False) from now on.
+
+    It is called on a thread of Zenoh's, where it must not wait. Returns a function that ends it.
+    """
+
+    def on_sample(sample: zenoh.Sample) -> None:
+        on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+    with while_open(session):
+        subscriber = session.liveliness().declare_subscriber(
+            key_expr, zenoh.handlers.Callback(on_sample, indirect=False)
+        )
+    return subscriber.undeclare
 
 
 def ask_all(session: Session, key: str, *, timeout: float, priority: zenoh.Priority) -> bool:
     """Return whether all queryables on a key answered within `timeout` seconds; also true when there is none."""
+    collector = _Collector()
     with while_open(session):
-        replies = session.get(
+        session.get(
             key,
+            collector.handler,
             target=zenoh.QueryTarget.ALL,
             timeout=_zenoh_timeout(timeout),
             priority=priority,
             congestion_control=zenoh.CongestionControl.DROP,  # a query that waits for a full queue could cut a link
         )
-        return all(reply.ok is not None for reply in replies)
+    answers = collector.wait(timeout)
+    return collector.complete and all(reply.ok is not None for reply in answers)
+
+
+class _Collector:
+    """Keep the replies to one query, in a bounded amount of memory."""
+
+    def __init__(self) -> None:
+        self._replies: list[zenoh.Reply] = []
+        self._ended = threading.Event()
+        self.handler = zenoh.handlers.Callback(self._add, self._ended.set, indirect=False)
+
+    @property
+    def complete(self) -> bool:
+        """Whether the query has ended."""
+        return self._ended.is_set()
+
+    def wait(self, timeout: float) -> list[zenoh.Reply]:
+        """Return what came until the query ended, or its timeout has passed."""
+        self._ended.wait(_zenoh_timeout(timeout) + _GRACE)
+        return self._replies[:MAX_ANSWERS]
+
+    def _add(self, reply: zenoh.Reply) -> None:
+        if len(self._replies) < MAX_ANSWERS:
+            self._replies.append(reply)
 
 
 def _zenoh_timeout(timeout: float) -> float:

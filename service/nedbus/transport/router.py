@@ -13,7 +13,7 @@ import zenoh
 from nedbus.errors import ConfigError, ListenError
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
-from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings
+from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings, open_session
 
 
 def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), config_file: Path | None = None) -> Session:
@@ -43,7 +43,7 @@ def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), conf
         config = _read_config(config_file)
         insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
     try:
-        return zenoh.open(config)
+        return open_session(config)
     except zenoh.ZError as exc:
         raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import threading
 import time
@@ -13,7 +14,7 @@ from typing import Final
 
 import zenoh
 
-from nedbus.errors import ClosedError, ConfigError, ConnectError, NedbusError
+from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 
 from .endpoints import check_endpoints
 from .tls import Tls
@@ -38,6 +39,37 @@ COMMON_SETTINGS: Final = {
     "transport/link/tx/queue/size/data_high": 4,
     "transport/link/tx/queue/size/data": 4,
 }
+
+
+_opened_here = False
+_forked = False
+
+
+def _after_fork() -> None:
+    global _forked  # noqa: PLW0603 - a process has one state
+    _forked = _forked or _opened_here
+
+
+os.register_at_fork(after_in_child=_after_fork)
+
+
+def is_forked() -> bool:
+    """Return whether this process was forked from one with Zenoh sessions, in which Zenoh works no more."""
+    return _forked
+
+
+def require_unforked() -> None:
+    """Raise ForkError in a process that was forked from one with Zenoh sessions."""
+    if _forked:
+        raise ForkError
+
+
+def open_session(config: zenoh.Config) -> Session:
+    """Open a session; raise ForkError in a process that was forked from one with sessions, where Zenoh would hang."""
+    global _opened_here  # noqa: PLW0603 - a process has one state
+    require_unforked()
+    _opened_here = True
+    return zenoh.open(config)
 
 
 def open_client(
@@ -69,7 +101,7 @@ def open_client(
         left = start + timeout - time.monotonic()
         settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
         try:
-            return zenoh.open(insert_settings(zenoh.Config(), settings, where="connect"))
+            return open_session(insert_settings(zenoh.Config(), settings, where="connect"))
         except zenoh.ZError:
             left = start + timeout - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
