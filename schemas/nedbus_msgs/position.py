@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar, Final, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from .equivalents import to_python
 from .fast_path import validate_fields
 from .float32 import float32_overflows, round_to_float32
 from .px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
@@ -119,6 +120,20 @@ class VehicleLocalPosition(BaseModel):
 
         # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
         __init__.__pydantic_base_init__ = True
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """Validate, and where that fails once more with what NumPy and JSON have in place of Python's values."""
+        try:
+            return validate(fields)
+        except ValidationError:
+            if not isinstance(fields, dict):
+                raise
+            converted = to_python(fields)
+            if all(converted[name] is value for name, value in fields.items()):
+                raise
+        return validate(converted)
 
     @model_validator(mode="after")
     def _round_and_check(self) -> Self:

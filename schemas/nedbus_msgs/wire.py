@@ -172,6 +172,9 @@ def _unpack_fields(payload: bytes, newer: Mapping[int, Sequence[str]]) -> dict[s
         raise DecodeError(f"{len(values)} fields where layout {layout} has {len(names)}")
     for name, value in zip(names, values, strict=True):
         # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
-        if isinstance(value, tuple) and any(isinstance(item, tuple) for item in value):
+        parts = value if isinstance(value, tuple) else (value,)
+        if isinstance(value, tuple) and any(isinstance(part, tuple) for part in parts):
             raise DecodeError(f"{name}: an array within an array")
+        if any(isinstance(part, str) for part in parts):  # which the model accepts as "NaN", from JSON
+            raise DecodeError(f"{name}: text, where msgpack has numbers and bools")
     return dict(zip(names, values, strict=True))

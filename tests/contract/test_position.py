@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, describe, json_schema
+from nedbus_msgs.arrays import to_array
 
 from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, messages
 
@@ -195,3 +198,53 @@ def test_messages_are_equal_by_their_values() -> None:
     assert one != VehicleLocalPosition(timestamp=1, x=0.5, delta_xy=(0.0, math.nan))
     assert one != VehicleLocalPosition(timestamp=1)
     assert one != "message"
+
+
+def test_json_is_read_back_by_every_validation() -> None:
+    """What model_dump_json writes, with names for NaN and infinities and lists for pairs, makes the message again."""
+    message = VehicleLocalPosition(timestamp=1, x=math.inf, vxy_max=-math.inf, delta_xy=(1.0, math.nan))
+    document = message.model_dump_json()
+    assert VehicleLocalPosition.model_validate_json(document) == message
+    assert VehicleLocalPosition.model_validate(json.loads(document)) == message
+    assert VehicleLocalPosition(**json.loads(document)) == message
+
+
+@pytest.mark.parametrize(
+    "fields", [{"x": "nan"}, {"x": "1.0"}, {"timestamp": "NaN"}, {"xy_valid": "NaN"}, {"delta_xy": [1.0]}, {"x": [1.0]}]
+)
+def test_only_what_json_writes_is_read_back(fields: dict[str, object]) -> None:
+    """The model stays strict: other text, and other lengths, are no numbers."""
+    with pytest.raises(ValidationError) as info:
+        VehicleLocalPosition.model_validate({"timestamp": 1, **fields})
+    assert [detail["loc"][0] for detail in info.value.errors()] == list(fields)
+
+
+def test_numpy_scalars_make_a_message() -> None:
+    """What arrays hold can be given to the model, also beside Python's values; what does not fit is rejected."""
+    array = np.array([1.5, np.nan], "f4")
+    scalars = {
+        "timestamp": np.uint64(2**63),
+        "xy_reset_counter": np.uint8(7),
+        "xy_valid": np.bool_(True),
+        "x": array[0],
+    }
+    message = VehicleLocalPosition.model_validate({**scalars, "y": 0.5, "delta_xy": array})
+    assert message == VehicleLocalPosition(
+        timestamp=2**63, xy_reset_counter=7, xy_valid=True, x=1.5, y=0.5, delta_xy=(1.5, math.nan)
+    )
+    assert {type(value) for value in message.__dict__.values()} == {int, bool, float, tuple}
+    for wrong in (
+        {"xy_valid": np.uint8(1)},
+        {"timestamp": np.int64(-1)},
+        {"xy_reset_counter": np.uint16(256)},
+        {"x": array},
+    ):
+        with pytest.raises(ValidationError):
+            VehicleLocalPosition.model_validate({"timestamp": 1, **wrong})
+
+
+def test_element_of_an_array_makes_a_message() -> None:
+    """`dict(zip(names, element))` of what `nedbus.read` returns is a message."""
+    [element] = to_array([VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))])
+    fields = {name: element[name] for name in FIELD_TYPES}
+    assert VehicleLocalPosition(**fields) == VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))
