@@ -124,13 +124,18 @@ class Client(Protocol):
     @property
     def connected(self) -> bool: ...
     def subscribe(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self,
+        topic: str = DEFAULT_TOPIC,
+        *,
+        vehicle: str | int = "*",
+        instance: int | None = None,
+        mode: Mode = "latest",
     ) -> SubscriptionFace: ...
     def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = "*", instance: int | None = None
     ) -> list[nedbus.Sample]: ...
     def vehicles(self) -> dict[str, list[Address]]: ...
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> PublisherFace: ...
+    def publisher(self, topic: str, *, vehicle: str | int, instance: int | None = None) -> PublisherFace: ...
     def services(self) -> list[dict[str, object]]: ...
     def close(self) -> None: ...
 
@@ -173,7 +178,12 @@ class SyncClient:
         return self._bus.connected
 
     def subscribe(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self,
+        topic: str = DEFAULT_TOPIC,
+        *,
+        vehicle: str | int = "*",
+        instance: int | None = None,
+        mode: Mode = "latest",
     ) -> SubscriptionFace:
         return SyncSubscription(self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode))
 
@@ -250,7 +260,12 @@ class BlockingClient:
         return self._bus.connected
 
     def subscribe(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None, mode: Mode = "latest"
+        self,
+        topic: str = DEFAULT_TOPIC,
+        *,
+        vehicle: str | int = "*",
+        instance: int | None = None,
+        mode: Mode = "latest",
     ) -> SubscriptionFace:
         async def subscribe() -> nedbus.AsyncSubscription:
             return self._bus.subscribe(topic, vehicle=vehicle, instance=instance, mode=mode)
@@ -258,14 +273,14 @@ class BlockingClient:
         return BlockingSubscription(self._runner, self._run(subscribe()))
 
     def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = "*", instance: int | None = None
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = "*", instance: int | None = None
     ) -> list[nedbus.Sample]:
         return self._run(self._bus.latest(topic, vehicle=vehicle, instance=instance))
 
     def vehicles(self) -> dict[str, list[Address]]:
         return self._run(self._bus.vehicles())
 
-    def publisher(self, topic: str, *, vehicle: str, instance: int | None = None) -> PublisherFace:
+    def publisher(self, topic: str, *, vehicle: str | int, instance: int | None = None) -> PublisherFace:
         publisher = self._run(self._bus.publisher(topic, vehicle=vehicle, instance=instance))
         return BlockingPublisher(self._runner, publisher)
 

@@ -45,6 +45,7 @@ from .topics import (
     get_topic,
     schema_key,
     status_key,
+    vehicle_name,
 )
 from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, decode_row, describe, encode, encode_fields, encode_row
 
@@ -126,6 +127,7 @@ __all__ = [
     "upgraded_names",
     "variances_enu_to_ned",
     "variances_ned_to_enu",
+    "vehicle_name",
     "wrap",
     "yaw_enu_to_ned",
     "yaw_ned_to_enu",

@@ -54,6 +54,14 @@ _CDR: Final = np.dtype(
         "itemsize": len(_ZEROS_IN_CDR),
     }
 )
+_CDR_BOOLS: Final = np.dtype(
+    {
+        "names": [name for name, kind in FIELD_TYPES.items() if kind == "bool"],
+        "formats": ["u1" for kind in FIELD_TYPES.values() if kind == "bool"],
+        "offsets": [_CDR_OFFSETS[name] for name, kind in FIELD_TYPES.items() if kind == "bool"],
+        "itemsize": len(_ZEROS_IN_CDR),
+    }
+)
 _WORDS: Final = PAYLOAD_SIZE // 4  # 32-bit words of a payload
 _TAG_WORDS = np.frombuffer(TAGS.to_bytes(PAYLOAD_SIZE, "big"), "u4")
 _TAG_MASK_WORDS = np.frombuffer(TAG_MASK.to_bytes(PAYLOAD_SIZE, "big"), "u4")
@@ -98,9 +106,19 @@ def encode_cdr_array(array: MessageArray) -> npt.NDArray[np.void]:
     return payloads
 
 
-def decode_cdr_array(payloads: bytes) -> MessageArray:
-    """Return the messages of concatenated CDR payloads of the current layout, without validating them."""
-    return np.frombuffer(payloads, _CDR).astype(DTYPE)
+def decode_cdr_array(payloads: Sequence[bytes]) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
+    """Return the messages of CDR payloads of the current layout, and a mask of those that are valid.
+
+    A payload that is False in the mask may still be valid: `decode_cdr` and the model decide.
+    """
+    size = len(_ZEROS_IN_CDR)
+    fits = np.array([len(each) == size and each[:2] == _ZEROS_IN_CDR[:2] for each in payloads], bool)
+    data = b"".join(each if fit else _ZEROS_IN_CDR for each, fit in zip(payloads, fits.tolist(), strict=True))
+    bools = np.frombuffer(data, _CDR_BOOLS)
+    for name in _CDR_BOOLS.names or ():
+        fits &= bools[name] <= 1
+    array = np.frombuffer(data, _CDR).astype(DTYPE)
+    return array, fits & valid_mask(array)
 
 
 def valid_mask(array: MessageArray) -> npt.NDArray[np.bool_]:

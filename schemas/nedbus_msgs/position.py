@@ -199,7 +199,7 @@ def _fill(message: VehicleLocalPosition, values: dict[str, object]) -> None:
     _set_private(message, None)
 
 
-# What Pydantic's own validator sets on an instance; the model is frozen, so this sets its slots.
+# What Pydantic's own validator sets on an instance (2.12 to 2.x); the model is frozen, so this sets its slots.
 _ALL: Final = frozenset(NAMES)
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[VehicleLocalPosition, object], None]", vars(BaseModel)[slot].__set__)

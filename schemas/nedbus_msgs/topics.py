@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, cast
 
 from .errors import AddressError
 
@@ -168,6 +168,11 @@ def get_topic(name: object) -> Topic:
     if not isinstance(name, str) or name not in TOPICS:
         raise AddressError("topic", name, f"one of {', '.join(TOPICS)}")
     return TOPICS[name]
+
+
+def vehicle_name(vehicle: str | int) -> str:
+    """Return the name of a vehicle that is given by name or by number, such as a MAVLink system id."""
+    return str(vehicle) if type(vehicle) is int else cast("str", vehicle)
 
 
 def check_vehicle(vehicle: object) -> None:

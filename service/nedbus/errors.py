@@ -91,11 +91,12 @@ _TLS_HINT = (
 class ConnectError(NedbusError, ConnectionError):
     """Raised when no endpoint answered in time."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float) -> None:
+    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
         secure = any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints)
+        tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         super().__init__(
-            f"nothing answers at {' or '.join(endpoints)} (tried for {seconds:.3g} s): start 'nedbus serve' or a Zenoh"
-            " router there, or name another endpoint with --connect or NEDBUS_CONNECT"
+            f"nothing answers at {' or '.join(endpoints)} ({tried}): start 'nedbus serve' or a Zenoh router there, or"
+            " name another endpoint with --connect or NEDBUS_CONNECT"
             + ("; a router that does answer refuses a certificate without a word:" + _TLS_HINT if secure else "")
         )
         self.endpoints = tuple(endpoints)
@@ -132,7 +133,7 @@ class OutputError(NedbusError, OSError):
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {
             errno.EEXIST: "choose another name, or remove it",
-            errno.ENOSPC: "free some space, or write elsewhere; what was flushed before can be read",
+            errno.ENOSPC: "free some space, or write elsewhere",
         }
         hint = hints.get(error.errno or 0, "check that its folder exists and that this user may write there")
         super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import copy
 import datetime as dt
 import gc
 import json
 import logging
 import math
+import pickle
 import signal
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from functools import partial
 from typing import cast
 
@@ -732,3 +735,79 @@ def test_last_value_in_a_newer_layout_is_read(client: Client, raw: Session) -> N
     wait_for(lambda: [sample.message.x for sample in client.latest()] == [2.5], what="the message")
     for queryable in queryables:
         queryable.undeclare()
+
+
+def test_vehicle_may_be_a_number(client: Client, bus: nedbus.Bus) -> None:
+    """A MAVLink system id names a vehicle as it does in the settings."""
+    bus.publisher(VLP, vehicle=7).publish(message(1))
+    assert client.subscribe(vehicle=7).receive(DEADLINE).vehicle == "7"
+    assert [sample.vehicle for sample in client.latest(vehicle=7)] == ["7"]
+    assert client.latest(vehicle=8) == []
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
+def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
+    """A script may queue samples for another process, or keep them in a set; the time when it was sent stays exact."""
+    bus.publisher(VLP, vehicle="1", source="test").publish(message(1, x=math.nan))
+    sample = bus.subscribe().receive(DEADLINE)
+    again = copied(sample)
+    assert again == sample
+    assert (again.sent, again.source, again.missing) == (sample.sent, "test", sample.missing)
+    assert len({sample, again}) == 1
+    assert again != nedbus.Sample(sample.message, sample.address, sample.received)
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> None:
+    """Each message goes to one of them, and neither fails, in either mode."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    subscription = bus.subscribe(mode=mode)
+    wait_for_reader(bus._session, publisher.key)
+    taken: list[int] = []
+
+    def read() -> None:
+        taken.extend(sample.message.timestamp for sample in subscription)
+
+    threads = [threading.Thread(target=read) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for timestamp in range(1, 2001):
+        publisher.publish(message(timestamp))
+    wait_for(lambda: 2000 in taken, what="the last message")
+    if mode == "every":
+        wait_for(lambda: len(taken) == 2000, what="all others")
+    subscription.close()
+    for thread in threads:
+        thread.join(DEADLINE)
+        assert not thread.is_alive()
+    assert len(taken) == len(set(taken)) == subscription.counts.received
+
+
+def test_unexpected_error_in_the_pump_is_counted(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A bug that one sample triggers costs that sample, is logged, and the reader goes on."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = bus.subscribe(mode="every")
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    with monkeypatch.context() as patched:
+        patched.setattr(subscription._queue._decoder, "admit", lambda _: 1 / 0)
+        publisher.publish(message(2))
+        wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
+    publisher.publish(message(3))
+    assert subscription.receive(DEADLINE).message.timestamp == 3
+    assert any("left out after an unexpected error" in text for text in caplog.messages)
+
+
+def test_unexpected_error_in_an_answer_leaves_others_answered(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread that answers queries survives a bug in one answer."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    wait_for(partial(answers, raw, publisher.key), what="an answer")
+    with monkeypatch.context() as patched:
+        patched.setattr(nedbus.Publisher, "last", property(lambda _: 1 / 0), raising=False)
+        assert answers(raw, publisher.key) == 0
+    assert answers(raw, publisher.key) == 1

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Self
 
 from nedbus.errors import ClosedError
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .async_publisher import AsyncPublisher
 from .async_subscription import AsyncSubscription
@@ -16,7 +16,10 @@ from .sample import Mode, Sample
 
 
 class AsyncBus:
-    """The twin of Bus for asyncio, from `connect_async`: the same methods, awaited where they wait."""
+    """The twin of Bus for asyncio, from `connect_async`: the same methods, awaited where they wait.
+
+    Of `open_session` there is no twin, as Zenoh's sessions block.
+    """
 
     def __init__(self, open_bus: Callable[[], Bus]) -> None:
         self._open_bus = open_bus
@@ -27,17 +30,37 @@ class AsyncBus:
         """Whether there is a link to a router at this moment."""
         return self._opened().connected
 
+    @property
+    def prefix(self) -> str:
+        """The first chunks of every key."""
+        return self._opened().prefix
+
+    @property
+    def routers(self) -> tuple[str, ...]:
+        """The endpoints that it joins."""
+        return self._opened().routers
+
     def subscribe(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, mode: Mode = "latest"
+        self,
+        topic: str = DEFAULT_TOPIC,
+        *,
+        vehicle: str | int = ANY,
+        instance: int | None = None,
+        mode: Mode = "latest",
     ) -> AsyncSubscription:
         """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
+        self._opened()
+        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode)
+
+    def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> AsyncSubscription:
+        """Subscribe to a selection of addresses, as `subscribe` does."""
         bus = self._opened()
         receive_queue = bus._make_queue(mode)
-        key_expr = Selection(topic, vehicle, instance).key_expr(prefix=bus.prefix)
+        key_expr = selection.key_expr(prefix=bus.prefix)
         return AsyncSubscription(lambda: bus._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr)
 
     async def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, timeout: float = 2.0
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
     ) -> list[Sample]:
         """Return the last sample of each key as `Bus.latest` does."""
         bus = self._opened()
@@ -55,7 +78,7 @@ class AsyncBus:
         self,
         topic: str,
         *,
-        vehicle: str,
+        vehicle: str | int,
         instance: int | None = None,
         lossless: bool = False,
         source: str | None = None,

@@ -36,6 +36,16 @@ class AsyncPublisher:
         return self._publisher.key
 
     @property
+    def source(self) -> str | None:
+        """Where its messages come from, as readers see it."""
+        return self._publisher.source
+
+    @property
+    def lossless(self) -> bool:
+        """Whether `publish` waits for slow readers."""
+        return self._publisher.lossless
+
+    @property
     def published(self) -> int:
         """How many messages it has published."""
         return self._publisher.published

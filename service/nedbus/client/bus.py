@@ -10,7 +10,7 @@ from typing import Self
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, decode
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, decode, vehicle_name
 
 from .closing import Finalizer
 from .decoder import Decoder
@@ -29,7 +29,7 @@ from .zenoh_subscriber import ZenohSubscriber
 class Bus:
     """A connection to a router, from `connect`.
 
-    Topics, vehicles and instances are selected by name; "*" and None stand for any.
+    Topics and vehicles are selected by name, instances by number; "*" and None stand for any; vehicle 7 is "7".
     All methods may be called from any thread; an invalid name raises AddressError, a closed bus ClosedError.
     """
 
@@ -51,7 +51,12 @@ class Bus:
         return bool(self._session.info.routers_zid())
 
     def subscribe(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, mode: Mode = "latest"
+        self,
+        topic: str = DEFAULT_TOPIC,
+        *,
+        vehicle: str | int = ANY,
+        instance: int | None = None,
+        mode: Mode = "latest",
     ) -> Subscription:
         """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
 
@@ -63,7 +68,7 @@ class Bus:
         Raises ConnectError when mode "every" cannot open its session, because the router is away at this moment.
         """
         self._require_open()
-        return self.subscribe_to(Selection(topic, vehicle, instance), mode=mode)
+        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode)
 
     def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> Subscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
@@ -72,7 +77,7 @@ class Bus:
         return Subscription(self._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr, owner=self)
 
     def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str = ANY, instance: int | None = None, timeout: float = 2.0
+        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
     ) -> list[Sample]:
         """Return the last sample of each key, sorted by address; `latency` is then its age.
 
@@ -81,7 +86,7 @@ class Bus:
         The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
         self._require_open()
-        key_expr = Selection(topic, vehicle, instance).key_expr(prefix=self.prefix)
+        key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = self._make_decoder()
         newest: dict[Address, Sample] = {}
         for raw in decoder.admit(query(self._session, key_expr, timeout=timeout, newest=False)):
@@ -111,7 +116,7 @@ class Bus:
         self,
         topic: str,
         *,
-        vehicle: str,
+        vehicle: str | int,
         instance: int | None = None,
         lossless: bool = False,
         source: str | None = None,
@@ -124,7 +129,7 @@ class Bus:
         """
         self._require_open()
         return self._publishers.publisher(
-            Address(vehicle, topic, instance), lossless=lossless, source=source, owner=self
+            Address(vehicle_name(vehicle), topic, instance), lossless=lossless, source=source, owner=self
         )
 
     def open_session(self, endpoint: str | None = None, *, timeout: float = 3.0) -> Session:

@@ -107,10 +107,15 @@ class Decoder:
                 continue  # `decode` rejects it
         return found
 
+    def count_invalid(self, count: int) -> None:
+        """Count invalid samples."""
+        with self._counting:
+            self.invalid += count
+
     def reject(self, key: str, error: Exception) -> None:
         """Count an invalid sample, and log why, once for each key."""
+        self.count_invalid(1)
         with self._counting:
-            self.invalid += 1
             if key in self._warned or len(self._warned) >= MAX_KEYS:
                 return
             self._warned.add(key)

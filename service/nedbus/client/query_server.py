@@ -82,6 +82,7 @@ class QueryServer:
     def _run(self) -> None:
         while (item := self._pending.get()) is not None:
             query, reply = item
+            key_expr = str(query.key_expr)  # a query that has ended does not tell it any more
             try:
                 with query:
                     for each in reply(query):
@@ -93,6 +94,6 @@ class QueryServer:
                             attachment=each.attachment,
                         )
             except zenoh.ZError as exc:
-                _log.debug("a query on %s could not be answered: %s", query.key_expr, exc)
+                _log.debug("a query on %s could not be answered: %s", key_expr, exc)
             except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
-                _log.exception("a query on %s is not answered", query.key_expr)
+                _log.exception("a query on %s is not answered", key_expr)

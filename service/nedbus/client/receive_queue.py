@@ -62,6 +62,10 @@ class ReceiveQueue:
         """Note that messages were lost in transit; called on Zenoh's thread, before the next sample."""
         self._announcements.append(miss)
 
+    def count_invalid(self, count: int) -> None:
+        """Count samples that could not be queued."""
+        self._decoder.count_invalid(count)
+
     def put(self, batch: Sequence[RawSample]) -> None:
         """Queue what arrived, in its order; what is not worth queueing is rejected."""
         admitted = self._decoder.admit(batch)
@@ -96,26 +100,14 @@ class ReceiveQueue:
     def wait_for_capacity(self) -> None:
         """Wait until fewer than 1,024 samples are queued, or the queue has ended."""
         with self._lock:
-            self._full = True  # before the look at the queue, as readers take without the lock
+            self._full = True
             self._capacity.wait_for(lambda: len(self._every) < CAPACITY or self.ended)
             self._full = False
 
     def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
-        while True:
-            if self._every:
-                raw = self._every.popleft()
-                self._notify_capacity()
-                key = str(raw.key_expr)
-                with self._lock:
-                    self._apply_announcements()
-                    lost = self._follow(key, raw)
-            elif self._newest:
-                with self._lock:
-                    key = next(iter(self._newest))
-                    raw, lost = self._newest.pop(key)
-            else:
-                return None
+        while (taken := self._take()) is not None:
+            raw, key, lost = taken
             if self._unreported:
                 lost += self._unreported.pop(key, 0)
             sample = self._decoder.decode(raw, key, decode, lost=lost)
@@ -124,6 +116,7 @@ class ReceiveQueue:
                 return sample
             if lost and len(self._unreported) < MAX_KEYS:
                 self._unreported[key] = lost
+        return None
 
     def pop_batch(self) -> Batch | None:
         """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
@@ -155,6 +148,23 @@ class ReceiveQueue:
         self._lost_in_batches += lost
         return batch
 
+    def _take(self) -> tuple[RawSample, str, int] | None:
+        """Take the next sample, its key, and how many were lost before it; several threads may take."""
+        with self._lock:
+            if self._every:
+                raw = self._every.popleft()
+                if self._full and len(self._every) <= CAPACITY // 2:
+                    self._full = False
+                    self._capacity.notify_all()
+                self._apply_announcements()
+                key = str(raw.key_expr)
+                return raw, key, self._follow(key, raw)
+            if self._newest:
+                key = next(iter(self._newest))
+                raw, lost = self._newest.pop(key)
+                return raw, key, lost
+        return None
+
     def _decode_row(self, raw: RawSample, key: str) -> Row | None:
         sample = self._decoder.decode(raw, key, decode_row)
         return None if sample is None else sample.message
@@ -180,12 +190,6 @@ class ReceiveQueue:
         while self._announcements:
             miss = self._announcements.popleft()
             self._tracker.announce(str(miss.source), miss.nb)
-
-    def _notify_capacity(self) -> None:
-        if self._full and len(self._every) <= CAPACITY // 2:
-            with self._lock:
-                self._full = False
-                self._capacity.notify_all()
 
     def _wake_reader(self) -> None:
         if self._wakeups.empty():

@@ -20,14 +20,13 @@ M_co = TypeVar("M_co", bound=VehicleLocalPosition | Row, default=VehicleLocalPos
 _UNKNOWN: Final = Provenance()
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Sample(Generic[M_co]):
     """One message that arrived.
 
     `message`: the validated message; a Row, which has the same fields, from `rows()`.
     `address`: vehicle, topic and instance, also as attributes of their own.
     `received`: when it was decoded here, ns since the epoch.
-    `stamp`: Zenoh's timestamp, None if its publisher set none.
     `lost`: messages of this key that were lost in transit just before this one.
     `provenance`: the source and the fields that it did not provide, also as `source` and `missing`.
     `stored`: from `bus.latest()` only: no publisher answers for this address, but a storage that kept its last message.
@@ -36,7 +35,7 @@ class Sample(Generic[M_co]):
     message: M_co
     address: Address
     received: int
-    stamp: zenoh.Timestamp | None = None
+    _stamp: zenoh.Timestamp | int | None = None  # Zenoh's timestamp, read when it is asked for; or ns since the epoch
     lost: int = 0
     provenance: Provenance = _UNKNOWN
     stored: bool = False
@@ -44,7 +43,8 @@ class Sample(Generic[M_co]):
     @property
     def sent(self) -> int | None:
         """When its publisher sent it, ns since the epoch by the publisher's clock; None without a timestamp."""
-        return None if self.stamp is None else self.stamp.get_time_as_ntp64().as_nanos()
+        stamp = self._stamp
+        return stamp if stamp is None or isinstance(stamp, int) else stamp.get_time_as_ntp64().as_nanos()
 
     @property
     def vehicle(self) -> str:
@@ -79,6 +79,19 @@ class Sample(Generic[M_co]):
         """Seconds from sent to received, None without a timestamp; as good as the two hosts' clocks agree."""
         sent = self.sent
         return None if sent is None else (self.received - sent) / 1e9
+
+    def __eq__(self, other: object) -> bool:
+        """Compare everything; NaN equals NaN in a VehicleLocalPosition."""
+        return self._state() == other._state() if isinstance(other, Sample) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash((self.address, self.received, self.message.timestamp))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), self._state()  # Zenoh's timestamp cannot be pickled
+
+    def _state(self) -> tuple[object, ...]:
+        return self.message, self.address, self.received, self.sent, self.lost, self.provenance, self.stored
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from contextlib import suppress
@@ -13,6 +14,8 @@ from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
 from .receive_queue import ReceiveQueue
+
+_log = logging.getLogger(__name__)
 
 _RING: Final = 4096  # samples that wait for the pump of a `latest` reader
 _FIFO: Final = 4096  # samples that wait for the pump of an `every` reader; then Zenoh holds back, drops and recovers
@@ -34,6 +37,7 @@ class ZenohSubscriber:
     def __init__(self, session: Session, key_expr: str, receive_queue: ReceiveQueue) -> None:
         every = not receive_queue.newest_only
         self._queue = receive_queue
+        self._name = key_expr
         self._session = session if every else None
         self._closing = threading.Lock()
         self._closed = False
@@ -71,13 +75,25 @@ class ZenohSubscriber:
         self._pump.join(1.0)
 
     def _run(self) -> None:
-        while batch := _receive(self._handler):
-            if not self._queue.ended:
-                self._queue.put(batch)
-                self._queue.wait_for_capacity()
-                if len(batch) >= _BUSY:
-                    time.sleep(_PAUSE)
-        self._queue.end()
+        try:
+            while batch := _receive(self._handler):
+                if not self._queue.ended:
+                    self._put(batch)
+                    self._queue.wait_for_capacity()
+                    if len(batch) >= _BUSY:
+                        time.sleep(_PAUSE)
+        except BaseException:
+            _log.exception("%s: the subscription ends after an unexpected error", self._name)
+            raise
+        finally:
+            self._queue.end()  # nobody waits for a pump that has ended
+
+    def _put(self, batch: list[zenoh.Sample]) -> None:
+        try:
+            self._queue.put(batch)
+        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
+            _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch))
+            self._queue.count_invalid(len(batch))
 
 
 def _receive(handler: zenoh.Handler[_T]) -> list[_T]:

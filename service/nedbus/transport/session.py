@@ -94,7 +94,7 @@ def open_client(
         # No peer on the network is trusted: the largest answer that is expected is a status of many sources.
         "transport/link/rx/max_message_size": 2**18,
     }
-    start = time.monotonic()
+    start, reason = time.monotonic(), ""
     stop = stop or threading.Event()
     for pause in chain(_PAUSES, repeat(1.0)):
         # An endpoint that accepts and then sends nothing may not use up more than the time that there is.
@@ -102,11 +102,13 @@ def open_client(
         settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
         try:
             return open_session(insert_settings(zenoh.Config(), settings, where="connect"))
-        except zenoh.ZError:
+        except zenoh.ZError as exc:
+            reason = error_reason(exc)
             left = start + timeout - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
                 break
-    raise ConnectError(endpoints, timeout)
+    # Of most failures Zenoh says no more than that there is no connection.
+    raise ConnectError(endpoints, timeout, "" if "Unable to connect" in reason else reason)
 
 
 def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:
