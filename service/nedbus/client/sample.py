@@ -27,6 +27,7 @@ class Sample(Generic[M_co]):
     `message`: the validated message; a Row, which has the same fields, from `rows()`.
     `address`: vehicle, topic and instance, also as attributes of their own.
     `received`: when it was decoded here, ns since the epoch.
+    `stamp`: Zenoh's timestamp, with the id of the clock; None without one, and in a copy.
     `lost`: messages of this key that were lost in transit just before this one.
     `provenance`: the source and the fields that it did not provide, also as `source` and `missing`.
     `stored`: from `bus.latest()` only: no publisher answers for this address, but a storage that kept its last message.
@@ -35,16 +36,16 @@ class Sample(Generic[M_co]):
     message: M_co
     address: Address
     received: int
-    _stamp: zenoh.Timestamp | int | None = None  # Zenoh's timestamp, read when it is asked for; or ns since the epoch
+    stamp: zenoh.Timestamp | None = None
     lost: int = 0
     provenance: Provenance = _UNKNOWN
     stored: bool = False
+    _sent: int | None = None  # of a copy, as Zenoh's timestamp cannot be pickled
 
     @property
     def sent(self) -> int | None:
         """When its publisher sent it, ns since the epoch by the publisher's clock; None without a timestamp."""
-        stamp = self._stamp
-        return stamp if stamp is None or isinstance(stamp, int) else stamp.get_time_as_ntp64().as_nanos()
+        return self._sent if self.stamp is None else self.stamp.get_time_as_ntp64().as_nanos()
 
     @property
     def vehicle(self) -> str:
@@ -88,10 +89,11 @@ class Sample(Generic[M_co]):
         return hash((self.address, self.received, self.message.timestamp))
 
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), self._state()  # Zenoh's timestamp cannot be pickled
+        return type(self), self._state()
 
     def _state(self) -> tuple[object, ...]:
-        return self.message, self.address, self.received, self.sent, self.lost, self.provenance, self.stored
+        facts = (self.message, self.address, self.received, None, self.lost, self.provenance, self.stored)
+        return (*facts, self.sent)
 
 
 @dataclass(frozen=True, slots=True)
