@@ -43,18 +43,23 @@ def violations(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
 
 
 def make_fast_check(indexes: Mapping[str, Any]) -> Callable[[Any], bool]:
-    """Return a function that returns True only if values pass the rules; each field is at its index of the values.
+    """Return a function that returns whether values pass the rules; each field is at its index of the values.
 
-    False may be wrong: `violations` decides.
+    `violations` has the reasons.
     """
+    flagged = tuple((indexes[flag.name], tuple(indexes[name] for name in flag.fields)) for flag in FLAGS.values())
     get_flagged = _getter(indexes, [name for flag in FLAGS.values() for name in flag.fields])
     get_not_negative = _getter(indexes, NOT_NEGATIVE)
     bounds = tuple((indexes[name], bound) for name, bound in WITHIN.items())
     timestamp, timestamp_sample = indexes["timestamp"], indexes["timestamp_sample"]
 
     def passes_rules(values: Any) -> bool:
-        if not math.isfinite(sum(get_flagged(values))):  # one that is not finite makes the sum not finite
-            return False
+        if not math.isfinite(sum(get_flagged(values))):  # one of them is not finite: perhaps its flag is not set
+            for flag, fields in flagged:
+                if values[flag]:
+                    for field in fields:
+                        if not math.isfinite(values[field]):
+                            return False
         if min(0.0, *get_not_negative(values)) < 0.0:
             return False
         for index, bound in bounds:

@@ -142,9 +142,7 @@ def _decode_full_width(payload: bytes) -> Values | None:
     number = int.from_bytes(payload, "big")
     if number & TAG_MASK != TAGS:
         return None
-    flat = _FIXED.unpack((number & _VALUE_MASK).to_bytes(PAYLOAD_SIZE, "big"))
-    first, second = flat[_FIRST : _FIRST + 2], flat[_SECOND + 1 : _SECOND + 3]
-    return check_row((*flat[:_FIRST], first, *flat[_FIRST + 2 : _SECOND + 1], second, *flat[_SECOND + 3 :]))
+    return check_row(msgpack.unpackb(payload, use_list=False)[1:])
 
 
 def _decode_any(payload: bytes, newer: Mapping[int, Sequence[str]] | None) -> VehicleLocalPosition:
