@@ -25,7 +25,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.transport import Session, open_router
+from nedbus.transport import Session, ask_alive_keys, open_router
 from nedbus_msgs import TOPICS, Address, encode
 from tests.conftest import DEADLINE, Client, Start, free_endpoint, message, wait_for, wait_for_reader
 
@@ -168,6 +168,10 @@ def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
             one.publisher(VLP, vehicle=str(number)).publish(message(1))
         for asking in (one, other):
             wait_for(partial(has_all, asking), what="600 vehicles, each with an answer")
+
+
+def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
+    return len(bus.vehicles()) == count
 
 
 def has_all(bus: nedbus.Bus) -> bool:
@@ -811,3 +815,31 @@ def test_unexpected_error_in_an_answer_leaves_others_answered(
         patched.setattr(nedbus.Publisher, "last", property(lambda _: 1 / 0), raising=False)
         assert answers(raw, publisher.key) == 0
     assert answers(raw, publisher.key) == 1
+
+
+def test_vehicles_are_asked_for_once(bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asking for all tokens costs everybody on the router: whoever asks again and again only follows them."""
+    asked: list[str] = []
+
+    def ask(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
+        asked.append(key_expr)
+        return ask_alive_keys(session, key_expr, timeout=timeout)
+
+    monkeypatch.setattr("nedbus.client.vehicle_directory.ask_alive_keys", ask)
+    with nedbus.connect(endpoint) as other:
+        for count, vehicle in enumerate("abc", 1):
+            other.publisher(VLP, vehicle=vehicle)
+            wait_for(partial(has_vehicles, bus, count), what=f"vehicle {vehicle}")
+    wait_for(lambda: not bus.vehicles(), what="the vehicles to go")
+    assert asked == ["nedbus/*/@alive/**"]
+
+
+def test_incomplete_list_of_vehicles_is_said(
+    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With more tokens than are kept, or a router that is too slow to list them, what is known is no whole list."""
+    monkeypatch.setattr(
+        "nedbus.client.vehicle_directory.ask_alive_keys", lambda *_, timeout: ([f"nedbus/1/@alive/{VLP}"], False)
+    )
+    assert list(bus.vehicles()) == list(bus.vehicles()) == ["1"]
+    assert len([text for text in caplog.messages if "not all liveliness tokens are known" in text]) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import logging
 import os
 import queue
 import threading
@@ -12,6 +13,8 @@ from collections.abc import Callable
 from typing import Final
 
 from nedbus.transport import is_forked
+
+_log = logging.getLogger(__name__)
 
 _DRAIN: Final = 2.0  # s that the end of a process waits for what is being closed
 _pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # may be filled in the midst of anything
@@ -60,7 +63,11 @@ def _close_later(close: Callable[[], object]) -> None:
 
 def _run() -> None:
     while True:
-        _pending.get()()
+        close = _pending.get()
+        try:
+            close()
+        except Exception:  # noqa: BLE001 - what cannot be closed must not keep all else open
+            _log.debug("something that was no longer referenced could not be closed", exc_info=True)
 
 
 @atexit.register

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
-from .queries import MAX_ANSWERS, alive_keys, ask_all, follow_alive_keys, query
+from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, ask_all, follow_alive_keys, query
 from .rmw_zenoh import (
+    BRIDGED_ENCODING,
     NO_HASH,
     Attachment,
     PublisherToken,
     TopicKey,
-    is_nedbus_gid,
-    make_gid,
+    gid_of_token,
     node_token,
     publisher_token,
     publishers_key_expr,
@@ -31,6 +31,7 @@ else:
     )
 
 __all__ = [
+    "BRIDGED_ENCODING",
     "CA_DAYS",
     "DAYS",
     "DEFAULT_ENDPOINT",
@@ -43,15 +44,15 @@ __all__ = [
     "Tls",
     "TopicKey",
     "alive_keys",
+    "ask_alive_keys",
     "ask_all",
     "check_endpoints",
     "dial_endpoint",
     "follow_alive_keys",
+    "gid_of_token",
     "is_forked",
-    "is_nedbus_gid",
     "make_authority",
     "make_certificate",
-    "make_gid",
     "node_token",
     "open_client",
     "open_router",

@@ -37,10 +37,19 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
+    keys, _ = ask_alive_keys(session, key_expr, timeout=timeout)
+    return keys
+
+
+def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
+    """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
     collector = _Collector()
     with while_open(session):
         session.liveliness().get(key_expr, collector.handler, timeout=_zenoh_timeout(timeout))
-    return sorted({str(reply.ok.key_expr) for reply in collector.wait(timeout) if reply.ok is not None})
+    answers = collector.wait(timeout)
+    keys = sorted({str(reply.ok.key_expr) for reply in answers if reply.ok is not None})
+    failed = any(reply.ok is None for reply in answers)  # Zenoh reports a timeout as an error
+    return keys, collector.complete and not failed and len(answers) < MAX_ANSWERS
 
 
 def follow_alive_keys(
