@@ -19,7 +19,7 @@ from tests.conftest import Start
 ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
-    "errors", "extras", "transport", "settings", "client", "recording", "sources", "daemon", "bridges", "cli",
+    "errors", "extras", "whole_file", "transport", "settings", "client", "recording", "sources", "daemon", "bridges", "cli",
 ]  # fmt: skip
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {
@@ -29,9 +29,10 @@ ONLY: dict[str, set[str]] = {
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
         "nedbus/client/acknowledgement",
         "nedbus/client/query_server", "nedbus/client/qos",
-        "nedbus/sources/px4_zenoh", "nedbus/bridges/ros2",
+        "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",
     },
     "msgpack": {"nedbus_msgs/wire"},
+    "xxhash": {"nedbus/transport/rmw_zenoh"},
     "numpy": {
         "nedbus_msgs/arrays", "nedbus/client/batch", "nedbus/sources/ulog",
         "nedbus/recording/ulog", "nedbus/recording/arrays", "nedbus/recording/plot",
@@ -39,7 +40,7 @@ ONLY: dict[str, set[str]] = {
     "pydantic": {
         "nedbus_msgs/position", "nedbus_msgs/px4_types", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
         "nedbus/settings", "nedbus/sources/options", "nedbus/sources/spec", "nedbus/daemon/output",
-        "nedbus/recording/conversion",
+        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status",
     },
     "pydantic_core": {
         "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus/client/publisher_registry",
@@ -47,8 +48,8 @@ ONLY: dict[str, set[str]] = {
     "pydantic_settings": {"nedbus/settings"},
     "typing_extensions": {"nedbus/client/sample"},
     "pyulog": {"nedbus/recording/ulog"},
-    "mcap": {"nedbus/recording/writer", "nedbus/recording/reader"},
-    "zstandard": {"nedbus/recording/reader"},
+    "mcap": {"nedbus/recording/writer", "nedbus/recording/reader", "nedbus/recording/chunks"},
+    "zstandard": {"nedbus/recording/chunks"},
     "pandas": {"nedbus/recording/arrays"},
     "polars": {"nedbus/recording/arrays"},
     "matplotlib": {"nedbus/recording/plot"},
@@ -56,10 +57,10 @@ ONLY: dict[str, set[str]] = {
     "serial": {"nedbus/sources/mavlink_link"},
     "foxglove": {"nedbus/bridges/foxglove", "nedbus/bridges/foxglove_messages"},
     "cryptography": {"nedbus/transport/pki"},
-    "rich": {"nedbus/cli/progress", "nedbus/cli/files"},
+    "rich": {"nedbus/cli/progress", "nedbus/cli/files", "nedbus/cli/live_table", "nedbus/cli/logs"},
     "typer": {
         "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
-        "nedbus/cli/query", "nedbus/cli/stream", "nedbus/cli/serve", "nedbus/cli/run",
+        "nedbus/cli/query", "nedbus/cli/echo", "nedbus/cli/health", "nedbus/cli/serve", "nedbus/cli/run",
     },
 }  # fmt: skip
 MAX_LINES = 250

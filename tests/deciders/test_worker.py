@@ -10,8 +10,9 @@ import pytest
 
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.worker import Worker
-from nedbus.errors import AddressInUseError, SourceError
+from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
+from nedbus.transport import Session
 from nedbus_msgs import Address, VehicleLocalPosition
 
 ONE, TWO = Address("1", "vehicle_local_position"), Address("2", "vehicle_local_position")
@@ -93,7 +94,7 @@ class FakeReplay:
     """A replay of these messages; each of `failures` is raised by one `open` before it works."""
 
     messages: list[SourceMessage]
-    failures: list[Exception] = field(default_factory=list)
+    failures: list[BaseException] = field(default_factory=list)
     speed: float | None = 1.0
     loop: bool = False
     wait: bool = False
@@ -114,11 +115,14 @@ class FakeLive:
 
     clock: StandingClock
     script: Script
+    failures: list[BaseException] = field(default_factory=list)
     closed: int = 0
 
-    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
         try:
             yield None
+            if self.failures:
+                raise self.failures.pop(0)
             for item in self.script:
                 if isinstance(item, float):
                     for _ in range(round(item * 4)):
@@ -208,7 +212,7 @@ def test_loop_does_not_spin() -> None:
 def test_failure_is_retried_with_growing_pauses() -> None:
     """1, 2, 4, 8, 16, 30, 30 s; the status has the reason until it works, and the addresses are free meanwhile."""
     clock = StandingClock()
-    failures: list[Exception] = [SourceError("flight.ulg", "no such file")] * 7
+    failures: list[BaseException] = [SourceError("flight.ulg", "no such file")] * 7
     worker, registry, _ = make(FakeReplay([at(0.0)], failures), clock)
     worker.run()
     assert clock.waits == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
@@ -231,6 +235,70 @@ def test_unexpected_error_stops_this_source_only() -> None:
     worker, _, _ = make(FakeReplay([at(0.0)], [ZeroDivisionError("1/0")]), StandingClock())
     worker.run()
     assert (worker.status.state, worker.status.retries) == ("done", 1)
+
+
+class PanicException(BaseException):
+    """What pyo3 raises when Rust panics, as Zenoh does under a clock before 1970."""
+
+
+@pytest.mark.parametrize("retry", [True, False])
+def test_panic_is_a_failure_of_the_source(retry: bool) -> None:
+    """What is no Exception is told as any other error: it never leaves a source "running" whose thread ended."""
+    clock = StandingClock(stop_at=100.0)
+    worker, _, ends = make(FakeReplay([at(0.0)], [PanicException("clock before 1970")] * 9), clock, retry=retry)
+    worker.run()
+    status = worker.status
+    assert (status.state, status.ended) == (("retrying", False) if retry else ("failed", True))
+    assert status.error == "an unexpected PanicException: clock before 1970"
+    assert ends == ["end"]
+
+
+def test_error_while_a_failure_is_handled_ends_the_source() -> None:
+    """Even an error that nobody handles leaves the source failed, with the reason."""
+
+    def panic() -> None:
+        raise PanicException("poisoned")
+
+    class Breaking(FakeReplay):
+        def open(self) -> ReplayRun:
+            return ReplayRun(self.break_(), (ONE,), 2, "a flight")
+
+        def break_(self) -> Iterator[SourceMessage]:
+            yield at(0.0)
+            registry.open[ONE].close = panic
+            raise ZeroDivisionError
+
+    worker, registry, ends = make(Breaking([]), StandingClock())
+    worker.run()
+    status = worker.status
+    assert (status.state, status.error) == ("failed", "an unexpected PanicException: poisoned")
+    assert ends == ["end"]
+
+
+def test_closed_session_is_a_failure_unless_the_service_is_stopped() -> None:
+    """A session that was closed meanwhile cannot be used again: the source has failed, and says why."""
+    worker, _, _ = make(FakeReplay([at(0.0)], [ClosedError()]), StandingClock())
+    worker.run()
+    assert (worker.status.state, worker.status.error) == ("failed", str(ClosedError()))
+    clock = StandingClock()
+
+    class Stopping(FakeReplay):
+        def open(self) -> ReplayRun:
+            clock.wait(1000.0)
+            raise ClosedError
+
+    worker, _, _ = make(Stopping([]), clock)
+    worker.run()
+    assert (worker.status.state, worker.status.error) == ("starting", None)
+
+
+def test_live_source_is_retried_without_retry() -> None:
+    """--until-done: a serial port that fails once does not end a live source; only replays have no second try."""
+    clock = StandingClock(stop_at=100.0)
+    source = FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")])
+    worker, registry, _ = make(source, clock, retry=False)
+    worker.run()
+    assert (times(registry), worker.status.state, worker.status.retries) == ([1.0], "done", 1)
 
 
 def test_taken_address_releases_the_others() -> None:
@@ -276,8 +344,8 @@ def test_live_states_follow_the_vehicles() -> None:
     states: list[tuple[str, tuple[str, ...]]] = []
 
     class Watched(FakeLive):
-        def listen(self) -> Iterator[SourceMessage | Rejection | None]:
-            for item in super().listen():
+        def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
+            for item in super().listen(None):
                 yield item
                 states.append((worker.status.state, worker.status.stale))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import signal
 import time
 from pathlib import Path
@@ -189,6 +190,40 @@ def source_of(status: dict[str, object], number: int = 0) -> dict[str, object]:
     source = sources[number]
     assert isinstance(source, dict)
     return source
+
+
+def test_pipe_is_an_error(tmp_path: Path, run_nedbus: Start) -> None:
+    """A FIFO is refused at once: opening it would wait for a writer, for ever and without a word."""
+    fifo = tmp_path / "flight.ulg"
+    os.mkfifo(fifo)
+    service = run_nedbus("serve", "-s", f"ulog:{fifo}")
+    assert service.wait() == 2
+    assert f"{fifo} is not a regular file: save it as one, then give that" in service.err
+
+
+@pytest.mark.parametrize("locale", ["C.UTF-8", "C"])
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        (b"what?.ulg", "what%3F.ulg"),
+        (b"what?.ulg", "what?.ulg?"),
+        (b"100%25.ulg", "100%2525.ulg"),
+        (b"a%20b.ulg", "a%20b.ulg"),
+        ("Flüge.ulg".encode(), "Flüge.ulg"),
+        (b"Fl\xfcge.ulg", os.fsdecode(b"Fl\xfcge.ulg")),
+    ],
+)
+def test_any_file_name_is_served(tmp_path: Path, run_nedbus: Start, name: bytes, written: str, locale: str) -> None:
+    """With ?, % or bytes that are no UTF-8 in it, and in the C locale: served, and named in the status."""
+    os.replace(write_log(tmp_path / "a.ulg", [0, 1000]), os.path.join(os.fsencode(tmp_path), name))  # noqa: PTH105, PTH118 - bytes
+    endpoint = free_endpoint()
+    text = f"ulog:{tmp_path}/{written}"
+    service = run_nedbus("serve", "-l", endpoint, "-s", text, LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    with until_connected(endpoint) as bus:
+        wait_for(lambda: [source_of(s)["state"] for s in bus.services()] == ["done"], what=f"the log: {service.err}")
+        status = source_of(bus.services()[0])
+        assert status["published"] == 2
+        assert str(status["source"]).startswith(f"ulog:{tmp_path}/")
 
 
 def test_loop_starts_again(tmp_path: Path, run_nedbus: Start) -> None:
@@ -405,6 +440,8 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
         (["-s", "sim:?speed=0"], "speed=0 is invalid: expected a factor from 0.001"),
         (["-s", "sim:?vehicle=a/b"], "vehicle=a/b is invalid: expected 1 to 64 of A-Z"),
         (["-s", "sim:?speed"], "'speed' is not OPTION=VALUE"),
+        (["-s", "ulog:a?b.ulg"], "'b.ulg' is not OPTION=VALUE&OPTION=VALUE, and a path with ? in it has %3F instead"),
+        (["-s", "ulog:/dev/null"], "/dev/null is not a regular file: save it as one, then give that"),
         (["-s", "sim:", "--until-done"], "until_done: no source ever ends"),
         (["-s", "sim:", "--listen", "7447"], "listen: '7447' is not an endpoint: write PROTOCOL/HOST:PORT"),
         (["-s", "sim:", "--config", "no.toml"], "no.toml: there is no such file"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import nedbus
-from nedbus_msgs import ROS2_TYPE
+from nedbus_msgs import LAYOUTS, ROS2_TYPE, type_hash
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, wait_for
 
 from .test_mavlink import Fly, fly, port
@@ -39,6 +39,12 @@ def test_all_commands_are_known() -> None:
     assert others == {"nedbus echo vehicle_local_position", 'pip install "nedbus[mavlink]"'}
     assert len(SERVES) == 5
     assert len(ROS2) == 6
+
+
+def test_hashes_are_those_of_the_layouts() -> None:
+    """The table by which a reader finds the layout of a workspace names each layout with the start of its hash."""
+    rows = re.findall(r"^\| `(RIHS01_\w{8})` \| (\S+)", PAGE, re.MULTILINE)
+    assert {layout: start for start, layout in rows} == {layout: type_hash(layout)[:15] for layout in LAYOUTS}
 
 
 @pytest.mark.parametrize("command", SERVES)

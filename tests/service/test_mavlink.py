@@ -11,6 +11,7 @@ import sys
 import time
 import tty
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -233,6 +234,56 @@ def test_invalid_estimates_are_rejected(
     wait_for(lambda: status(bus)["rejected"] == 2, what="both")
     assert "eph: must not be negative" in service.err
     assert "out of order: time_boot_ms 1500 after 2000" in service.err
+
+
+def test_denied_origin_is_told_once_and_not_before_there_can_be_one(service: Process, port: int) -> None:
+    """PX4 denies GPS_GLOBAL_ORIGIN until it has a global position: that is no news; a denial afterwards is, once."""
+    encoder, decoder = dialect.MAVLink(None, 9, 1), dialect.MAVLink(None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.settimeout(0.2)
+
+        def send(message: Any) -> None:
+            vehicle.sendto(message.pack(encoder), ("127.0.0.1", port))
+
+        def answer(flags: int, number: int) -> bool:
+            """Send a status, deny what is requested, and return whether this was."""
+            send(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0))
+            send(dialect.MAVLink_local_position_ned_message(round(time.monotonic() * 1000), *range(6)))
+            with suppress(TimeoutError):
+                for request in decoder.parse_buffer(vehicle.recv(65535)) or []:
+                    if request.get_type() == "COMMAND_LONG":
+                        denied = dialect.MAV_RESULT_DENIED
+                        send(dialect.MAVLink_command_ack_message(request.command, denied, 0, 0, 245, 191))
+                        if request.param1 == number:
+                            return True
+            return False
+
+        wait_for(lambda: answer(0b1111, ORIGIN), what="the request of an origin")
+        wait_for(lambda: "9/vehicle_local_position: does not send ODOMETRY" in service.err, what="the other denials")
+        assert "GPS_GLOBAL_ORIGIN" not in service.err
+        for _ in range(2):
+            wait_for(lambda: answer(0b11111, ORIGIN), what="the request of an origin")
+    wait_for(lambda: "does not send GPS_GLOBAL_ORIGIN when it is requested" in service.err, what="the denial")
+    assert service.err.count("GPS_GLOBAL_ORIGIN") == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (0b1111111111, True),  # at rest, since 48f1687d3a
+        (0b1101111111, True),  # in flight
+        (0b1101100101, False),  # GPS lost
+        (0b0010100101, False),  # the constant position mode, up to 1.15: no velocity, and no position
+        (0b0010111101, False),  # the same, of a release that keeps a position all the same
+    ],
+)
+def test_constant_position_mode_is_no_sign_of_rest(flags: int, expected: bool) -> None:
+    """Its bit counts where no horizontal velocity is valid: it was the opposite of that until PX4's 48f1687d3a."""
+    vehicle = Vehicle(30.0)
+    vehicle.handle(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0)
+    fields = vehicle.handle(position(1), 100.0)
+    assert fields is not None
+    assert fields["xy_valid"] is expected
 
 
 def test_broken_tcp_link_is_reopened(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import time
 from collections.abc import Callable, Iterator
@@ -10,13 +11,18 @@ from typing import Any, cast
 
 import pytest
 import zenoh
+from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 
 import nedbus
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.px4_streams import StreamRegistry, track_sequence
-from nedbus.transport import NO_HASH, Attachment, Session, TopicKey, make_gid
+from nedbus.sources.px4_streams import NotAcceptedError, StreamRegistry, track_sequence
+from nedbus.transport import BRIDGED_ENCODING, NO_HASH, Attachment, Session, TopicKey
 from nedbus_msgs import ANY, LAYOUTS, ROS2_TYPE, DecodeError, dds_type, downgrade, encode_cdr, type_hash, upgrade
-from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
+from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
+
+from .test_ros2 import Peer, flight, peer
+
+__all__ = ["peer"]  # a fixture
 
 VLP = "vehicle_local_position"
 GID = bytes(range(16))
@@ -239,6 +245,7 @@ def test_hostile_input_is_counted_and_logged(
     assert [(sample.vehicle, sample.message.timestamp) for sample in samples] == [("1", 1), ("1", 2)]
     assert every.counts.received == 2
     assert status(bus)["published"] == 2
+    assert "not a VehicleLocalPosition" not in service.err
     rejections = [line for line in service.err.splitlines() if ": rejected: " in line]
     assert sum(64 * "0" in line for line in rejections) == 1
     assert len(rejections) <= 8, rejections
@@ -264,7 +271,8 @@ def test_messages_of_nedbus_ros2_are_ignored(
     """Messages that nedbus published to ROS 2 are not received again, whoever forwards them."""
     service = serve()
     px4 = Px4(raw)
-    px4.put(1, attachment=bytes(Attachment(1, 1, make_gid())))
+    wait_for_reader(raw, px4.key())
+    raw.put(px4.key(), b"", attachment=bytes(Attachment(1, 1, GID)), encoding=BRIDGED_ENCODING)
     px4.put(2)
     assert every.receive(DEADLINE).message.timestamp == 2
     assert status(bus)["rejected"] == 0
@@ -348,6 +356,47 @@ def test_second_key_of_an_address_is_rejected(
     assert "already: name one of them with vehicles=" in service.err
 
 
+def test_ros_2_publisher_that_restarts_is_received_at_once(
+    serve: Serve, peer: Peer, bus: nedbus.Bus, every: nedbus.Subscription
+) -> None:
+    """A ROS 2 node that is killed and started again has a new gid: nothing of it is rejected, and it is one reboot.
+
+    The node is zenoh-ros2-sdk's.
+    """
+    serve()
+    messages = flight()
+    rows = [downgrade(each, "1.16") for each in messages]
+    for _ in range(2):
+        node = peer("talk", "1.16", topic=f"/fmu/out/{VLP}", rows=rows)
+        assert [sample.message for sample in receive(every, len(rows))] == messages
+        node.kill()
+    now = status(bus)
+    assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (2 * len(rows), 0, 0, 1)
+
+
+def test_ros_2_lists_the_source_as_a_subscriber(serve: Serve, peer: Peer, raw: Session) -> None:
+    """`ros2 topic info -v` shows it for as long as somebody publishes: a publisher that is lazy sees whom to serve.
+
+    The publisher is zenoh-ros2-sdk's, and so is the parser of the tokens.
+    """
+
+    def subscriptions() -> list[dict[str, object]]:
+        tokens = raw.liveliness().get("@ros2_lv/4/*/*/*/MS/**")
+        return [_parse_liveliness_keyexpr(str(reply.ok.key_expr)) or {} for reply in tokens if reply.ok]
+
+    serve()
+    node = peer("talk", "1.14", topic=f"/drone/{VLP}", rows=[], domain_id=4)
+    wait_for(subscriptions, what="the subscription")
+    [found] = subscriptions()
+    assert str(found["node_name"]).startswith("nedbus_px4_zenoh_")
+    topic = (found["qualified_name"], found["dds_type"], found["type_hash"])
+    assert topic == (f"/drone/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
+    nodes = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/4/*/*/*/NN/**") if reply.ok]
+    assert any(name.endswith(f"/{found['node_name']}") for name in nodes)
+    node.kill()
+    wait_for(lambda: not subscriptions(), what="the subscription to be withdrawn")
+
+
 def test_stale_vehicle_is_not_listed(serve: Serve, raw: Session, bus: nedbus.Bus, every: nedbus.Subscription) -> None:
     """A vehicle that sends nothing for 3 s is stale in the status and not listed; others are not affected."""
     serve()
@@ -375,6 +424,17 @@ def test_vehicle_connects_to_the_service(run_nedbus: Start) -> None:
         px4 = Px4(bus._session)
         px4.put(1)
         assert subscription.receive(DEADLINE).message.timestamp == 1
+
+
+def test_source_is_no_client_of_its_own_router(run_nedbus: Start) -> None:
+    """It listens on the router's own session, as a link to itself would drop messages: named or not."""
+    endpoint = free_endpoint()
+    service = run_nedbus("serve", "--listen", endpoint, "-s", "px4-zenoh:", "-s", f"px4-zenoh:{endpoint}?domain=3")
+    wait_for(lambda: service.err.count("listening") == 2, what="both sources")
+    with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
+        [reply] = bus._session.get("@/*/router")
+        assert reply.ok is not None
+        assert len(json.loads(reply.ok.payload.to_bytes())["sessions"]) == 1
 
 
 def test_router_that_is_down_is_retried(run_nedbus: Start) -> None:
@@ -427,11 +487,11 @@ def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
     assert (streams.find(key()), str(second.address)) == (first, f"1/{VLP}")
     streams.claim(first, None, 100.0)
     track_sequence(first, None, 100.0)
-    with pytest.raises(DecodeError, match="already: name one of them with vehicles="):
+    with pytest.raises(NotAcceptedError, match="already: name one of them with vehicles="):
         streams.claim(second, None, 102.9)
     streams.claim(second, None, 103.0)
     track_sequence(second, None, 103.0)
-    with pytest.raises(DecodeError, match="already"):
+    with pytest.raises(NotAcceptedError, match="already"):
         streams.claim(first, None, 104.0)
 
 
@@ -441,7 +501,7 @@ def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
     streams.claim(stream, Attachment(7, 0, GID), 100.0)
     track_sequence(stream, Attachment(7, 0, GID), 100.0)
     other = Attachment(500, 0, GID[::-1])
-    with pytest.raises(DecodeError, match="two publishers share this key"):
+    with pytest.raises(NotAcceptedError, match="two publishers share this key"):
         streams.claim(stream, other, 102.9)
     streams.claim(stream, other, 103.0)
     assert track_sequence(stream, other, 103.0) == (0, False)
@@ -462,10 +522,10 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
     stream = streams.register(key())
     for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
         track_sequence(stream, Attachment(sequence, 0, GID), now)
-    with pytest.raises(DecodeError, match="goes back and forth"):
+    with pytest.raises(NotAcceptedError, match="goes back and forth"):
         track_sequence(stream, Attachment(2, 0, GID), 103.0)
     assert track_sequence(stream, Attachment(1, 0, GID), 106.1) == (0, True)
-    with pytest.raises(DecodeError, match="sequence number 1 is a duplicate"):
+    with pytest.raises(NotAcceptedError, match="sequence number 1 is a duplicate"):
         track_sequence(stream, Attachment(1, 0, GID), 106.2)
 
 
@@ -473,6 +533,6 @@ def test_number_of_keys_is_limited(streams: StreamRegistry) -> None:
     """A thousand keys are registered, and no more."""
     for domain in range(1000):
         streams.register(key(domain=domain))
-    with pytest.raises(DecodeError, match="more than 1000 keys"):
+    with pytest.raises(NotAcceptedError, match="more than 1000 keys"):
         streams.register(key(domain=1000))
     assert streams.find(key(domain=1000)) is None

@@ -112,8 +112,9 @@ class Daemon:
         try:
             queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
             clock, retry = SystemClock(self._stop), not self._settings.until_done
+            router = session if self.role == "router" else None
             self._workers = [
-                Worker(text, source, registry, clock=clock, retry=retry, on_end=self._changed.set)
+                Worker(text, source, registry, router=router, clock=clock, retry=retry, on_end=self._changed.set)
                 for text, source in self._sources
             ]
             threads = [threading.Thread(target=worker.run, name=worker.text, daemon=True) for worker in self._workers]

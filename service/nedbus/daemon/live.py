@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from typing import Final
 
 from nedbus.sources import LiveSource, Rejection
+from nedbus.transport import Session
 
 from .clock import Clock
 from .output import SourceOutput
@@ -15,7 +16,14 @@ from .status import State
 _POLL: Final = 0.5  # s between two checks for stale streams
 
 
-def listen(source: LiveSource, output: SourceOutput, *, on_state: Callable[[State], object], clock: Clock) -> None:
+def listen(
+    source: LiveSource,
+    output: SourceOutput,
+    *,
+    router: Session | None,
+    on_state: Callable[[State], object],
+    clock: Clock,
+) -> None:
     """Publish what a live source delivers until it ends or the service is stopped.
 
     `on_state` is called with "waiting" once the source listens and when all streams are stale, with "running" when a
@@ -24,7 +32,7 @@ def listen(source: LiveSource, output: SourceOutput, *, on_state: Callable[[Stat
     Raises SourceError when the source cannot be opened, or fails.
     """
     with ExitStack() as closing:
-        items = source.listen()
+        items = source.listen(router)
         closing.callback(getattr(items, "close", lambda: None))
         next_poll = float("-inf")
         for number, item in enumerate(items):

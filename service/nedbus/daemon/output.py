@@ -64,8 +64,8 @@ class SourceOutput:
     @property
     def streams(self) -> tuple[StreamStatus, ...]:
         """The health of up to 100 streams."""
-        streams = list(self._streams.items())[:_MAX_STREAMS]
-        return tuple(StreamStatus(str(address), stream.health.snapshot()) for address, stream in streams)
+        streams, now = list(self._streams.items())[:_MAX_STREAMS], self._now()
+        return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -96,6 +96,9 @@ class SourceOutput:
         stream = self._streams[message.address]
         if stream.publisher is None:
             raise KeyError(message.address)
+        if message.error is not None:
+            self._reject_invalid(message, message.error)
+            return
         try:
             valid = upgrade(message.fields)
         except ValidationError as exc:
@@ -103,7 +106,7 @@ class SourceOutput:
             return
         stream.publisher.publish(valid)
         self.published += 1
-        stream.health.add(valid, received=self._clock.time_ns(), lost=message.lost)
+        stream.health.add(valid, received=self._now(), lost=message.lost)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source, and claim its address if need be."""
@@ -149,6 +152,10 @@ class SourceOutput:
             _log.warning("%s: %s: rejected: %s", self._name, where, reason)
         if rejection.address is not None:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
+
+    def _now(self) -> int:
+        """Return monotonic ns: rates and ages do not follow the wall clock."""
+        return round(self._clock.now() * 1e9)
 
     def _reject_invalid(self, message: SourceMessage, reason: str) -> None:
         self.rejected += 1

@@ -9,6 +9,7 @@ from typing import Final
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.sources import LiveSource, ReplayRun, ReplaySource, Source, SourceMessage
+from nedbus.transport import Session
 
 from .clock import Clock
 from .live import listen
@@ -26,7 +27,8 @@ _POLL: Final = 0.05  # s between two checks for a reader
 class Worker:
     """Run one source until it ends or its clock is stopped; `run` is meant for a thread of its own.
 
-    With `retry` a source that fails is started again, with growing pauses; `on_end` is called when `run` returns.
+    With `retry` a replay that fails is started again, with growing pauses, as a live source always is.
+    `router` is what the service's router lends to its live sources; `on_end` is called when `run` returns.
     """
 
     def __init__(
@@ -35,6 +37,7 @@ class Worker:
         source: Source,
         registry: PublisherRegistry,
         *,
+        router: Session | None = None,
         clock: Clock,
         retry: bool,
         on_end: Callable[[], object],
@@ -43,8 +46,9 @@ class Worker:
         self.source = source
         self._name = self.text.rstrip(":")  # as the log calls it
         self._registry = registry
+        self._router = router
         self._clock = clock
-        self._retry = retry
+        self._retry = retry or isinstance(source, LiveSource)
         self._on_end = on_end
         self._output = SourceOutput(self._name, self.text, registry, clock)
         self._run: ReplayRun | None = None
@@ -75,40 +79,50 @@ class Worker:
         )
 
     def run(self) -> None:
-        """Run the source, again if it loops or fails, until it is done or stopped."""
-        failures = 0
+        """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""
         try:
-            while not self._clock.stopped:
-                start = self._clock.now()
-                try:
-                    self._run_once()
-                except ClosedError:
-                    return
-                except NedbusError as exc:
-                    self._fail(str(exc))
-                except Exception as exc:  # noqa: BLE001 - a fault in one source must not stop the others
-                    _log.exception("%s: an unexpected error", self._name)
-                    self._fail(f"an unexpected {type(exc).__name__}: {exc}")
-                else:
-                    if isinstance(self.source, LiveSource) or not self.source.loop:
-                        self._end("done")
-                        return
-                    failures = 0
-                    self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
-                    continue
-                if not self._retry:
-                    self._end("failed")
-                    return
-                if self._clock.now() - start > _BACKOFF[-1]:
-                    failures = 0  # it worked for a while
-                self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
-                failures += 1
+            self._run_until_done()
+        except BaseException as exc:  # noqa: BLE001 - a thread that ends must not look as if it ran
+            _log.exception("%s: an unexpected error ended it", self._name)
+            self._error = _describe(exc)
+            self._state = "failed"
         finally:
             self._on_end()
 
+    def _run_until_done(self) -> None:
+        failures = 0
+        while not self._clock.stopped:
+            start = self._clock.now()
+            try:
+                self._run_once()
+            except ClosedError as exc:
+                if not self._clock.stopped:
+                    self._error = str(exc)
+                    self._end("failed")
+                return
+            except NedbusError as exc:
+                self._fail(str(exc))
+            except BaseException as exc:  # noqa: BLE001 - of one source, not of the service; a panic of Rust is no Exception
+                _log.exception("%s: an unexpected error", self._name)
+                self._fail(_describe(exc))
+            else:
+                if isinstance(self.source, LiveSource) or not self.source.loop:
+                    self._end("failed" if self._error else "done")
+                    return
+                failures = 0
+                self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
+                continue
+            if not self._retry:
+                self._end("failed")
+                return
+            if self._clock.now() - start > _BACKOFF[-1]:
+                failures = 0  # it worked for a while
+            self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
+            failures += 1
+
     def _run_once(self) -> None:
         if isinstance(self.source, LiveSource):
-            listen(self.source, self._output, on_state=self._set_state, clock=self._clock)
+            listen(self.source, self._output, router=self._router, on_state=self._set_state, clock=self._clock)
         else:
             self._run_replay(self.source)
 
@@ -127,6 +141,7 @@ class Worker:
             self._output.claim(address, lossless=source.speed is None)
         self._set_state("running")
         replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
+        self._error = run.damage
 
     def _publish(self, message: SourceMessage) -> None:
         self._output.publish(message)
@@ -156,3 +171,7 @@ class Worker:
         self._retries += 1
         _log.error("%s", reason)
         self._output.release()
+
+
+def _describe(error: BaseException) -> str:
+    return f"an unexpected {type(error).__name__}: {error}"

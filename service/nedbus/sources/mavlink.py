@@ -11,6 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
+from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .mavlink_link import Link, Peer, check_link, open_link
@@ -42,7 +43,7 @@ class MavlinkSource:
         self._options = options
         self._sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
 
-    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | None]:
         """Receive; raise SourceError when the link cannot be opened, or breaks."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
@@ -64,6 +65,7 @@ class _LinkSession:
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
         self._autopilots: set[tuple[int, int]] = set()  # besides component 1 of any system
+        self._denied: set[tuple[str, int]] = set()  # vehicles, and what they do not send: each is logged once
 
     def run(self) -> Iterator[SourceMessage | Rejection | None]:
         next_requests = next_heartbeat = 0.0
@@ -139,8 +141,10 @@ class _LinkSession:
         if message.target_system not in (0, _SYSTEM) or message.result == dialect.MAV_RESULT_IN_PROGRESS:
             return
         number = vehicle.acknowledge(now)
-        if number is not None and message.result != dialect.MAV_RESULT_ACCEPTED:
-            _log.info("%s: does not send %s at a requested rate", address, dialect.mavlink_map[number].msgname)
+        is_denied = message.result != dialect.MAV_RESULT_ACCEPTED
+        if number is not None and is_denied and vehicle.has(number) and (address.vehicle, number) not in self._denied:
+            self._denied.add((address.vehicle, number))
+            _log.info("%s: does not send %s when it is requested", address, dialect.mavlink_map[number].msgname)
         self._send_requests(now)
 
     def _send_requests(self, now: float) -> None:

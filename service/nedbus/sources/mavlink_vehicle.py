@@ -22,6 +22,10 @@ _MAX_TRIES: Final = 5
 _RETRY_INTERVAL: Final = 5.0  # s until an unknown origin, or positions that do not arrive, are requested again
 _FULL_TURN: Final = 36000  # 0.01 deg, of `hdg`
 _UNKNOWN_HEADING: Final = 65535
+# Bits of ESTIMATOR_STATUS.flags.
+_VELOCITY_HORIZ, _VELOCITY_VERT = 2, 4
+_POS_HORIZ_REL, _POS_HORIZ_ABS, _POS_VERT_ABS = 8, 16, 32
+_CONST_POS_MODE: Final = 128
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 STREAMS: Final = {32: None, 230: 2.0, 33: 10.0, 141: 10.0, 331: 10.0}
@@ -61,6 +65,7 @@ class Vehicle:
         """Discard what was received, and request everything again: it was silent, or rebooted."""
         self._heading, self._yaw, self._status, self._bottom, self._velocity = (_Expiring() for _ in range(5))
         self._origin: dict[str, object] = {}
+        self._is_global = False
         self._pending = [*self._rates, ORIGIN]
         self._tries = 0
         self._next_request = now
@@ -103,6 +108,10 @@ class Vehicle:
         self._next_request = now if self._pending else now + _RETRY_INTERVAL
         return number
 
+    def has(self, number: int) -> bool:
+        """Return whether it should be able to send this message now: without a global position there is no origin."""
+        return number != ORIGIN or self._is_global
+
     def handle(self, message: Any, now: float) -> dict[str, object] | None:
         """Return the fields of an estimate if this is a position, else None.
 
@@ -126,25 +135,17 @@ class Vehicle:
                     **({"ref_timestamp": message.time_usec} if message.time_usec else {}),
                 }
             case "ALTITUDE":
-                known = math.isfinite(message.bottom_clearance)
-                bottom: dict[str, object] = {"dist_bottom": message.bottom_clearance} if known else {}
-                self._bottom = _Expiring(now + _VALUE_TIMEOUT, {"dist_bottom_valid": known, **bottom})
+                is_known = math.isfinite(message.bottom_clearance)
+                bottom: dict[str, object] = {"dist_bottom": message.bottom_clearance} if is_known else {}
+                self._bottom = _Expiring(now + _VALUE_TIMEOUT, {"dist_bottom_valid": is_known, **bottom})
             case "ODOMETRY":
                 fields = _velocity_deviations(message.velocity_covariance)
                 self._velocity = _Expiring(now + _VALUE_TIMEOUT, fields)
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
-                bits = message.flags
-                self._status = _Expiring(
-                    now + _STATUS_TIMEOUT,
-                    {
-                        "xy_valid": bool(bits & (8 | 16)) and not bits & 128,
-                        "z_valid": bool(bits & 32),
-                        "v_xy_valid": bool(bits & 2),
-                        "v_z_valid": bool(bits & 4),
-                        **{name: value for name, value in deviations.items() if math.isfinite(value)},
-                    },
-                )
+                known = {name: value for name, value in deviations.items() if math.isfinite(value)}
+                self._is_global = bool(message.flags & _POS_HORIZ_ABS)
+                self._status = _Expiring(now + _STATUS_TIMEOUT, _validity(message.flags) | known)
         return None
 
     def _estimate(self, message: Any, now: float) -> dict[str, object]:
@@ -180,6 +181,21 @@ class Vehicle:
             elif ms < self._last_ms:
                 self._wraps += 1
         self._last_ms = ms
+
+
+def _validity(bits: int) -> dict[str, object]:
+    """Return what ESTIMATOR_STATUS.flags say about position and velocity.
+
+    The constant position mode was the opposite of a horizontal velocity up to PX4 1.15; since PX4's commit 48f1687d3a
+    it is set for every vehicle at rest too, whose velocity and position are valid.
+    """
+    is_constant = bits & _CONST_POS_MODE and not bits & _VELOCITY_HORIZ
+    return {
+        "xy_valid": bool(bits & (_POS_HORIZ_REL | _POS_HORIZ_ABS)) and not is_constant,
+        "z_valid": bool(bits & _POS_VERT_ABS),
+        "v_xy_valid": bool(bits & _VELOCITY_HORIZ),
+        "v_z_valid": bool(bits & _VELOCITY_VERT),
+    }
 
 
 def _velocity_deviations(covariance: Any) -> dict[str, object]:

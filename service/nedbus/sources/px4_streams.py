@@ -9,11 +9,11 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from nedbus.errors import DecodeError
-from nedbus.transport import NO_HASH, Attachment, TopicKey
+from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
 from nedbus_msgs import Address, layout_of_type_hash, split_ros2_topic
 
 from .options import Px4ZenohOptions
+from .px4_publishers import AlivePublishers
 
 _MAX_STREAMS: Final = 1000  # keys; a vehicle has a handful
 _MAX_LOSS: Final = 1_000_000  # messages that can be lost at once; a larger step is not a gap
@@ -21,15 +21,26 @@ _TIMEOUT: Final = 3.0  # s without messages after which another publisher may ha
 _HINT: Final = "give each a namespace or a domain of its own"
 
 
+class NotAcceptedError(Exception):
+    """Raised for a message that may be valid, but not whose it is is certain, or not in which layout it is."""
+
+
 @dataclass(slots=True, eq=False)
 class Stream:
-    """One key: the address and layout of its messages, its publisher, and the last sequence number."""
+    """One key: the address and layout of its messages, its publisher, and the last sequence number.
 
-    key: str
+    `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
+    `reboots`: how many reboots of its vehicle it took part in.
+    """
+
+    key: TopicKey
     address: Address
     layout: str
+    reboots: int
+    publisher: PublisherToken | None = None
     gid: bytes | None = None
     sequence: int | None = None
+    restarted: bool = False
     last_received: float = -math.inf
     last_reboot: float = -math.inf
 
@@ -42,6 +53,20 @@ class StreamRegistry:
         self._vehicle = vehicle
         self._streams: dict[str, Stream] = {}
         self._owners: dict[Address, Stream] = {}
+        self._reboots: dict[str, int] = {}  # by vehicle
+        self._alive = AlivePublishers()
+
+    def add_publisher(self, token: PublisherToken, now: float) -> None:
+        """Take note of a publisher's liveliness token that appeared."""
+        stream = self._streams.get(str(token.key))
+        if stream is not None and _TIMEOUT <= now - stream.last_received < math.inf:
+            # Who published before is silent: it lost its connection, and a router takes longer to notice.
+            self._alive.forget(token.key)
+        self._alive.add(token)
+
+    def remove_publisher(self, token: PublisherToken, now: float) -> None:
+        """Take note of a publisher's liveliness token that is gone."""
+        self._alive.remove(token, now)
 
     def find(self, key: str) -> Stream | None:
         """Return the stream of a key that was registered."""
@@ -50,32 +75,48 @@ class StreamRegistry:
     def register(self, key: str) -> Stream:
         """Return a new stream for a key.
 
-        Raises DecodeError or AddressError for a key that is not that of a local position topic in a known layout,
-        and for one key too many.
+        Raises DecodeError or AddressError for a key that is not that of a local position topic, NotAcceptedError for
+        one whose layout is unknown, and for one key too many.
         """
         parsed = TopicKey.parse(key)
         namespace, topic, instance = split_ros2_topic(parsed.topic)
         address = Address(self._vehicle_of(parsed.domain, namespace), topic, instance)
-        stream = Stream(key, address, self._layout_of(parsed.type_hash))
+        layout = self._layout_of(parsed.type_hash)
+        stream = Stream(parsed, address, layout, self._reboots.get(address.vehicle, 0))
         if len(self._streams) >= _MAX_STREAMS:
-            raise DecodeError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
+            raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
         self._streams[key] = stream
         return stream
 
     def claim(self, stream: Stream, attachment: Attachment | None, now: float) -> None:
         """Make a stream and a publisher the owner of their address.
 
-        Raises DecodeError while another key, or another publisher on the same key, owns it.
+        Raises NotAcceptedError while another key, or another publisher on the same key, owns it, and while two
+        publishers are alike.
         """
+        if self._alive.are_alike(stream.key, now):
+            stream.publisher = stream.gid = stream.sequence = None
+            stream.last_received = now
+            raise NotAcceptedError(f"two vehicles are alike, with one key and one gid: {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
         if owner is not stream:
             if now - owner.last_received < _TIMEOUT:
-                raise DecodeError(f"{owner.key} is {stream.address} already: name one of them with vehicles=")
+                raise NotAcceptedError(f"{owner.key} is {stream.address} already: name one of them with vehicles=")
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
-            if stream.gid is not None and now - stream.last_received < _TIMEOUT:
-                raise DecodeError(f"two publishers share this key: {_HINT}")
+            stream.restarted = stream.publisher is not None and not self._alive.is_alive(stream.publisher)
+            if stream.gid is not None and not stream.restarted and now - stream.last_received < _TIMEOUT:
+                raise NotAcceptedError(f"two publishers share this key: {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
+            stream.publisher = self._alive.only(stream.key)
+
+    def is_reboot(self, stream: Stream) -> bool:
+        """Take note that a stream restarted; return whether it is the first one of its vehicle to do so."""
+        vehicle = stream.address.vehicle
+        known = self._reboots.get(vehicle, 0)
+        is_first = stream.reboots == known
+        self._reboots[vehicle] = stream.reboots = known + is_first
+        return is_first
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the vehicle that is configured, else one named by namespace and by any domain but the expected one."""
@@ -89,32 +130,32 @@ class StreamRegistry:
     def _layout_of(self, type_hash: str) -> str:
         if type_hash == NO_HASH:
             if self._options.layout is None:
-                raise DecodeError(f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14")
+                raise NotAcceptedError(f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14")
             return self._options.layout
         layout = layout_of_type_hash(type_hash)
         if layout is None:
-            raise DecodeError(f"no known layout has the type hash {type_hash}: update nedbus")
+            raise NotAcceptedError(f"no known layout has the type hash {type_hash}: update nedbus")
         return layout
 
 
 def track_sequence(stream: Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
-    """Take note of a message; return how many were lost just before it, and whether its vehicle rebooted.
+    """Take note of a message; return how many were lost just before it, and whether its publisher restarted.
 
-    Raises DecodeError for a duplicate, and for a sequence that goes back repeatedly: two vehicles with one gid.
+    Raises NotAcceptedError for a duplicate, and for a sequence that goes back repeatedly: two vehicles with one gid.
     """
-    lost, rebooted = 0, False
+    lost, restarted = 0, stream.restarted
     if attachment is not None:
         step = 1 if stream.sequence is None else attachment.sequence - stream.sequence
         if step == 0:
-            raise DecodeError(f"sequence number {attachment.sequence} is a duplicate")
+            raise NotAcceptedError(f"sequence number {attachment.sequence} is a duplicate")
         if step < 0:
             is_repeated = now - stream.last_reboot < _TIMEOUT
             stream.last_reboot = now
             if is_repeated:
-                raise DecodeError(f"its sequence goes back and forth, as if two vehicles shared this key: {_HINT}")
-            rebooted = True
+                raise NotAcceptedError(f"its sequence goes back and forth, as if two vehicles shared this key: {_HINT}")
+            restarted = True
         elif step <= _MAX_LOSS:
             lost = step - 1
         stream.sequence = attachment.sequence
-    stream.last_received = now
-    return lost, rebooted
+    stream.last_received, stream.restarted = now, False
+    return lost, restarted

@@ -6,23 +6,35 @@ import logging
 import queue
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Final
 
 import zenoh
 
 from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
-from nedbus.transport import Attachment, Session, check_endpoints, is_nedbus_gid, open_client, while_open
-from nedbus_msgs import ROS2_TYPES, dds_type, decode_cdr
+from nedbus.transport import (
+    BRIDGED_ENCODING,
+    Attachment,
+    PublisherToken,
+    Session,
+    check_endpoints,
+    open_client,
+    publishers_of_type_key_expr,
+    while_open,
+)
+from nedbus_msgs import ROS2_TYPES, dds_type, decode_cdr, split_ros2_topic
 
 from .options import Px4ZenohOptions
-from .px4_streams import Stream, StreamRegistry, track_sequence
+from .px4_node import Px4ZenohNode
+from .px4_streams import NotAcceptedError, StreamRegistry, track_sequence
 from .source import Rejection, SourceContext, SourceMessage
 
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
+_MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
 _TICK: Final = 0.25  # s
+_CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 _MAX_PAYLOAD: Final = 1024  # bytes
 
 
@@ -33,45 +45,51 @@ class Px4ZenohSource:
         if endpoint:
             check_endpoints([endpoint], where="px4-zenoh")
         self._endpoints = (endpoint,) if endpoint else context.routers
+        self._is_own = not endpoint or endpoint in context.routers
         self._tls = context.tls
         self._options = options
         self._vehicle = options.vehicle or context.vehicle
 
-    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
         """Receive; raise SourceError when no router answers, or the connection is closed."""
-        decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle))
-        pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        dropped = reported = 0
-
-        def enqueue(sample: zenoh.Sample) -> None:
-            nonlocal dropped
-            if pending.qsize() >= _MAX_PENDING:
-                with suppress(queue.Empty):
-                    pending.get_nowait()
-                dropped += 1
-            pending.put(sample)
-
-        session = self._open_session()
-        try:
+        inbox = _Inbox()
+        with ExitStack() as closing:
+            if router is not None and self._is_own:
+                # A link between the router and a client of its own would drop what does not fit its queue.
+                session = router
+            else:
+                session = self._open_session()
+                closing.callback(session.close)
+            node = Px4ZenohNode(session)
+            decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle), node)
             with while_open(session):
-                domain = "*" if self._options.domain is None else self._options.domain
-                for name in ROS2_TYPES:
-                    callback = zenoh.handlers.Callback(enqueue, indirect=False)
-                    session.declare_subscriber(f"{domain}/**/{dds_type(name)}/*", callback)
+                for name in map(dds_type, ROS2_TYPES):
+                    self._subscribe(session, name, inbox, closing)
+            closing.callback(node.close)
             yield None
             while not session.is_closed():
-                if dropped > reported:
-                    yield Rejection("queue", "messages arrive faster than they are decoded", count=dropped - reported)
-                    reported = dropped
+                yield from inbox.overflow(self._name)
                 try:
-                    sample = pending.get(timeout=_TICK)
+                    sample = inbox.pending.get(timeout=_TICK)
                 except queue.Empty:
                     yield None
                 else:
                     yield decoder.decode(sample)
             raise SourceError(self._name, "the connection was closed")
-        finally:
-            session.close()
+
+    def _subscribe(self, session: Session, dds_type: str, inbox: _Inbox, closing: ExitStack) -> None:
+        """Receive the messages of a type, and before them the tokens of those who publish them."""
+        domain = self._options.domain
+        tokens = session.liveliness().declare_subscriber(
+            publishers_of_type_key_expr(domain, dds_type),
+            zenoh.handlers.Callback(inbox.put_token, indirect=False),
+            history=True,
+        )
+        closing.callback(_undeclare, tokens)
+        messages = session.declare_subscriber(
+            f"{'*' if domain is None else domain}/**/{dds_type}/*", zenoh.handlers.Callback(inbox.put, indirect=False)
+        )
+        closing.callback(_undeclare, messages)
 
     @property
     def _name(self) -> str:
@@ -79,44 +97,100 @@ class Px4ZenohSource:
 
     def _open_session(self) -> Session:
         try:
-            return open_client(self._endpoints, timeout=0.5, tls=self._tls)
+            return open_client(self._endpoints, timeout=_CONNECT_TIMEOUT, tls=self._tls)
         except ConnectError as exc:
             reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
             raise SourceError(self._name, reason) from exc
 
 
+def _undeclare(subscriber: zenoh.Subscriber[None]) -> None:
+    with suppress(zenoh.ZError):  # its session may be closed already
+        subscriber.undeclare()
+
+
+class _Inbox:
+    """What arrived and waits to be decoded, in order; Zenoh's threads put it there."""
+
+    def __init__(self) -> None:
+        self.pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._dropped = self._reported = 0
+        self._is_full = False
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Put a message."""
+        if self.pending.qsize() < _MAX_PENDING:
+            self.pending.put(sample)
+        else:
+            self._dropped += 1
+
+    def put_token(self, sample: zenoh.Sample) -> None:
+        """Put a liveliness token."""
+        if self.pending.qsize() < _MAX_PENDING_TOKENS:
+            self.pending.put(sample)
+        else:
+            self._is_full = True
+
+    def overflow(self, name: str) -> Iterator[Rejection]:
+        """Yield how many messages were dropped since the last call; raise SourceError for tokens."""
+        if self._is_full:
+            raise SourceError(name, "publishers come and go faster than they can be followed")
+        dropped = self._dropped
+        if dropped > self._reported:
+            yield Rejection("queue", "messages arrive faster than they are decoded", count=dropped - self._reported)
+            self._reported = dropped
+
+
 class _Decoder:
     """Turn samples into messages and rejections, and log what vehicles do."""
 
-    def __init__(self, streams: StreamRegistry) -> None:
+    def __init__(self, streams: StreamRegistry, node: Px4ZenohNode) -> None:
         self._streams = streams
+        self._node = node
         self._bridged: set[str] = set()  # keys on which messages of `nedbus ros2` arrived
 
     def decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
+        key = str(sample.key_expr)
+        now = time.monotonic()
+        if key.startswith("@"):
+            self._follow(key, now, is_alive=sample.kind == zenoh.SampleKind.PUT)
+            return None
         if sample.kind != zenoh.SampleKind.PUT:
             return None
-        key = str(sample.key_expr)
         stream = self._streams.find(key)
-        now = time.monotonic()
         try:
             if stream is None:
                 stream = self._streams.register(key)
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
-            if attachment is not None and is_nedbus_gid(attachment.gid):
-                self._log_bridged(stream)
+            if str(sample.encoding) == BRIDGED_ENCODING:
+                self._log_bridged(key)
                 return None
             self._streams.claim(stream, attachment, now)
             if len(sample.payload) > _MAX_PAYLOAD:
-                raise DecodeError(f"{len(sample.payload)} bytes")
+                raise DecodeError(f"{len(sample.payload)} bytes are too many")
             fields = decode_cdr(sample.payload.to_bytes(), layout=stream.layout)
-            lost, rebooted = track_sequence(stream, attachment, now)
-        except (AddressError, DecodeError) as exc:
-            return Rejection(key, str(exc), stream.address if stream else None)
+            lost, restarted = track_sequence(stream, attachment, now)
+        except (AddressError, DecodeError, NotAcceptedError) as exc:
+            reason = exc.reason if isinstance(exc, DecodeError) else str(exc)
+            return Rejection(key, reason, stream.address if stream else None)
+        rebooted = restarted and self._streams.is_reboot(stream)
         if rebooted:
-            _log.warning("%s: its sequence restarts: the vehicle rebooted", key)
+            _log.warning("%s: its publisher restarted: the vehicle rebooted", key)
         return SourceMessage(0.0, stream.address, fields, lost, rebooted)
 
-    def _log_bridged(self, stream: Stream) -> None:
-        if stream.key not in self._bridged:
-            self._bridged.add(stream.key)
-            _log.info("%s comes from nedbus ros2: ignored, as it would loop", stream.key)
+    def _follow(self, text: str, now: float, *, is_alive: bool) -> None:
+        try:
+            token = PublisherToken.parse(text)
+            split_ros2_topic(token.key.topic)
+        except (AddressError, DecodeError):
+            return  # what it publishes is rejected
+        if is_alive:
+            self._streams.add_publisher(token, now)
+            self._node.subscribe(token)
+        else:
+            self._streams.remove_publisher(token, now)
+            self._node.unsubscribe(token)
+
+    def _log_bridged(self, key: str) -> None:
+        if key not in self._bridged:
+            self._bridged.add(key)
+            _log.info("%s comes from nedbus ros2: ignored, as it would loop", key)

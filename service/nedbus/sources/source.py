@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-from nedbus.transport import Tls
+from nedbus.transport import Session, Tls
 from nedbus_msgs import Address
 
 
@@ -18,6 +18,7 @@ class SourceMessage:
     `fields`: by name, of any PX4 layout.
     `lost`: messages that were lost between the vehicle and the source, just before this one.
     `rebooted`: this is the first message after the vehicle rebooted.
+    `error`: why it cannot be decoded, if so; it has no fields then.
     """
 
     due: float
@@ -25,6 +26,7 @@ class SourceMessage:
     fields: Mapping[str, object]
     lost: int = 0
     rebooted: bool = False
+    error: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,8 @@ class ReplayRun:
     `messages`: in order of `due`; can be iterated once.
     `addresses`: every address that occurs in the messages.
     `total`: the number of messages, None if they never end.
-    `summary`: a description for the log; `warnings`: damage that does not prevent the replay.
+    `summary`: a description for the log; `warnings`: what is damaged or left out.
+    `damage`: what damage cost, if it cost messages; at its end the run has failed then.
     """
 
     messages: Iterator[SourceMessage]
@@ -56,6 +59,7 @@ class ReplayRun:
     total: int | None
     summary: str
     warnings: tuple[str, ...] = field(default=())
+    damage: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +107,10 @@ class ReplaySource(Protocol):
 class LiveSource(Protocol):
     """A source that receives from vehicles; which addresses it has is known when messages arrive."""
 
-    def listen(self) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
         """Yield what arrives until the iterator is closed, and None at least twice a second when nothing does.
+
+        `router`: the session of the service where that is a router itself; it is lent, and must not be closed.
 
         Raises SourceError when it cannot be opened, or when the connection breaks.
         """

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Final, cast
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl, unquote, urlencode
 
 from pydantic import ValidationError
 
@@ -60,15 +61,18 @@ class SourceSpec:
     def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
         """Return the source, for a service with this default vehicle, router endpoints and TLS files.
 
-        Raises ConfigError for an invalid target, and when the extra of this kind is not installed.
+        Raises ConfigError for an invalid target, for a file that cannot be read twice, and when the extra of this kind
+        is not installed.
         """
         kind = SOURCE_KINDS[self.kind]
+        if kind.target == "FILE":
+            _check_file(self.text, Path(self.target).expanduser())
         make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.class_name))
         return make(self.target, self.options, SourceContext(vehicle, routers, tls))
 
 
 def parse_source(text: str) -> SourceSpec:
-    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`.
+    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path `%3F` stands for `?`, and `%25` for `%`.
 
     Raises ConfigError for an unknown kind, a missing target, or an unknown or invalid option.
     """
@@ -88,9 +92,12 @@ def parse_source(text: str) -> SourceSpec:
     except ValidationError as exc:
         raise ConfigError(f"source {text!r}", _explain(exc, kind)) from exc
     except ValueError:
-        raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE") from None
+        hint = ", and a path with ? in it has %3F instead" if kind.target == "FILE" else ""
+        raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}") from None
     if len(dict(pairs)) < len(pairs):
         raise ConfigError(f"source {text!r}", "an option occurs twice: remove one")
+    if kind.target == "FILE":
+        target = re.sub("%(3F|25)", lambda found: unquote(found[0]), target, flags=re.IGNORECASE)
     return SourceSpec(text, kind_name, target, options)
 
 
@@ -99,9 +106,14 @@ def source_text_of_file(path: str | PurePath, vehicle: str | None = None) -> str
 
     Raises ConfigError for a file suffix that belongs to no kind.
     """
-    query = urlencode({"vehicle": vehicle}) if vehicle else ""
-    text = f"{format_of(path)}:{path}"
-    return f"{text}?{query}" if query or "?" in str(path) else text
+    text = f"{format_of(path)}:{str(path).replace('%', '%25').replace('?', '%3F')}"
+    return f"{text}?{urlencode({'vehicle': vehicle})}" if vehicle else text
+
+
+def _check_file(text: str, path: Path) -> None:
+    """Raise ConfigError for a pipe, a socket or a device: its reader would wait for ever, or find nothing again."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ConfigError(f"source {text!r}", f"{path} is not a regular file: save it as one, then give that")
 
 
 def _explain(error: ValidationError, kind: SourceKind) -> str:

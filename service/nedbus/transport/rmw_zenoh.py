@@ -2,29 +2,35 @@
 
     key          <domain>/<topic>/<DDS type>/RIHS01_<hash>
     attachment   sequence number, time, 16, gid: 33 bytes, little-endian
-    tokens       @ros2_lv/<domain>/<session>/<node>/<entity>/NN|MP/<enclave>/<namespace>/<node name>[/<topic>/...]
+    tokens       @ros2_lv/<domain>/<session>/<node>/<entity>/NN|MP|MS/<enclave>/<namespace>/<node name>
+                 and for a publisher (MP) or a subscription (MS) /<topic>/<DDS type>/RIHS01_<hash>/<QoS>
 
 Source: rmw_zenoh's design document, and PX4's `zenoh` module, which is compatible with it.
 """
 
 from __future__ import annotations
 
-import os
+import re
 import struct
 from dataclasses import dataclass
 from typing import Final, Self
+
+import xxhash
 
 from nedbus_msgs import DecodeError
 
 NO_HASH: Final = "TypeHashNotSupported"
 """What stands in place of the type hash in keys of ROS 2 Humble, and of a PX4 that is built for it."""
 
+BRIDGED_ENCODING: Final = "application/cdr;nedbus"
+"""The encoding of messages that nedbus published to ROS 2: they must not be bridged back. ROS 2 does not look at it."""
+
 _QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: what PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
-_GID_PREFIX: Final = b"nedbus"
 _DOMAINS: Final = 10**9
 _LENGTH: Final = 512  # characters of a key; PX4 and ROS 2 have half as many
+_PX4_NODE = re.compile(r"px4_([0-9a-f]{32})")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +82,41 @@ class Attachment:
         return _ATTACHMENT.pack(self.sequence, self.time, _GID, self.gid)
 
 
-def make_gid() -> bytes:
-    """Return the gid of a new publisher of nedbus, which `is_nedbus_gid` recognizes."""
-    return _GID_PREFIX + os.urandom(_GID - len(_GID_PREFIX))
+@dataclass(frozen=True, slots=True)
+class PublisherToken:
+    """The liveliness token of a publisher: its session, its node's name, and the key of its messages.
+
+    `text` is the whole token, by which two publishers of one session differ.
+    """
+
+    text: str
+    session: str
+    node: str
+    key: TopicKey
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Parse the token of a publisher; raise DecodeError for anything else."""
+        parts = text.split("/")
+        if len(parts) != 13 or parts[0] != "@ros2_lv" or parts[5] != "MP" or len(text) > 2 * _LENGTH:
+            raise DecodeError("a liveliness token that is not that of a publisher")
+        _, domain, session, _, _, _, _, _, node, topic, dds_type, type_hash, _ = parts
+        name = topic.replace("%", "/").strip("/")
+        return cls(text, session, node, TopicKey.parse(f"{domain}/{name}/{dds_type}/{type_hash}"))
+
+    @property
+    def gid(self) -> bytes | None:
+        """The gid of its messages, if its node is named by that: PX4's is, and in simulation all have the same."""
+        found = _PX4_NODE.fullmatch(self.node)
+        return bytes.fromhex(found[1]) if found else None
 
 
-def is_nedbus_gid(gid: bytes) -> bool:
-    """Return whether a publisher of nedbus has this gid: its messages must not be bridged back."""
-    return gid.startswith(_GID_PREFIX)
+def gid_of_token(token: str) -> bytes:
+    """Return the gid that ROS 2 shows for the owner of a token, and that its messages carry.
+
+    Source: rmw_zenoh, liveliness_utils.cpp: the XXH3 of the token in 128 bits, the lower half first.
+    """
+    return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(_GID, "little")
 
 
 def node_token(domain: int, session: str, node: str) -> str:
@@ -93,11 +126,29 @@ def node_token(domain: int, session: str, node: str) -> str:
 
 def publisher_token(key: TopicKey, session: str, node: str, entity: int) -> str:
     """Return the liveliness token of a node's publisher, by which ROS 2 lists its topic."""
-    topic = "%" + key.topic.replace("/", "%")
-    return f"@ros2_lv/{key.domain}/{session}/0/{entity}/MP/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
+    return _endpoint_token("MP", key, session, node, entity)
+
+
+def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> str:
+    """Return the liveliness token of a node's subscription, by which a publisher in ROS 2 sees that it has one."""
+    return _endpoint_token("MS", key, session, node, entity)
 
 
 def publishers_key_expr(key: TopicKey) -> str:
     """Return the key expression for the tokens of all publishers of a topic with this type and hash."""
-    topic = "%" + key.topic.replace("/", "%")
-    return f"@ros2_lv/{key.domain}/*/*/*/MP/*/*/*/{topic}/{key.dds_type}/{key.type_hash}/*"
+    return f"@ros2_lv/{key.domain}/*/*/*/MP/*/*/*/{_mangle(key.topic)}/{key.dds_type}/{key.type_hash}/*"
+
+
+def publishers_of_type_key_expr(domain: int | None, dds_type: str) -> str:
+    """Return the key expression for the tokens of all publishers of a type, in one domain or in all."""
+    return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{dds_type}/*/*"
+
+
+def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
+    topic = _mangle(key.topic)
+    return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
+
+
+def _mangle(topic: str) -> str:
+    """Return a topic as one chunk of a token."""
+    return "%" + topic.replace("/", "%")

@@ -1,0 +1,148 @@
+"""Which publishers of rmw_zenoh are alive, alike or replaced, by the tokens of a real PX4 and of ROS 2 nodes."""
+
+from __future__ import annotations
+
+import pytest
+
+from nedbus.sources.options import Px4ZenohOptions
+from nedbus.sources.px4_publishers import AlivePublishers
+from nedbus.sources.px4_streams import NotAcceptedError, Stream, StreamRegistry, track_sequence
+from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
+from nedbus_msgs import ROS2_TYPE, DecodeError, dds_type, type_hash
+
+VLP = "vehicle_local_position"
+GID = bytes.fromhex("aabbcc00000000000000000000000000")  # of every PX4 in SITL
+# From ../shared/data/px4/gps_loss_zenoh.jsonl.gz.
+REAL = (
+    "@ros2_lv/0/7f683599e27664034d4ab1bf80ed5a2f/0/11/MP/%/%/px4_aabbcc00000000000000000000000000/"
+    f"%fmu%out%vehicle_local_position/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}/::,7:,:,:,,"
+)
+
+
+def key(topic: str = VLP, *, domain: int = 0) -> TopicKey:
+    """Return the key of a topic, as PX4 writes it."""
+    return TopicKey(domain, f"fmu/out/{topic}", dds_type(ROS2_TYPE), type_hash("1.16"))
+
+
+def px4(session: str, topic: str = VLP) -> PublisherToken:
+    """Return the token of a PX4 in simulation."""
+    return PublisherToken.parse(REAL.replace("7f683599e27664034d4ab1bf80ed5a2f", session).replace(VLP, topic))
+
+
+def node(session: str, name: str = "talker") -> PublisherToken:
+    """Return the token of a ROS 2 node, whose gid does not stand in it."""
+    return PublisherToken.parse(publisher_token(key(), session, name, 1))
+
+
+def send(streams: StreamRegistry, stream: Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
+    """Pass one message on; return what was lost before it, and whether its vehicle rebooted."""
+    attachment = Attachment(sequence, 0, gid)
+    streams.claim(stream, attachment, now)
+    lost, restarted = track_sequence(stream, attachment, now)
+    return lost, restarted and streams.is_reboot(stream)
+
+
+@pytest.fixture
+def streams() -> StreamRegistry:
+    """Return a registry with default options, for a service whose vehicle is 1."""
+    return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
+
+
+def test_token_of_a_real_px4_is_parsed() -> None:
+    """Its key is that of its messages, and its node is named by its gid; a ROS 2 node's is not."""
+    token = PublisherToken.parse(REAL)
+    assert str(token.key) == f"0/fmu/out/{VLP}/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}"
+    assert (token.session, token.gid) == ("7f683599e27664034d4ab1bf80ed5a2f", GID)
+    assert node("a").gid is None
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a", REAL.replace("MP", "MS"), REAL + "/x", REAL.replace("/0/7", "/x/7"), 99 * REAL]
+)
+def test_other_tokens_are_refused(text: str) -> None:
+    """What rmw_zenoh would not declare for a publisher raises DecodeError."""
+    with pytest.raises(DecodeError):
+        PublisherToken.parse(text)
+
+
+def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
+    """From the second token on nothing is accepted; afterwards the sequence starts anywhere: no loss, no reboot."""
+    stream = streams.register(str(key()))
+    streams.add_publisher(px4("a"), 100.0)
+    assert send(streams, stream, 7, 100.1) == (0, False)
+    streams.add_publisher(px4("b"), 100.2)
+    for number in range(100):
+        with pytest.raises(NotAcceptedError, match="two vehicles are alike, with one key and one gid: give each"):
+            send(streams, stream, number, 100.2 + number)
+    streams.remove_publisher(px4("a"), 201.0)
+    with pytest.raises(NotAcceptedError, match="alike"):
+        send(streams, stream, 900, 201.9)  # what it sent last comes after its token
+    assert send(streams, stream, 30, 202.1) == (0, False)
+    assert send(streams, stream, 31, 202.2) == (0, False)
+
+
+def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
+    """Two publishers of one session, and two sessions with different topics, are one vehicle each."""
+    stream = streams.register(str(key()))
+    for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
+        streams.add_publisher(token, 100.0)
+    assert send(streams, stream, 1, 100.1) == (0, False)
+
+
+def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistry) -> None:
+    """A router notices after up to 10 s that a link is dead: who was silent for 3 s is not in the way of who is new."""
+    stream = streams.register(str(key()))
+    streams.add_publisher(px4("a"), 100.0)
+    send(streams, stream, 500, 100.0)
+    streams.add_publisher(px4("b"), 103.0)
+    assert send(streams, stream, 1, 103.1) == (0, True)
+    streams.remove_publisher(px4("a"), 109.0)
+    assert send(streams, stream, 2, 109.1) == (0, False)
+
+
+def test_ros_2_nodes_of_one_name_are_told_apart_by_their_gids(streams: StreamRegistry) -> None:
+    """The first one is published, and the other one's messages are rejected, as long as both are there."""
+    stream = streams.register(str(key()))
+    streams.add_publisher(node("a"), 100.0)
+    assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
+    streams.add_publisher(node("b"), 100.0)
+    with pytest.raises(NotAcceptedError, match="two publishers share this key"):
+        send(streams, stream, 1, 100.1, b"b" * 16)
+    assert send(streams, stream, 2, 100.2, b"a" * 16) == (0, False)
+
+
+def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegistry) -> None:
+    """Its token says that the one before it is gone: a reboot, and nothing is lost."""
+    stream = streams.register(str(key()))
+    streams.add_publisher(node("a"), 100.0)
+    send(streams, stream, 41, 100.0, b"a" * 16)
+    streams.remove_publisher(node("a"), 100.1)
+    streams.add_publisher(node("b"), 100.2)
+    assert send(streams, stream, 1, 100.3, b"b" * 16) == (0, True)
+    assert send(streams, stream, 2, 100.4, b"b" * 16) == (0, False)
+
+
+def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
+    """A reboot counts once for a vehicle, whichever of its topics tells it first, and again the next time."""
+    topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
+    vehicle = [streams.register(str(key(topic))) for topic in topics]
+    other = streams.register(str(key(domain=1)))
+    for now in (100.0, 110.0, 120.0):
+        sequence = round(50 - now / 10)
+        reboots = [send(streams, stream, sequence, now)[1] for stream in [*vehicle, other]]
+        assert sum(reboots[:4]) == (now > 100.0)
+        assert reboots[4] is (now > 100.0)
+        vehicle.reverse()
+
+
+def test_tokens_are_bounded() -> None:
+    """A peer that declares tokens without end is followed up to 10,000, and costs nothing once they are gone."""
+    alive = AlivePublishers()
+    tokens = [node(str(number)) for number in range(10_005)]
+    for token in tokens:
+        alive.add(token)
+    assert [alive.is_alive(token) for token in (tokens[0], tokens[-1])] == [True, False]
+    for token in tokens[:-6]:
+        alive.remove(token, 0.0)
+    alive.add(tokens[-1])
+    assert alive.is_alive(tokens[-1])

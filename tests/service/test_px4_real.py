@@ -1,0 +1,351 @@
+"""What a real PX4 sent, played into a real service: Zenoh and MAVLink, beside the vehicle's own log.
+
+The recordings are in ../shared/data/px4, whose README says how they were made.
+They are played as fast as the service takes them, so that no test depends on the machine's speed.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import socket
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, Self, cast
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.transport import Attachment, Session
+from nedbus_msgs import ANY, Address, decode_cdr, encode_cdr, split_ros2_topic, upgrade
+from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, wait_for
+from tests.replays import open_replay
+from tests.zenohd import start_zenohd
+
+from .test_mavlink import is_in_use, port
+
+__all__ = ["port"]  # a fixture
+
+PX4: Final = LOGS.parent / "px4"
+LOG: Final = PX4 / "gps_loss.ulg"
+FLIGHT: Final = PX4 / "gps_loss_zenoh.jsonl.gz"
+ALIKE: Final = PX4 / "two_alike_zenoh.jsonl.gz"
+MAVLINK: Final = PX4 / "gps_loss_mavlink.bin.gz"
+WINDOW: Final = 100  # messages that are on their way at once
+VLP = "vehicle_local_position"
+
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(not LOG.exists(), reason=f"no recordings of a PX4: {PX4} is not there"),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """One line of a recording: a message, or a liveliness token that appears or goes, and the PX4 that sent it."""
+
+    px4: int
+    key: str
+    kind: str
+    express: bool = False
+    attachment: bytes = b""
+    payload: bytes = b""
+
+    @property
+    def address(self) -> Address:
+        """The address as which the service publishes it."""
+        _, topic, instance = split_ros2_topic("/".join(self.key.split("/")[1:-2]))
+        return Address("1", topic, instance)
+
+    @property
+    def cdr(self) -> bytes:
+        """The message in one form, whatever its padding."""
+        return encode_cdr(decode_cdr(self.payload, layout="1.16"), layout="1.16")
+
+
+def read_recording(path: Path) -> Iterator[Sent]:
+    """Yield what was sent, in order; a message is from the PX4 whose sequence it continues."""
+    sessions: list[str] = []
+    last: dict[tuple[int, str], int] = {}
+    with gzip.open(path, "rt") as lines:
+        for _, what, key, *rest in map(json.loads, lines):
+            if what == "token":
+                session = key.split("/")[2]
+                if session not in sessions:
+                    sessions.append(session)
+                yield Sent(sessions.index(session), key, rest[0].removeprefix("SampleKind."))
+            else:
+                _, kind, _, express, congestion, attachment, payload, _ = rest
+                assert (kind, congestion) == ("SampleKind.PUT", "CongestionControl.DROP")
+                sequence = Attachment.parse(bytes.fromhex(attachment)).sequence
+                distances = [abs(sequence - 1 - last.get((px4, key), 0)) for px4 in range(len(sessions))]
+                px4 = distances.index(min(distances))
+                last[px4, key] = sequence
+                yield Sent(px4, key, "PUT", express, bytes.fromhex(attachment), bytes.fromhex(payload))
+
+
+class Px4:
+    """The session of one PX4: its messages may be dropped wherever there is no room, but by its own queue."""
+
+    def __init__(self, endpoint: str) -> None:
+        config = zenoh.Config()
+        settings = {
+            "scouting/multicast/enabled": False,
+            "mode": "client",
+            "connect/endpoints": [endpoint],
+            "connect/timeout_ms": round(1000 * DEADLINE),
+            "listen/endpoints": [],
+            "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,  # us; zenoh-pico waits
+        }
+        for name, value in settings.items():
+            config.insert_json5(name, json.dumps(value))
+        self.session: Session = zenoh.open(config)
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+
+    def send(self, sent: Sent) -> None:
+        """Send what this PX4 sent."""
+        if sent.payload:
+            if sent.key not in self._publishers:
+                drop = zenoh.CongestionControl.DROP
+                publisher = self.session.declare_publisher(sent.key, congestion_control=drop, express=sent.express)
+                self._publishers[sent.key] = publisher
+                matching = cast("Callable[[], zenoh.MatchingStatus]", lambda: publisher.matching_status)
+                wait_for(lambda: matching().matching, what="the service to subscribe")
+            self._publishers[sent.key].put(sent.payload, attachment=sent.attachment)
+        elif sent.kind == "PUT":
+            self._tokens[sent.key] = self.session.liveliness().declare_token(sent.key)
+        elif sent.key in self._tokens:
+            self._tokens.pop(sent.key).undeclare()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+
+def status(bus: nedbus.Bus) -> Mapping[str, Any]:
+    """Return the status of the service's only source."""
+    services = cast("list[dict[str, Any]]", bus.services())
+    return services[0]["sources"][0] if services else {}
+
+
+def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
+    """Wait until the service published or rejected so many messages."""
+
+    def is_counted() -> bool:
+        now = status(bus)
+        return bool(now["published"] + now["rejected"] == count)
+
+    wait_for(is_counted, what=f"{count} messages")
+
+
+def log_rows() -> dict[tuple[Address, int], bytes]:
+    """Return the messages of the vehicle's own log, by address and time."""
+    rows = {}
+    for message in open_replay(f"ulog:{LOG}").messages:
+        fields = upgrade(message.fields).__dict__
+        rows[message.address, fields["timestamp"]] = encode_cdr(fields, layout="1.16")
+    return rows
+
+
+@pytest.fixture(params=["embedded", "zenohd"])
+def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_path: Path) -> str:
+    """Start a service that receives from PX4s, as the router or as the client of a zenohd; return the endpoint."""
+    endpoint = free_endpoint()
+    if request.param == "embedded":
+        service = run_nedbus("serve", "--listen", endpoint, "-s", "px4-zenoh:")
+    else:
+        file = tmp_path / "zenohd.json5"
+        # A zenohd drops what does not fit the queue of a link for 1 ms; here it is to be as slow as the machine.
+        queue = "queue: { congestion_control: { drop: { wait_before_drop: 10000000 } } }"
+        file.write_text(
+            f'{{ listen: {{ endpoints: ["{endpoint}"] }}, scouting: {{ multicast: {{ enabled: false }} }},'
+            f" transport: {{ link: {{ tx: {{ {queue} }} }} }} }}"
+        )
+        start_zenohd(start, "-c", str(file))
+        service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
+    wait_for(lambda: "listening" in service.err, what="the service")
+    return endpoint
+
+
+def test_flight_arrives_as_it_was_logged(where: str) -> None:
+    """26,514 messages of a flight, four streams, GPS lost and back: all arrive, to the bit those of PX4's own log.
+
+    Recorded from a real PX4: gps_loss_zenoh.jsonl.gz, gps_loss.ulg.
+    """
+    logged = log_rows()
+    equal: Counter[str] = Counter()
+    total = 0
+    with nedbus.connect(where, timeout=DEADLINE) as bus, bus.subscribe(ANY, mode="every") as every, Px4(where) as px4:
+        window: dict[Address, list[bytes]] = {}
+
+        def receive() -> None:
+            for _ in range(sum(map(len, window.values()))):
+                sample = every.receive(DEADLINE)
+                received = encode_cdr(sample.message.__dict__, layout="1.16")
+                assert (received, sample.source) == (window[sample.address].pop(0), "px4-zenoh")
+                row = logged.get((sample.address, sample.message.timestamp))
+                assert row in (None, received)
+                equal[str(sample.address)] += row is not None
+            window.clear()
+
+        for sent in read_recording(FLIGHT):
+            if total % WINDOW == 0 or sent.kind == "DELETE":
+                receive()
+            px4.send(sent)
+            if sent.payload:
+                window.setdefault(sent.address, []).append(sent.cdr)
+                total += 1
+        now = status(bus)
+        assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (total, 0, 0, 0)
+        assert (total, every.counts.lost) == (26_514, 0)
+    assert equal == {
+        "1/estimator_local_position/0": 5318,
+        "1/estimator_local_position/1": 5318,
+        "1/vehicle_local_position": 5202,
+        "1/vehicle_local_position_groundtruth": 10_649,
+    }
+
+
+def test_two_that_are_alike_are_not_mixed(where: str) -> None:
+    """Two PX4s with equal keys and gids: the first is published until the second appears, then neither, and it says so.
+
+    A key with which the second one only announces itself is closed too: nobody knows what it will send.
+    Nothing counts as lost, nothing as a reboot.
+    Recorded from two real PX4s, started 5 s apart: two_alike_zenoh.jsonl.gz.
+    """
+    lines = list(read_recording(ALIKE))
+    second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)
+    its_first = next(number for number, sent in enumerate(lines) if sent.px4 == 1 and sent.payload)
+    # Two sessions have no order between them: what the first one sent meanwhile may well have come later.
+    meanwhile = lines[second : its_first + 1]
+    alone = [sent for sent in lines[:second] if sent.payload]
+    played = 0
+    with (
+        nedbus.connect(where, timeout=DEADLINE) as bus,
+        bus.subscribe(ANY, mode="every") as every,
+        Px4(where) as first,
+        Px4(where) as other,
+    ):
+
+        def play(part: list[Sent]) -> None:
+            nonlocal played
+            for sent in part:
+                (first, other)[sent.px4].send(sent)
+                played += bool(sent.payload)
+                if sent.payload and played % WINDOW == 0:
+                    wait_until_counted(bus, played)
+            wait_until_counted(bus, played)
+
+        play(lines[:second])
+        play([sent for sent in meanwhile if sent.px4])
+        play([sent for sent in meanwhile if not sent.px4])
+        play([sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"])
+        received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
+        assert sorted(received) == sorted(sent.cdr for sent in alone)
+        now = status(bus)
+        assert (now["published"], now["rejected"]) == (len(alone), played - len(alone))
+        assert (now["lost"], now["reboots"], every.counts.lost) == (0, 0, 0)
+        assert len(now["warnings"]) == 4
+        assert all("two vehicles are alike" in warning for warning in now["warnings"])
+
+
+def test_restart_is_one_reboot(where: str) -> None:
+    """A PX4 that is shut down and started again is one reboot, whatever number of topics it has, and nothing is lost.
+
+    The first 2 s of a real flight, twice: gps_loss_zenoh.jsonl.gz.
+    """
+    lines = list(islice(read_recording(FLIGHT), 1100))
+    messages = [sent for sent in lines if sent.payload]
+    assert len({sent.address for sent in messages}) == 4
+    with nedbus.connect(where, timeout=DEADLINE) as bus:
+        for times in (1, 2):
+            with Px4(where) as px4:
+                played = (times - 1) * len(messages)
+                for sent in lines:
+                    px4.send(sent)
+                    played += bool(sent.payload)
+                    if sent.payload and played % WINDOW == 0:
+                        wait_until_counted(bus, played)
+                wait_until_counted(bus, played)
+        now = status(bus)
+        assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (2 * len(messages), 0, 0, 1)
+
+
+def read_datagrams(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield the time of each datagram [ns], and its bytes."""
+    data, offset = gzip.decompress(path.read_bytes()), 0
+    header = struct.Struct("<QH")
+    while offset < len(data):
+        time_ns, length = header.unpack_from(data, offset)
+        offset += header.size + length
+        yield time_ns, data[offset - length : offset]
+
+
+def is_position(datagram: bytes) -> bool:
+    """Return whether LOCAL_POSITION_NED is in a datagram of MAVLink 2."""
+    offset = 0
+    while offset < len(datagram):
+        length, flags = datagram[offset + 1], datagram[offset + 2]
+        if datagram[offset + 7 : offset + 10] == b"\x20\x00\x00":
+            return True
+        offset += 12 + length + 13 * (flags & 1)
+    return False
+
+
+def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
+    """Position and velocity equal the log's to the bit, and so do the flags, but for what is younger than their source.
+
+    ESTIMATOR_STATUS comes once a second, so that a flag is up to a second late, and not there before the first one.
+    In this flight that is: both vertical flags 11 times until the first status (1.15 s after the start), both
+    horizontal ones 11 times until GPS is used (3.15 s), 8 times after it was lost (28.15 s), and 4 times after it was
+    back (30.15 s).
+    A vehicle at rest is valid, though PX4 sets the bit of the constant position mode then.
+    Recorded from a real PX4, which nobody had asked for anything: gps_loss_mavlink.bin.gz, gps_loss.ulg.
+    """
+    names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")
+    flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
+    logged = {}
+    for message in open_replay(f"ulog:{LOG}").messages:
+        if message.address.topic == VLP:
+            fields = upgrade(message.fields).__dict__
+            logged[fields["timestamp"]] = fields
+    endpoint = free_endpoint()
+    run_nedbus("serve", "--listen", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}")
+    wait_for(lambda: is_in_use(port), what="the service to listen")
+    differing: Counter[tuple[str, int]] = Counter()
+    compared = pending = 0
+    with (
+        nedbus.connect(endpoint, timeout=DEADLINE) as bus,
+        bus.subscribe(mode="every") as every,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4,
+    ):
+        for _, datagram in read_datagrams(MAVLINK):
+            px4.sendto(datagram, ("127.0.0.1", port))
+            pending += 1
+            if not is_position(datagram):
+                continue
+            fields = every.receive(DEADLINE).message.__dict__
+            pending = 0
+            row = logged.get(fields["timestamp"])
+            if row is None:
+                continue  # the very last one, after the log was closed
+            compared += 1
+            assert [fields[name] for name in names] == [row[name] for name in names]
+            for flag in flags:
+                differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += fields[flag] != row[flag]
+        now = status(bus)
+    assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (1276, 0, 0, 0)
+    assert compared == 1275
+    vertical, horizontal = {1: 11}, {3: 11, 28: 8, 30: 4}
+    for flag in flags:
+        found = {second: count for (name, second), count in differing.items() if name == flag and count}
+        assert found == (horizontal if "xy" in flag else vertical)

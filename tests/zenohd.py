@@ -1,0 +1,43 @@
+"""The real zenohd, for tests: unpacked once from ../shared/bin, where that is there."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tarfile
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Process, Start
+
+ROOT = Path(__file__).parents[1]
+ARCHIVE = ROOT.parent / "shared" / "bin" / "zenohd-1.10.2.tar.xz"
+# Whatever `start` starts is Python: this one becomes another program.
+BECOME = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
+
+
+def zenohd_path() -> Path:
+    """Return the program, whose plugins are in ../lib beside it; skip the test where there is none."""
+    if not ARCHIVE.is_file():
+        pytest.skip(f"no real zenohd: {ARCHIVE} is not there")
+    unpacked = ROOT / "build" / f"zenohd-{hashlib.sha256(ARCHIVE.read_bytes()).hexdigest()[:12]}"
+    if not unpacked.is_dir():
+        unpacked.parent.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=unpacked.parent) as folder, tarfile.open(ARCHIVE) as archive:
+            archive.extraction_filter = getattr(tarfile, "data_filter", None)  # Debian's Python 3.11.2 has none
+            for member in archive:
+                archive.extract(member, folder)
+            try:
+                Path(folder, "zenohd").rename(unpacked)
+            except OSError:  # another run was faster
+                assert unpacked.is_dir()
+    return unpacked / "bin" / "zenohd"
+
+
+def start_zenohd(start: Start, *arguments: str, **environment: str) -> Process:
+    """Start a zenohd with these arguments, by the fixture `start`: it is killed at the end of the test."""
+    path = zenohd_path()
+    plugins = f"--plugin-search-dir={path.parents[1] / 'lib'}"
+    return start("-c", BECOME, os.fspath(path), plugins, *arguments, NO_COLOR="1", RUST_LOG="info", **environment)
