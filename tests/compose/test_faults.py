@@ -147,6 +147,7 @@ import sys, threading, zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", '["tcp/router:7447"]')
+config.insert_json5("connect/timeout_ms", "-1")  # the router may not listen yet
 session = zenoh.open(config)
 subscriber = session.declare_subscriber("nedbus/**", zenoh.handlers.FifoChannel(1))
 print("stuck", flush=True)

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 
 import pytest
 
-from nedbus.bridges.ros2_arbiter import MAX_LATENCY, TAKE_OVER_DELAY, Decision, Ros2Arbiter
+from nedbus.bridges.ros2_arbiter import TAKE_OVER_DELAY, Decision, Ros2Arbiter
 from nedbus.errors import AddressError
 from nedbus_msgs import Address
 
@@ -63,16 +63,16 @@ def test_topic_of_another_node_is_left_to_it() -> None:
     arbiter = make()
     assert arbiter.update([ONE], {ONE: "px4"}, now=0.0) == [Decision("defer", ONE, TOPIC, "px4")]
     assert arbiter.update([ONE], {ONE: "px4"}, now=1.0) == []
-    assert not arbiter.forwards(ONE, latency=0.0)
+    assert not arbiter.publishes(ONE)
 
 
 def test_published_topic_is_left_to_a_node_that_comes_later() -> None:
     """PX4 itself wins over the bridge."""
     arbiter = make()
     arbiter.update([ONE], {}, now=0.0)
-    assert arbiter.forwards(ONE, latency=0.0)
+    assert arbiter.publishes(ONE)
     assert actions(arbiter, [ONE], {ONE: "px4"}, now=1.0) == [("defer", TOPIC)]
-    assert not arbiter.forwards(ONE, latency=0.0)
+    assert not arbiter.publishes(ONE)
 
 
 def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
@@ -103,7 +103,7 @@ def test_two_addresses_of_one_topic_conflict() -> None:
         Decision("conflict", second, topic, str(first)),
     ]
     assert arbiter.update([first, second], {}, now=1.0) == []
-    assert (arbiter.forwards(first, latency=0.0), arbiter.forwards(second, latency=0.0)) == (True, False)
+    assert (arbiter.publishes(first), arbiter.publishes(second)) == (True, False)
     assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
 
@@ -117,20 +117,10 @@ def test_published_address_keeps_its_topic_in_a_conflict() -> None:
     ]
 
 
-def test_old_sample_is_not_forwarded() -> None:
-    """ROS 2 would use a recovered sample as the current estimate; one without a latency is current."""
-    arbiter = make()
-    arbiter.update([ONE], {}, now=0.0)
-    assert arbiter.forwards(ONE, latency=None)
-    assert arbiter.forwards(ONE, latency=-0.5)
-    assert arbiter.forwards(ONE, latency=MAX_LATENCY - 0.01)
-    assert not arbiter.forwards(ONE, latency=MAX_LATENCY)
-
-
-def test_sample_of_an_unpublished_address_is_not_forwarded() -> None:
+def test_address_is_not_published_before_and_after() -> None:
     """A sample can come before the first update, and after the address was withdrawn."""
     arbiter = make()
-    assert not arbiter.forwards(ONE, latency=0.0)
+    assert not arbiter.publishes(ONE)
     arbiter.update([ONE], {}, now=0.0)
     arbiter.update([], {}, now=1.0)
-    assert not arbiter.forwards(ONE, latency=0.0)
+    assert not arbiter.publishes(ONE)

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import signal
+import threading
+import time
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import cast
 
 import pytest
 import zenoh
 
 import nedbus
-from nedbus.transport import Attachment, Session, TopicKey, publisher_token
+from nedbus.transport import Attachment, Session, TopicKey, gid_of_token, open_router, publisher_token
 from nedbus_msgs import (
     DEFAULT_TOPIC,
     LAYOUTS,
     ROS2_TYPE,
     VehicleLocalPosition,
     dds_type,
+    decode_cdr,
     downgrade,
     type_hash,
     upgrade,
 )
-from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
+from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
 from tests.replays import open_replay
 
 VLP = DEFAULT_TOPIC
@@ -42,6 +47,21 @@ def flight() -> list[VehicleLocalPosition]:
 def definition(layout: str) -> str:
     """Return the message definition as a .msg file of px4_msgs has it."""
     return "".join(f"{LAYOUTS[layout].type_of(name)} {name}\n" for name in LAYOUTS[layout].fields)
+
+
+class WrongClock:
+    """A session on a host whose clock is wrong by so many seconds."""
+
+    def __init__(self, session: Session, ahead: float) -> None:
+        self._session = session
+        self._ahead = dt.timedelta(seconds=ahead)
+
+    def new_timestamp(self) -> zenoh.Timestamp:
+        stamp = self._session.new_timestamp()
+        return zenoh.Timestamp(stamp.get_time() + self._ahead, bytes(stamp.get_id()))
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._session, name)
 
 
 @pytest.fixture
@@ -92,6 +112,7 @@ def test_ros_2_node_receives_and_lists(
     node = peer("listen", layout, topic=topic, rows=expected, domain_id=3)
     wait_for_reader(bus._session, f"3{topic}/{dds_type(ROS2_TYPE)}/{type_hash(layout)}")
     wait_for(lambda: f"-> {topic}" in bridge.err, what="the bridge")
+    wait_for_reader(bus._session, f"nedbus/7/{VLP}")
     for each in messages:
         publisher.publish(each)
     assert node.wait() == 0, node.err
@@ -108,6 +129,7 @@ def test_bridge_writes_what_px4_writes(run_nedbus: Start, endpoint: str, bus: ne
     key = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
     subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(100))
     wait_for(lambda: list(raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**")), what="the publisher's token")
+    wait_for_reader(bus._session, f"nedbus/1/{VLP}")
     for timestamp in (1, 2):
         publisher.publish(message(timestamp))
     one, two = (subscriber.handler.recv() for _ in range(2))
@@ -115,8 +137,92 @@ def test_bridge_writes_what_px4_writes(run_nedbus: Start, endpoint: str, bus: ne
     first, second = (Attachment.parse(sample.attachment.to_bytes()) for sample in (one, two) if sample.attachment)
     assert (first.sequence, second.sequence, first.gid == second.gid) == (1, 2, True)
     assert second.time > first.time > 1_700_000_000_000_000_000
+    (token,) = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/0/*/*/*/MP/**") if reply.ok]
+    assert first.gid == gid_of_token(token), "what `ros2 topic info -v` shows"
     nodes = [str(reply.ok.key_expr) for reply in raw.liveliness().get("@ros2_lv/0/*/*/*/NN/**") if reply.ok]
     assert len(nodes) == 1
+
+
+@pytest.mark.parametrize("ahead", [-3600.0, -1.5, 3600.0])
+def test_clocks_of_two_hosts_do_not_matter(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session, ahead: float
+) -> None:
+    """A vehicle whose clock is wrong reaches ROS 2 whole, and without a last value of another time.
+
+    A real rclpy got 0 of 400 messages of a vehicle whose clock was 1.5 s behind.
+    """
+    with nedbus.connect(endpoint) as vehicle:
+        publisher = vehicle.publisher(VLP, vehicle="1")
+        publisher._session = cast("Session", WrongClock(publisher._session, ahead))
+        publisher.publish(message(1))
+        wait_for(bus.latest, what="the last value")
+        key = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
+        subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(1000))
+        bridge = run_nedbus("ros2", "-c", endpoint)
+        wait_for(lambda: "->" in bridge.err and "that were held back: 1" in bridge.err, what="both")
+        wait_for_reader(vehicle._session, f"nedbus/1/{VLP}")
+        for timestamp in range(2, 402):
+            publisher.publish(message(timestamp))
+        received = [subscriber.handler.recv() for _ in range(400)]
+        times = [decode_cdr(each.payload.to_bytes(), layout="1.16")["timestamp"] for each in received]
+        assert times == list(range(2, 402))
+
+
+def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path) -> None:
+    """After an outage the bridge recovers what it missed, and says how much it held back of it: it is no estimate."""
+    endpoint = free_endpoint()
+    router = open_router(listen=(endpoint,))
+    published: list[float] = []  # when each timestamp was, from 0 on
+    stop = threading.Event()
+    with nedbus.connect(endpoint) as vehicle, nedbus.connect(endpoint) as node:
+        publisher = vehicle.publisher(VLP, vehicle="1")
+        key = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
+        subscriber = node._session.declare_subscriber(key, zenoh.handlers.FifoChannel(100_000))
+        bridge = run_nedbus("ros2", "-c", endpoint)
+        received: list[int] = []
+
+        def fly() -> None:
+            while not stop.wait(0.01):
+                publisher.publish(message(len(published)))
+                published.append(time.monotonic())
+
+        def has_received(timestamp: int) -> bool:
+            while (sample := subscriber.handler.try_recv()) is not None:
+                received.append(int(str(decode_cdr(sample.payload.to_bytes(), layout="1.16")["timestamp"])))
+            return bool(received) and received[-1] >= timestamp
+
+        flight = threading.Thread(target=fly)
+        flight.start()
+        wait_for(lambda: has_received(100), what="ROS 2 to receive")
+        router.close()
+        first = len(published)
+        wait_for(lambda: len(published) > first + 300, what="the outage")
+        router, back = open_router(listen=(endpoint,)), time.monotonic()
+        wait_for(lambda: " s late: ROS 2 would use them as the current estimate" in bridge.err, what="the recovery")
+        last = len(published)
+        wait_for(lambda: has_received(last), what="what is current")
+        stop.set()
+        flight.join()
+    router.close()
+    missed = [timestamp for timestamp in range(first, last) if published[timestamp] < back - 1.1]
+    assert len(missed) > 100
+    assert not set(missed) & set(received)
+    assert received == sorted(set(received))
+
+
+@pytest.mark.parametrize(
+    ("type_hash", "gid"),
+    [
+        (f"RIHS01_{'0123456789abcdef' * 4}", "6111f41e7e37c001654a5d5744a79f5d"),
+        ("TypeHashNotSupported", "dc9fe97ae21781b5bf9db22103fda477"),
+        (f"RIHS01_{'0123456789abcdef' * 4}/long/and/longer", "5f06fa6078c5c222f899e17f78d4257a"),
+    ],
+)
+def test_gid_is_that_of_rmw_zenoh(type_hash: str, gid: str) -> None:
+    """These were computed by rmw_zenoh's own code (simplified_xxhash3.cpp), for both of its paths."""
+    key = TopicKey(0, f"fmu/out/{VLP}", "px4_msgs::msg::dds_::VehicleLocalPosition_", type_hash)
+    token = publisher_token(key, "0123456789abcdef" * 2, "nedbus_4711", 1)
+    assert gid_of_token(token).hex() == gid
 
 
 def test_topic_of_another_node_is_left_to_it(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
@@ -183,12 +289,28 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
     subscriber = raw.declare_subscriber(key, zenoh.handlers.FifoChannel(10))
     bridge = run_nedbus("ros2", "-c", endpoint, "--humble", "-t", "estimator_local_position", "-i", "0")
     wait_for(lambda: "set --namespace" in bridge.err, what="both")
+    wait_for_reader(bus._session, "nedbus/a_b/estimator_local_position/0")
     for publisher in publishers:
         publisher.publish(message(7))
     assert len(subscriber.handler.recv().payload) == 220
     assert "estimator_local_position_1" not in bridge.err
     bridge.signal(signal.SIGTERM)
     assert bridge.wait() == 0
+
+
+def test_router_that_hides_ros_2_is_named(run_nedbus: Start, tmp_path: Path) -> None:
+    """A router whose access control has no rule for ROS 2 denies in silence: the bridge finds out, and ends."""
+    endpoint, file = free_endpoint(), tmp_path / "router.json5"
+    rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]
+    policies = [{"rules": ["no"], "subjects": ["all"]}]
+    access = {"enabled": True, "default_permission": "allow", "rules": rules, "policies": policies}
+    file.write_text(json.dumps({"mode": "router", "access_control": {**access, "subjects": [{"id": "all"}]}}))
+    session = open_router(listen=(endpoint,), config_file=file)
+    bridge = run_nedbus("ros2", "-c", endpoint)
+    assert bridge.wait() == 1
+    assert "this router hides what nedbus announces to ROS 2" in bridge.err
+    assert len(bridge.err.splitlines()) == 1
+    session.close()
 
 
 @pytest.mark.parametrize(

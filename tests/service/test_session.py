@@ -8,8 +8,9 @@ import pytest
 
 import nedbus
 from nedbus.errors import ConfigError, ListenError
+from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
-from tests.conftest import free_endpoint, wait_for
+from tests.conftest import Start, free_endpoint, wait_for
 
 
 @pytest.mark.parametrize(
@@ -39,6 +40,41 @@ def test_router_file_must_be_one(tmp_path: Path) -> None:
         open_router(config_file=tmp_path / "no.json5")
     with pytest.raises(ConfigError, match=r"is a \.json5, \.json, \.yaml or \.yml file"):
         open_router(config_file=tmp_path / "router.conf")
+
+
+def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Zenoh's Python library ignores them without a word: each is named, and one that is required is an error."""
+    file = tmp_path / "router.json5"
+    file.write_text('{ mode: "router", plugins: { rest: { http_port: 8000 }, storage_manager: {} } }')
+    open_router(listen=(free_endpoint(),), config_file=file).close()
+    ignored = "without plugin rest and plugin storage_manager: this router loads no plugins, as zenohd does"
+    assert caplog.messages == [f"{file}: {ignored}"]
+    file.write_text("{ plugins: { rest: { __required__: true } } }")
+    with pytest.raises(ConfigError, match="it requires plugin rest, and this router loads no plugins: start it with"):
+        open_router(config_file=file)
+
+
+@pytest.mark.parametrize("name", ["storage.json5", "rest-reader.json5"])
+def test_file_for_zenohd_alone_is_refused(name: str) -> None:
+    """`nedbus router` does not run as if these did something."""
+    with pytest.raises(ConfigError, match="this router loads no plugins"):
+        open_router(config_file=Path(__file__).parents[2] / "config" / name)
+
+
+def test_help_names_every_source(run_nedbus: Start) -> None:
+    """`nedbus serve --help` derives from the table of sources: none is forgotten."""
+    help_ = run_nedbus("serve", "--help", COLUMNS="300")
+    assert help_.wait() == 0
+    assert all(f" {name}:{kind.target or ''}" in help_.out for name, kind in SOURCE_KINDS.items())
+
+
+def test_router_command_names_ignored_plugins(run_nedbus: Start, tmp_path: Path) -> None:
+    """Who starts `nedbus router FILE` reads it."""
+    file = tmp_path / "router.json5"
+    file.write_text("{ plugins: { rest: { http_port: 8000 } } }")
+    router = run_nedbus("router", str(file), "--listen", free_endpoint())
+    wait_for(lambda: "router on" in router.err, what="the router")
+    assert "without plugin rest: this router loads no plugins" in router.err
 
 
 def test_taken_port_names_the_reason(endpoint: str) -> None:

@@ -13,20 +13,22 @@ from typing import Final
 import zenoh
 
 from nedbus.client import Bus, Sample, Subscription
-from nedbus.errors import NoDataError
+from nedbus.errors import NedbusError, NoDataError
 from nedbus.transport import (
+    BRIDGED_ENCODING,
     NO_HASH,
     Attachment,
     Session,
     TopicKey,
     alive_keys,
-    make_gid,
+    gid_of_token,
     node_token,
     publisher_token,
     publishers_key_expr,
     while_open,
 )
 from nedbus_msgs import (
+    ANY,
     CURRENT,
     LAYOUTS,
     ROS2_TYPE,
@@ -39,11 +41,13 @@ from nedbus_msgs import (
     type_hash,
 )
 
+from .late_filter import LateFilter
 from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
 _POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
+_VISIBLE: Final = 5.0  # s after which what was announced is visible to others, or denied
 
 
 class Ros2Bridge:
@@ -56,6 +60,7 @@ class Ros2Bridge:
     A topic that another node publishes is left to that node: a PX4 that speaks Zenoh itself is not published twice.
     `selection` is what to publish, all addresses without it.
     `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
+    `observer` is another session at the same router, to see what others see: access control denies in silence.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -65,6 +70,7 @@ class Ros2Bridge:
         bus: Bus,
         session: Session,
         *,
+        observer: Session | None = None,
         selection: Selection | None = None,
         layout: str = CURRENT.name,
         domain: int = 0,
@@ -76,23 +82,31 @@ class Ros2Bridge:
             raise LayoutError(f"no layout {layout!r}: choose from {', '.join(LAYOUTS)}")
         self._bus = bus
         self._session = session
+        self._observer = observer
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
         self._hash = type_hash(layout) if hashed else NO_HASH
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
+        self._late_filter = LateFilter()
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
 
-        Raises ClosedError when the bus or the session is closed meanwhile.
+        Raises ClosedError when the bus or the session is closed meanwhile, NedbusError when the observer does not see
+        the bridge.
         """
+        key = node_token(self._domain, self._zid, self._node)
         with while_open(self._session):
-            token = self._session.liveliness().declare_token(node_token(self._domain, self._zid, self._node))
+            token = self._session.liveliness().declare_token(key)
         try:
+            if self._observer is not None:
+                self._require_visible(self._observer, key, stop)
+            # What was published before must not reach ROS 2 as the current estimate.
+            self._late_filter = LateFilter(self._bus.latest(ANY))
             with self._bus.subscribe_to(self._selection, mode="every") as subscription:
                 self._forward(subscription, stop)
         finally:
@@ -100,6 +114,19 @@ class Ros2Bridge:
                 publisher.close()
             self._publishers.clear()
             token.undeclare()
+
+    def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
+        """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
+        end = time.monotonic() + _VISIBLE
+        while not stop.is_set() and not alive_keys(observer, token, timeout=0.5):
+            if not all(session.info.routers_zid() for session in (observer, self._session)):
+                end = time.monotonic() + _VISIBLE  # without a link nobody sees anything
+            elif time.monotonic() > end:
+                raise NedbusError(
+                    "this router hides what nedbus announces to ROS 2: its access control has no rule for the keys of"
+                    " ROS 2: start the router of ROS 2, and name it with --to"
+                )
+            stop.wait(0.05)
 
     def _forward(self, subscription: Subscription, stop: threading.Event) -> None:
         next_poll = 0.0
@@ -111,11 +138,16 @@ class Ros2Bridge:
                 sample = subscription.receive(0.1)
             except NoDataError:
                 continue
-            if self._arbiter.forwards(sample.address, latency=sample.latency):
+            if self._late_filter.admits(sample, arrived=time.monotonic_ns()) and self._arbiter.publishes(
+                sample.address
+            ):
                 self._put(sample)
 
     def _poll(self) -> None:
-        """Query what is on the bus and in ROS 2, and do what the arbiter decides."""
+        """Say what was held back, query what is on the bus and in ROS 2, and do what the arbiter decides."""
+        held_back = self._late_filter.report()
+        if held_back:
+            _log.warning("%s: ROS 2 would use them as the current estimate", held_back)
         addresses = [
             address
             for addresses in self._bus.vehicles().values()
@@ -142,6 +174,7 @@ class Ros2Bridge:
             if decision.action == "defer":
                 _log.warning("%s: node %s publishes /%s already: left to that node", address, other, topic)
             else:
+                self._late_filter.forget(address)
                 _log.info("%s is no longer published: /%s is withdrawn", address, topic)
 
     def _other_publisher(self, key: TopicKey) -> str | None:
@@ -155,11 +188,14 @@ class Ros2Bridge:
     def _open(self, address: Address, topic: str) -> None:
         key = self._key(topic)
         self._entities += 1
+        token = publisher_token(key, self._zid, self._node, self._entities)
         with while_open(self._session):
             self._publishers[address] = _Ros2Publisher(
-                make_gid(),
-                self._session.declare_publisher(str(key), congestion_control=zenoh.CongestionControl.DROP),
-                self._session.liveliness().declare_token(publisher_token(key, self._zid, self._node, self._entities)),
+                gid_of_token(token),
+                self._session.declare_publisher(
+                    str(key), encoding=BRIDGED_ENCODING, congestion_control=zenoh.CongestionControl.DROP
+                ),
+                self._session.liveliness().declare_token(token),
             )
 
     def _put(self, sample: Sample) -> None:

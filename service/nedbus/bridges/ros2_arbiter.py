@@ -13,9 +13,6 @@ from nedbus_msgs import Address, AddressError, ros2_topic_of
 TAKE_OVER_DELAY: Final = 5.0
 """Seconds without another node's publisher after which its topic is taken over."""
 
-MAX_LATENCY: Final = 1.0
-"""Seconds from which on a sample is not forwarded: ROS 2 would use a recovered one as the current estimate."""
-
 _NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*|")
 
 
@@ -81,12 +78,9 @@ class Ros2Arbiter:
                 decisions.append(decision)
         return decisions
 
-    def forwards(self, address: Address, *, latency: float | None) -> bool:
-        """Return whether to forward a sample of an address: it is published, and the sample is not too old.
-
-        A sample without a latency is forwarded.
-        """
-        return address in self._published and (latency is None or latency < MAX_LATENCY)
+    def publishes(self, address: Address) -> bool:
+        """Return whether an address is published."""
+        return address in self._published
 
     def _decide(self, address: Address, other_node: str | None, now: float) -> Decision | None:
         topic = self.topic_of(address)

@@ -45,13 +45,15 @@ def ros2(
     namespaces = dict(each.partition(":")[::2] for each in namespace or ())
     with ExitStack() as closing:
         try:
-            session = bus.open_session(to)
+            session, observer = bus.open_session(to), bus.open_session(to)
         except ConnectError as exc:
             raise NedbusError(f"nothing answers at {to}: start the router of ROS 2 there, or correct --to") from exc
         closing.callback(session.close)
+        closing.callback(observer.close)
         bridge = bridges.Ros2Bridge(
             bus,
             session,
+            observer=observer,
             selection=selection,
             layout=layout,
             domain=domain,

@@ -12,6 +12,7 @@ import typer
 from nedbus import __version__
 from nedbus.daemon import Daemon
 from nedbus.settings import load_settings
+from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, open_router, router_endpoints
 
 from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
@@ -19,6 +20,7 @@ from .progress import Display
 from .run import run_until_signal, run_until_stopped
 
 _log = logging.getLogger("nedbus")
+_SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
 
 ListenOption = Annotated[
     list[str] | None,
@@ -35,7 +37,7 @@ def serve(
             "--source",
             "-s",
             metavar="SOURCE",
-            help="sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, with ?OPTION=VALUE&...; repeatable",
+            help=f"{_SOURCES}, with ?OPTION=VALUE&...; repeatable",
         ),
     ] = None,
     connect: Annotated[

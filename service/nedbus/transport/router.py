@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import zenoh
@@ -15,13 +16,18 @@ from nedbus.errors import ConfigError, ListenError
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings, open_session
 
+_log = logging.getLogger(__name__)
+
 
 def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), config_file: Path | None = None) -> Session:
     """Open a session that is itself a router, by default on loopback, or as a JSON5 file for `zenohd` configures it.
 
     Endpoints that are given replace those of the file, as the flags of `zenohd` do.
 
-    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file.
+    Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
+
+    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, or a plugin that the file
+    requires.
     """
     check_endpoints(listen, where="listen")
     check_endpoints(connect, where="connect")
@@ -41,6 +47,9 @@ def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), conf
     else:
         given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
         config = _read_config(config_file)
+        plugins = json.loads(config.get_json("plugins"))
+        if plugins:
+            _log.warning("%s: without %s: this router loads no plugins, as zenohd does", config_file, _names(plugins))
         insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
     try:
         return open_session(config)
@@ -73,6 +82,11 @@ def _read_config(path: Path) -> zenoh.Config:
         position = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
         raise ConfigError.in_file(path, _parser_message(text), line=line, column=column) from exc
+    plugins = json.loads(config.get_json("plugins"))
+    required = [name for name, settings in plugins.items() if settings and settings.get("__required__")]
+    if required:
+        reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
+        raise ConfigError.in_file(path, reason)
     for name, value in json.loads(config.get_json("transport/link/tls")).items():
         # Zenoh would report only that there is no such file, and not which.
         if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
@@ -80,6 +94,10 @@ def _read_config(path: Path) -> zenoh.Config:
                 path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
             )
     return config
+
+
+def _names(plugins: Iterable[str]) -> str:
+    return " and ".join(f"plugin {name}" for name in plugins)
 
 
 def _parser_message(text: str) -> str:

@@ -1,0 +1,124 @@
+"""Which samples are current, decided at times that the test gives, by clocks that agree in nothing."""
+
+from __future__ import annotations
+
+import datetime as dt
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.bridges.late_filter import DRIFT, MAX_LATENESS, STEADY, LateFilter
+from nedbus_msgs import Address
+from tests.conftest import message
+
+ONE = Address("1", "vehicle_local_position")
+SECOND = 10**9
+NOW = 1_790_000_000 * SECOND  # what a vehicle's clock shows
+
+
+def sample(sent: int | None, *, by: int = 7, address: Address = ONE) -> nedbus.Sample:
+    """Return a sample that a publisher stamped with this time, in ns."""
+    stamp = None
+    if sent is not None:
+        moment = dt.datetime.fromtimestamp(sent // SECOND, dt.UTC)
+        moment += dt.timedelta(microseconds=sent % SECOND // 1000)
+        stamp = zenoh.Timestamp(moment, bytes([by]))
+    return nedbus.Sample(message(1), address, received=0, stamp=stamp)
+
+
+def admitted(late: LateFilter, *times: tuple[float, float]) -> list[bool]:
+    """Return what is admitted of samples with these times, sent and arrived, in seconds."""
+    return [late.admits(sample(NOW + round(sent * SECOND)), arrived=round(arrived * SECOND)) for sent, arrived in times]
+
+
+@pytest.mark.parametrize("ahead", [-86_400 * 365 * 20, -1.5, 0.0, 1.5, 86_400])
+def test_difference_of_two_clocks_does_not_matter(ahead: float) -> None:
+    """A vehicle whose clock is wrong by seconds or by years is as current as any."""
+    late = LateFilter()
+    assert all(admitted(late, *((ahead + each / 100, each / 100) for each in range(500))))
+    assert (late.held, late.report()) == (0, None)
+
+
+def test_recovered_samples_are_held_back_and_counted() -> None:
+    """After 10 s without a link those of the outage come in a burst: of these only the last second is current."""
+    late = LateFilter()
+    assert all(admitted(late, *((each / 100, each / 100) for each in range(200))))
+    burst = admitted(late, *((2 + each / 100, 12 + each / 2000) for each in range(1000)))
+    assert burst == sorted(burst), "once current, always current"
+    assert burst.count(False) == late.held
+    assert 900 <= burst.count(False) <= 960
+    assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
+    assert late.report() == f"{ONE}: messages from before that were held back: {late.held}, up to 10.0 s late"
+    assert late.report() is None
+
+
+def test_slow_recovery_is_held_back_as_well() -> None:
+    """A thin link catches up slowly: still nothing old passes."""
+    late = LateFilter()
+    admitted(late, (0.0, 0.0))
+    slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
+    assert slow == sorted(slow)
+    assert 2_650 <= slow.count(False) <= 2_750
+
+
+def test_last_value_from_before_is_held_back() -> None:
+    """A vehicle that is silent has a last message, of which nobody knows how old it is; its next one is current."""
+    late = LateFilter([sample(NOW)])
+    assert admitted(late, (0.0, 50.0), (3600.0, 3650.0)) == [False, True]
+    assert late.report() == f"{ONE}: messages from before that were held back: 1"
+
+
+def test_clock_that_is_set_back_by_another_implementation() -> None:
+    """Late and not catching up: after 2 s that is a clock."""
+    late = LateFilter()
+    admitted(late, *((each / 100, each / 100) for each in range(200)))
+    steps = admitted(late, *((each / 100 - 3600, each / 100) for each in range(200, 800)))
+    assert steps == sorted(steps)
+    assert steps.count(False) == STEADY / SECOND * 100
+
+
+def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:
+    """Zenoh never goes back: for an hour its timestamps stand, then they go on; all of it is current."""
+    late = LateFilter()
+    admitted(late, *((each / 100, each / 100) for each in range(200)))
+    assert all(admitted(late, *((1.99, each / 100) for each in range(200, 2_000))))
+    assert all(admitted(late, *((1.99 + each / 100, 20 + each / 100) for each in range(2_000))))
+    assert admitted(late, (22.0, 45.0)) == [False]
+
+
+def test_clocks_that_drift_apart() -> None:
+    """The fastest sample counts for a minute: 100 us in a second make a second in three hours, and nothing late."""
+    late = LateFilter()
+    assert all(admitted(late, *((each * (1 - 1e-4), float(each)) for each in range(20_000))))
+    assert DRIFT > 10 * MAX_LATENESS
+
+
+def test_new_publisher_has_a_clock_of_its_own() -> None:
+    """A vehicle that restarted with the clock of 1970 is current at once."""
+    late = LateFilter()
+    admitted(late, (0.0, 0.0))
+    assert late.admits(sample(SECOND, by=8), arrived=SECOND)
+
+
+def test_forgotten_address_starts_anew() -> None:
+    """What is withdrawn leaves nothing behind."""
+    late = LateFilter()
+    admitted(late, (0.0, 0.0))
+    late.forget(ONE)
+    assert admitted(late, (0.0, 3600.0)) == [True]
+
+
+def test_sample_without_a_timestamp_is_current() -> None:
+    """Nothing tells its age."""
+    late = LateFilter()
+    assert late.admits(sample(None), arrived=0)
+    assert late.admits(sample(None), arrived=3600 * SECOND)
+
+
+def test_others_are_named_in_short() -> None:
+    """One line, however many vehicles there are."""
+    late = LateFilter([sample(NOW, address=Address(name, ONE.topic)) for name in "abc"])
+    for name in "abc":
+        assert not late.admits(sample(NOW, address=Address(name, ONE.topic)), arrived=0)
+    assert late.report() == "a/vehicle_local_position and 2 others: messages from before that were held back: 3"
