@@ -4,18 +4,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DEV := $(VENV)/.dev
 
 .PHONY: run check quick test compose-test wheel bench clean
 
-run: $(READY)  ## the service with a simulated flight; then it says what to type in a second terminal
+run: $(READY)  ## the service with a simulated flight; it prints what to type in a second terminal
 	$(BIN)/nedbus serve --source sim:
 
-check: $(READY)  ## lint and types
+check: $(DEV)  ## lint and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-quick: $(READY)  ## the tests that start no process: under a minute
+quick: $(DEV)  ## the tests that start no process: under a minute
 	$(BIN)/pytest -q -m "not process and not compose"
 
 test: check  ## lint, types, and the tests that need no containers, with branch coverage
@@ -24,17 +25,17 @@ test: check  ## lint, types, and the tests that need no containers, with branch 
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
-compose-test: $(READY)  ## the tests in containers; they need Docker with compose, and some minutes
+compose-test: $(DEV)  ## the tests in containers; they need Docker with compose, and some minutes
 	$(BIN)/pytest -q -m compose --junitxml=build/compose-tests.xml
 
-wheel: $(READY)  ## build the wheel, install it where nothing else is, and use it
+wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and use it
 	rm -rf dist build/wheel-venv
 	$(BIN)/python -m build --wheel
 	$(PYTHON) -m venv build/wheel-venv
 	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
 
-bench: $(READY)  ## measure: beside the peers, with many vehicles, pacing of a replay, cost of an idle service
+bench: $(DEV)  ## measure: beside the peers, with many vehicles, pacing of a replay, cost of an idle service
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.picture
@@ -44,11 +45,18 @@ bench: $(READY)  ## measure: beside the peers, with many vehicles, pacing of a r
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 
-$(READY): pyproject.toml
-	$(PYTHON) -m venv $(VENV)
+$(READY): pyproject.toml  # what running needs
+	@echo "making a virtual environment in $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@echo "installing nedbus and the packages that it needs, about 200 MB ..."
+	@$(BIN)/pip install --disable-pip-version-check --editable .
+	@touch $(READY)
+
+$(DEV): $(READY) pyproject.toml  # what tests, checks and measurements need besides
+	@echo "installing what development needs, about 600 MB ..."
 	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
 	$(BIN)/pip install -q --group dev --editable .
-	touch $(READY)
+	touch $(DEV)
 
 clean:
 	rm -rf $(VENV) dist build .coverage* .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -1,10 +1,12 @@
 """Read the messages of all vehicles as NumPy arrays, and print the mean speed of each."""
 
+from contextlib import suppress
+
 import numpy as np
 
 import nedbus
 
-with nedbus.connect() as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(mode="every") as subscription:
     for batch in subscription.batches():
         for address in batch.addresses:
             own = batch.of(address)

@@ -1,12 +1,13 @@
 """How far is each EKF instance from the truth? Every message counts here, so the mode is "every"."""
 
 import math
+from contextlib import suppress
 
 import nedbus
 
 truth: nedbus.VehicleLocalPosition | None = None
-with nedbus.connect() as bus, bus.subscribe("*", vehicle="1", mode="every") as subscription:
-    for sample in subscription:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus:
+    for sample in bus.subscribe("*", vehicle="1", mode="every"):
         message = sample.message
         if sample.topic == "vehicle_local_position_groundtruth":
             truth = message

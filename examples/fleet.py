@@ -1,8 +1,10 @@
 """Query once: which vehicles are there, where are they, and how old are their last messages?"""
 
+from contextlib import suppress
+
 import nedbus
 
-with nedbus.connect() as bus:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for vehicle, addresses in bus.vehicles().items():
         print(f"vehicle {vehicle}: {len(addresses)} streams")
     for sample in bus.latest():

@@ -1,10 +1,11 @@
 """Print the health of all streams every two seconds: rate, loss, gaps, and the share of valid messages."""
 
 import time
+from contextlib import suppress
 
 import nedbus
 
-with nedbus.connect() as bus, bus.subscribe("*", mode="every") as subscription:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe("*", mode="every") as subscription:
     monitor = nedbus.Monitor()
     shown = time.monotonic()
     for sample in subscription:

@@ -4,6 +4,7 @@ array[0] is the number of the layout; array[1], array[2], ... are PX4's fields i
 """
 
 import json
+from contextlib import suppress
 
 import msgpack
 import zenoh
@@ -11,7 +12,8 @@ import zenoh
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
-with zenoh.open(config) as session, session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(100)) as samples:
+with suppress(KeyboardInterrupt), zenoh.open(config) as session:
+    samples = session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(100))
     while True:
         sample = samples.recv()
         array = msgpack.unpackb(sample.payload.to_bytes())

@@ -1,6 +1,8 @@
+from contextlib import suppress
+
 import nedbus
 
-with nedbus.connect() as bus:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     for sample in bus.subscribe():  # vehicle_local_position of all vehicles; or name a topic, a vehicle
         message = sample.message
         if message.xy_valid and message.z_valid:

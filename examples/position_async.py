@@ -1,6 +1,7 @@
 """The same with asyncio: print where every vehicle is, and once a second how many samples were lost."""
 
 import asyncio
+from contextlib import suppress
 
 import nedbus
 
@@ -24,4 +25,5 @@ async def main() -> None:
             group.create_task(report(subscription))
 
 
-asyncio.run(main())
+with suppress(KeyboardInterrupt):
+    asyncio.run(main())

@@ -2,10 +2,11 @@
 
 import math
 import time
+from contextlib import suppress
 
 import nedbus
 
-with nedbus.connect() as bus:
+with suppress(KeyboardInterrupt), nedbus.connect() as bus:
     publisher = bus.publisher("external_ins_local_position", vehicle="mine")
     while True:
         now = time.monotonic()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -47,12 +48,15 @@ def test_all_examples_are_tested() -> None:
 
 @pytest.mark.parametrize("name", PRINTS)
 def test_example_runs(start: Start, simulated: str, tmp_path: Path, name: str) -> None:
-    """Each example prints its result, and no error."""
+    """Each example prints its result, and ends without a word at Ctrl-C."""
     process = run_example(start, name, simulated, tmp_path)
     wait_for(
         lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
     )
     assert PRINTS[name] in process.out, process.err
+    if name != "fleet.py":  # which ends by itself
+        process.signal(signal.SIGINT)
+    assert process.wait() == 0
     assert process.err == ""
 
 

@@ -27,7 +27,7 @@ def test_first_script_is_the_example() -> None:
     """What is shown is what the tests run."""
     example = (ROOT / "examples" / "position.py").read_text()
     assert example in blocks("python")
-    assert len(example.splitlines()) == 8
+    assert len(example.splitlines()) == 10
 
 
 @pytest.mark.parametrize(("command", "arguments"), COMMANDS)
@@ -47,7 +47,7 @@ def test_shown_targets_exist() -> None:
     """Every make target of the README is in the Makefile."""
     makefile = (ROOT / "Makefile").read_text()
     targets = set(re.findall(r"^make (\w+)", BASH, re.MULTILINE))
-    assert targets == {"run", "test"}
+    assert targets == {"run", "test", "wheel"}
     assert all(f"\n{target}:" in makefile for target in targets)
 
 

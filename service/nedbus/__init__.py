@@ -76,7 +76,7 @@ if TYPE_CHECKING:
         SourceError,
         UnknownLayoutError,
     )
-    from .recording import addresses_of, read
+    from .recording import addresses_of, missing_of, read
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
@@ -135,6 +135,7 @@ __all__ = [
     "enu_to_ned",
     "flu_to_frd",
     "frd_to_flu",
+    "missing_of",
     "ned_to_enu",
     "read",
     "to_array",
@@ -156,6 +157,7 @@ _WITH_NUMPY = {
     "to_message": "nedbus_msgs.arrays",
     "Batch": "nedbus.client",
     "addresses_of": "nedbus.recording",
+    "missing_of": "nedbus.recording",
     "read": "nedbus.recording",
 }
 

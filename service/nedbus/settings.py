@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import logging
 import os
 import re
 import tomllib
@@ -12,10 +14,10 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError
 from pydantic_settings import (
     BaseSettings,
+    InitSettingsSource,
     NoDecode,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
-    TomlConfigSettingsSource,
 )
 
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
@@ -23,7 +25,17 @@ from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
 from .errors import ConfigError
 from .transport import Tls, check_endpoints, dial_endpoint, router_endpoints
 
+_log = logging.getLogger(__name__)
+
 DEFAULT_FILE = Path("nedbus.toml")
+
+
+def _split_sources(value: object) -> object:
+    """Split at semicolons and line breaks; without any, at commas before KIND: that are no part of an option."""
+    if not isinstance(value, str):
+        return value
+    parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
+    return tuple(part.strip() for part in parts if part.strip())
 
 
 def _split(value: object) -> object:
@@ -55,6 +67,7 @@ Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split), AfterV
 class Settings(BaseSettings):
     """All settings; every field is also NEDBUS_<FIELD> in the environment, with commas between several values.
 
+    Sources whose options contain commas are separated by semicolons.
     `load_settings` makes one; it raises ConfigError with the flag, the variable, or file, line and column.
     """
 
@@ -70,22 +83,12 @@ class Settings(BaseSettings):
     vehicle: Annotated[str, BeforeValidator(_text), AfterValidator(_vehicle)] = Field(
         "1", description="Vehicle of sources that name none"
     )
-    source: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split)] = Field((), description="What is published")
+    source: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_sources)] = Field(
+        (), description="What is published"
+    )
     until_done: bool = Field(False, description="End when every finite source has ended")
 
     _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
-
-    @classmethod
-    def settings_customise_sources(
-        cls,
-        settings_cls: type[BaseSettings],
-        init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
-    ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Put the file below the environment, and the environment below flags and arguments."""
-        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
     @property
     def routers(self) -> tuple[str, ...]:
@@ -126,13 +129,10 @@ def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     path = _settings_file(file)
     flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     try:
-        settings = _with_file(path)(**flags)
-    except UnicodeDecodeError as exc:
-        raise ConfigError.in_file(path or DEFAULT_FILE, "this is not text in UTF-8") from exc
-    except tomllib.TOMLDecodeError as exc:
-        raise _toml_error(path or DEFAULT_FILE, exc) from exc
+        settings = _with_file(_read_toml(path) if path else {})(**flags)
     except ValidationError as exc:
         raise _setting_error(path, flags, exc) from exc
+    _warn_of_misspelt_variables()
     settings._set_by.update({name: _set_by(name, path, flags) for name in settings.model_fields_set})
     return settings
 
@@ -153,22 +153,53 @@ def _set_by(name: str, path: Path | None, flags: Mapping[str, object]) -> str:
     return variable if os.environ.get(variable) else str(path)
 
 
-def _with_file(path: Path | None) -> type[Settings]:
-    """Return Settings that read this file: the path is part of Pydantic's class configuration."""
+def _warn_of_misspelt_variables() -> None:
+    """Warn of environment variables that look like a setting, and are none."""
+    known = {f"NEDBUS_{name.upper()}" for name in (*Settings.model_fields, "config")}
+    for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
+        if near := difflib.get_close_matches(variable, known, 1, 0.85):
+            _log.warning("%s is not a setting: did you mean %s?", variable, near[0])
+
+
+def _with_file(content: Mapping[str, object]) -> type[Settings]:
+    """Return Settings with this content of a file below the environment, which is below flags and arguments."""
 
     class FileSettings(Settings):
-        model_config = SettingsConfigDict(toml_file=path)
+        @classmethod
+        def settings_customise_sources(
+            cls,
+            settings_cls: type[BaseSettings],
+            init_settings: PydanticBaseSettingsSource,
+            env_settings: PydanticBaseSettingsSource,
+            dotenv_settings: PydanticBaseSettingsSource,
+            file_secret_settings: PydanticBaseSettingsSource,
+        ) -> tuple[PydanticBaseSettingsSource, ...]:
+            return init_settings, env_settings, InitSettingsSource(settings_cls, dict(content))
 
     return FileSettings
 
 
-def _toml_error(path: Path, error: tomllib.TOMLDecodeError) -> ConfigError:
-    position = re.search(r"\(at line (\d+), column (\d+)\)", str(error))
-    reason = re.sub(r" \(at .*\)", "", str(error))
-    if position is None:  # "at end of document"
-        lines = path.read_text().splitlines() or [""]
-        return ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1)
-    return ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2]))
+def _read_text(path: Path) -> str:
+    """Return the text of a file, without the mark that editors on Windows put first; raise ConfigError."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as exc:
+        raise ConfigError.in_file(path, "this is not text in UTF-8") from exc
+    except OSError as exc:
+        raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+
+
+def _read_toml(path: Path) -> dict[str, object]:
+    text = _read_text(path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
+        reason = re.sub(r" \(at .*\)", "", str(exc))
+        if position is None:  # "at end of document"
+            lines = text.splitlines() or [""]
+            raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
+        raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
 
 
 def _setting_error(path: Path | None, flags: Mapping[str, object], error: ValidationError) -> ConfigError:
@@ -182,7 +213,7 @@ def _setting_error(path: Path | None, flags: Mapping[str, object], error: Valida
     setter = _set_by(name, path, flags)
     if path is None or setter != str(path):
         return ConfigError(setter, reason)
-    line, column = _find_key(path.read_text(), name)
+    line, column = _find_key(_read_text(path), name)
     return ConfigError.in_file(path, reason, line=line, column=column)
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import json
+import math
 import os
 import signal
 import struct
@@ -210,3 +212,60 @@ def test_help_explains_every(run_nedbus: Start) -> None:
     shown = run_nedbus("echo", "--help", COLUMNS="300")
     assert shown.wait() == 0
     assert "a replay at speed=max then waits" in shown.out
+
+
+def test_echo_csv_of_two_vehicles(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """--csv --field x,y,z writes names, then a row for each message of all vehicles; NaN and pairs included."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:", "-s", "sim:?vehicle=2")
+    wait_for(lambda: len(bus.latest()) == 2, what="two vehicles")
+    echo = run_nedbus("echo", "-c", endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "50")
+    assert echo.wait() == 0, echo.err
+    rows = list(csv.DictReader(echo.out.splitlines()))
+    names = ["vehicle", "topic", "instance", "sent", "timestamp", "x", "y", "delta_xy[0]", "delta_xy[1]", "xy_valid"]
+    assert list(rows[0]) == names
+    assert len(rows) == 50
+    assert {row["vehicle"] for row in rows} == {"1", "2"}
+    assert all(int(row["sent"]) > int(row["timestamp"]) * 1000 and row["xy_valid"] == "True" for row in rows)
+    assert all(math.isfinite(float(row["x"])) for row in rows)
+    complete = run_nedbus("echo", "-c", endpoint, "--csv", "--once")
+    assert complete.wait() == 0, complete.err
+    head, row = csv.reader(complete.out.splitlines())
+    assert len(head) == len(row) == 4 + len(VehicleLocalPosition.model_fields) + 2
+
+
+def test_echo_shows_chosen_fields(run_nedbus: Start, flying: str) -> None:
+    """--field chooses in every form; --once ends after one message."""
+    for form, text in (([], "  x "), (["--full"], "\n  x: "), (["--json"], '"message": {"x":')):
+        echo = run_nedbus("echo", "-c", flying, "--once", "--field", "x,z", *form)
+        assert echo.wait() == 0, echo.err
+        assert text in echo.out
+        assert "vx" not in echo.out
+        assert echo.out.count("vehicle_local_position") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (["--field", "xy_vallid"], "--field: there is no field 'xy_vallid': did you mean xy_valid"),
+        (["--field", "qqq"], "--field: there is no field 'qqq': 'nedbus schema' lists them"),
+        (["--csv", "--json"], "--csv: cannot be combined with --json"),
+        (["--once", "-n", "3"], "--count: cannot be combined with --once"),
+    ],
+)
+def test_echo_options_that_contradict(run_nedbus: Start, endpoint: str, options: list[str], text: str) -> None:
+    """Exit 2, and what to write instead."""
+    echo = run_nedbus("echo", "-c", endpoint, *options)
+    assert echo.wait() == 2
+    assert text in echo.err
+
+
+def test_hz_csv(run_nedbus: Start, flying: str) -> None:
+    """A line of names, then one for each stream and second, with its state."""
+    hz = run_nedbus("hz", "-c", flying, "--csv", "-d", "3", "-t", VLP)
+    assert hz.wait() == 0, hz.err
+    rows = list(csv.DictReader(hz.out.splitlines()))
+    assert len(rows) >= 2
+    assert {(row["vehicle"], row["topic"]) for row in rows} == {("1", VLP)}
+    assert {row["state"] for row in rows} <= {"ok", "slow"}  # slow on a machine that is busy
+    assert float(rows[-1]["rate"]) > 1
+    assert float(rows[0]["time"]) < float(rows[-1]["time"])

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
-from nedbus import Health, StreamHealth
-from nedbus_msgs import DOUBT_FLAGS, VehicleLocalPosition
+from nedbus import Health, Monitor, Sample, StreamHealth
+from nedbus.cli.state import describe_stream, stream_state
+from nedbus_msgs import DOUBT_FLAGS, Address, VehicleLocalPosition
 
 SECOND = 1_000_000_000
 
@@ -87,3 +90,91 @@ def test_latency_and_loss() -> None:
         stream.add(message(index), received=index, latency=latency, lost=index)
     health = stream.snapshot(0)
     assert (health.latency, health.latency_max, health.lost) == (0.2, 0.9, 3)
+
+
+def test_usual_rate_shows_a_stream_that_became_slow() -> None:
+    """After a minute at 100 Hz, 5 Hz is far below the usual rate; a burst of what was recovered changes it little."""
+    times = [index * 0.01 for index in range(6000)]
+    times += [60.0 + index * 0.0001 for index in range(6000)]
+    times += [62.0 + index * 0.01 for index in range(200)]
+    times += [64.0 + index * 0.2 for index in range(50)]
+    health = follow(*times).snapshot(round((times[-1] + 0.1) * SECOND))
+    assert health.rate == pytest.approx(5.0, rel=0.05)
+    assert health.usual_rate is not None
+    assert 50 < health.usual_rate < 120
+
+
+def test_slow_stream_is_stale_later() -> None:
+    """3 s without a message are stale, but not of a stream that comes every 5 s."""
+    assert follow(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
+    assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
+
+
+def sample(vehicle: str, seconds: float = 0.0) -> Sample:
+    return Sample(message(seconds), Address(vehicle, "vehicle_local_position"), received=time.time_ns())
+
+
+def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rate and age are of the monotonic clock: an hour back on the wall clock changes nothing."""
+    monitor, now, address = Monitor(), 100 * SECOND, Address("1", "vehicle_local_position")
+    monkeypatch.setattr("time.monotonic_ns", lambda: now)
+    monkeypatch.setattr("time.time_ns", lambda: 0)
+    monitor.add(sample("1"))
+    for index in range(300):
+        now += SECOND // 100
+        if index == 150:
+            monkeypatch.setattr("time.time_ns", lambda: -3600 * SECOND)
+        monitor.add(sample("1", index / 100))
+    assert monitor.snapshot()[address].rate == pytest.approx(100.0)
+    now += 7 * SECOND
+    health = monitor.snapshot()[address]
+    assert health.rate is None
+    assert health.age == pytest.approx(7.0)
+
+
+def test_monitor_is_bounded() -> None:
+    """A flood of 20,000 keys leaves 4096 streams, and never takes the place of one that still sends."""
+    monitor = Monitor()
+    monitor.add(sample("real"))
+    for index in range(20_000):
+        assert not monitor.add(sample(f"flood-{index}"))
+        assert monitor.add(sample("real"))
+    assert len(monitor._streams) == 4096
+    assert list(monitor.snapshot()) == [Address("real", "vehicle_local_position")]
+    monitor.forget(Address("real", "vehicle_local_position"))
+    assert not monitor.snapshot()
+
+
+def late(seconds: float) -> Health:
+    """Return the health of a stream at 100 Hz that comes so late."""
+    stream = StreamHealth("vehicle_local_position")
+    for index in range(300):
+        stream.add(message(index / 100), received=index * SECOND // 100, latency=seconds)
+    return stream.snapshot(3 * SECOND)
+
+
+def test_states_have_reasons() -> None:
+    """The worst state wins, and each but "ok" has its reason; the clock is the test's."""
+    fresh = late(0.01)
+    assert str(stream_state(fresh)) == "ok"
+    assert str(stream_state(fresh, alive=True)) == "ok"
+    assert str(stream_state(fresh, alive=False)) == "ok"  # other languages publish without tokens
+    assert str(stream_state(late(4.4))) == "slow: 4.4 s late, or clocks differ"
+    stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
+    assert str(stream_state(stream.snapshot(33 * SECOND))).startswith("slow: 5.0 Hz, usually ")
+    silent = stream.snapshot(40 * SECOND)
+    assert str(stream_state(silent, alive=True)) == "stale: nothing for 7.2 s"
+    assert str(stream_state(silent)) == "stale: nothing for 7.2 s"
+    assert str(stream_state(silent, alive=False)) == "gone: last message 7.2 s ago"
+    assert str(stream_state(silent, alive=False, connected=False)) == "disconnected: no link"
+    assert stream_state(fresh).severity > stream_state(late(4.4)).severity > stream_state(silent).severity
+
+
+def test_description_has_state_flags_and_events() -> None:
+    """What is shown in a table: state, flags, then gaps, disorder and reboots; "ok" when there is nothing to say."""
+    valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
+    health = follow(0.0, 0.01, 0.02, **valid).snapshot(SECOND // 10)
+    assert describe_stream(health, stream_state(health)) == "ok"
+    doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, **{**valid, "xy_valid": False}).snapshot(4 * SECOND)
+    state = stream_state(doubtful)
+    assert describe_stream(doubtful, state) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"

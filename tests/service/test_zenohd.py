@@ -121,6 +121,35 @@ def test_storage_keeps_what_a_vehicle_sent_last(start: Start, zenohd: str) -> No
         assert reader.vehicles() == {}
 
 
+def test_vehicle_that_restarted_wins_over_the_storage(start: Start, run_nedbus: Start, zenohd: str) -> None:
+    """A real storage keeps a message of the last run, whose clock was ahead: live answers win, and `get` tells."""
+    storage = start_zenohd(start, "-c", shipped("storage.json5", **{ROUTER: zenohd}))
+    wait_for(lambda: "started plugin storage_manager" in storage.out, what="the storage")
+    with nedbus.connect(zenohd) as reader:
+        ahead = zenoh.Timestamp(reader._session.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
+
+        def is_stored() -> bool:
+            reader._session.put(f"nedbus/1/{VLP}", encode(message(99)), timestamp=ahead)
+            return last_messages(reader) == [99]
+
+        wait_for(is_stored, what="the message in the storage")
+        assert reader.latest()[0].stored
+        stored = run_nedbus("get", "-c", zenohd)
+        assert stored.wait() == 1
+        assert ", only stored" in stored.out
+        assert "no publisher answers: these are what a storage kept" in stored.err
+        listed = run_nedbus("list", "-c", zenohd)
+        assert listed.wait() == 0
+        assert "stored" in listed.out
+        with nedbus.connect(zenohd) as vehicle:
+            vehicle.publisher(VLP, vehicle="1").publish(message(1))
+            wait_for(lambda: last_messages(reader) == [1], what="the live answer")
+            live = run_nedbus("get", "-c", zenohd)
+            assert live.wait() == 0, live.err
+            assert "timestamp: 1\n" in live.out
+            assert "stored" not in live.out
+
+
 def test_storage_waits_for_its_router(start: Start) -> None:
     """It may be started first, and joins again a router that was away."""
     endpoint = free_endpoint()

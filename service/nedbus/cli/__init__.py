@@ -1,17 +1,39 @@
 """The command line, a user of the library."""
 
+import os
+import resource
+import signal
 import sys
+from typing import Final
 
 from nedbus import __version__
 
 __all__ = ["main"]
 
+_FILES: Final = 64  # that a process needs to open at once, and some more
+
 
 def main() -> None:
     """Run `nedbus`."""
-    if sys.argv[1:] == ["--version"]:
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C in the middle of an import would show a traceback
+    _fill_closed_streams()
+    if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # at once: the imports below take longer
         return
+    allowed, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if allowed != resource.RLIM_INFINITY and allowed < _FILES:  # Zenoh would abort the process
+        sys.stderr.write(f"nedbus: only {allowed} open files are allowed: set 'ulimit -n {_FILES}' or more\n")
+        sys.exit(1)
     from .app import app
 
     app()
+
+
+def _fill_closed_streams() -> None:
+    """Open the null device where a standard stream is closed: a socket in its place would get what is written there."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - until the end

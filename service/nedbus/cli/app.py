@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 from collections.abc import Callable, Mapping
 from typing import Annotated
 
@@ -12,12 +10,15 @@ import typer
 from nedbus import __version__
 
 from .bridges import foxglove, ros2
+from .echo import echo
 from .files import convert, plot, record
-from .options import write
+from .health import health
+from .hz import hz
+from .logs import log_to_stderr
+from .options import command, write
 from .pki import pki
-from .query import get, health, info, list_, schema
+from .query import get, info, list_, schema
 from .serve import router, serve
-from .stream import echo, hz
 
 app = typer.Typer(
     name="nedbus",
@@ -47,6 +48,7 @@ for _name, _function in _COMMANDS.items():
 app.add_typer(pki, name="pki")
 
 
+@command
 def _show_version(asked: bool) -> None:
     if asked:
         write(f"nedbus {__version__}")
@@ -59,5 +61,4 @@ def _set_up(
     version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
 ) -> None:
-    logging.basicConfig(stream=sys.stderr, format="%(asctime)s %(levelname)-7s %(message)s", datefmt="%H:%M:%S")
-    logging.getLogger("nedbus").setLevel(logging.DEBUG if debug else logging.INFO)
+    log_to_stderr(debug=debug)

@@ -1,13 +1,16 @@
-"""What all commands share: options, the open bus, exit codes, one line for an error."""
+"""What all commands share: options, the open bus, output, exit codes, one line for an error."""
 
 from __future__ import annotations
 
+import errno
 import functools
 import inspect
 import logging
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
@@ -18,6 +21,8 @@ from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, 
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, TOPICS, Selection
+
+from .format import MAX_TEXT, printable, to_text
 
 P = ParamSpec("P")
 
@@ -47,6 +52,7 @@ InstanceOption = Annotated[
     int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position (default: all)")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
+CsvOption = Annotated[bool, typer.Option("--csv", help="CSV, with a line of names first")]
 WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait for a router that is not there yet")]
 CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many samples")]
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="End after this many seconds")]
@@ -57,6 +63,8 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
 
     @functools.wraps(function)
     def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as `main` left it while everything was imported
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             function(*args, **kwargs)
         except (ConfigError, AddressError, LayoutError) as exc:
@@ -70,9 +78,16 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
             _discard_stdout()
             raise typer.Exit(0) from None
         except OSError as exc:
-            write_stderr(f"nedbus: cannot write: {(exc.strerror or str(exc)).lower()}")
-            _discard_stdout()
-            raise typer.Exit(1) from None
+            where = f"{exc.filename}: " if exc.filename else ""
+            raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
+        except BaseException as exc:
+            if type(exc).__name__ != "PanicException":  # of Zenoh's; it cannot be imported
+                raise
+            hint = "is the clock set, is there memory, are enough open files allowed ('ulimit -n')?"
+            raise _exit_with(NedbusError(f"Zenoh cannot go on ({exc}): {hint}"), 1) from exc
+        finally:
+            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                signal.signal(signal.SIGINT, signal.SIG_DFL)  # what is left is the end, which needs no traceback
 
     return run
 
@@ -125,15 +140,34 @@ _BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
 
 
 def write_stderr(text: str) -> None:
-    """Write a line for a person to stderr, at once."""
-    sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()
+    """Write a line for a person to stderr, at once; if nobody can read it any more, go on."""
+    with suppress(OSError):
+        sys.stderr.write(f"{printable(text)}\n")
+        sys.stderr.flush()
 
 
 def write(line: str) -> None:
-    """Write a line of output, at once."""
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()
+    """Write a line of output, or several, at once.
+
+    Raises BrokenPipeError when its reader is gone, NedbusError when it cannot be written.
+    """
+    try:
+        if sys.stdout is None:
+            raise OSError(errno.EBADF, "standard output is closed")
+        sys.stdout.write(f"{printable(line)}\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as exc:
+        _discard_stdout()
+        raise NedbusError(f"cannot write: {(exc.strerror or str(exc)).lower()}") from exc
+
+
+def require_one(flags: Mapping[str, bool]) -> None:
+    """Raise ConfigError when more than one of these flags is set."""
+    given = [name for name, is_set in flags.items() if is_set]
+    if len(given) > 1:
+        raise ConfigError(given[1], f"cannot be combined with {given[0]}: remove one of the two")
 
 
 def choose(
@@ -161,10 +195,11 @@ def _exit_with(error: NedbusError, code: int) -> typer.Exit:
     """Return the exit for an error that is reported in one line; raise the error itself with --debug."""
     if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
         raise error
-    write_stderr(f"nedbus: {error}")
+    write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))
     return typer.Exit(code)
 
 
 def _discard_stdout() -> None:
     """Redirect stdout to the null device, so that flushing it at exit does not fail again."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from nedbus.daemon import Daemon, SourceStatus
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import DEFAULT_TOPIC
 
-from .format import to_line
+from .format import to_line, to_text
+from .logs import log_to
+from .options import write_stderr
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -21,10 +26,10 @@ _REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports in a plain
 _REPORTED: Final = 3  # messages in a report
 
 _HINT: Final = """In a second terminal:
-  nedbus list{where}  what is published
-  nedbus echo{where}  messages as they arrive, a line each
-  nedbus hz{where}    rate, jitter, latency, loss
-  nedbus get{where}   all fields of the last message"""
+  {nedbus} list{where}  what is published
+  {nedbus} echo{where}  messages as they arrive, a line each
+  {nedbus} hz{where}    rate, jitter, latency, loss
+  {nedbus} get{where}   all fields of the last message"""
 
 
 class Display:
@@ -46,12 +51,18 @@ class Display:
 
     def __exit__(self, *exc: object) -> None:
         if self._progress is not None:
-            self._progress.stop()
+            with suppress(OSError):
+                self._progress.stop()
 
     def update(self) -> None:
-        """Show the current state."""
-        if not self._daemon.ready.is_set():
-            return
+        """Show the current state; a terminal that is gone ends the display, not the service."""
+        if self._daemon.ready.is_set():
+            try:
+                self._update()
+            except OSError:
+                self._progress = None
+
+    def _update(self) -> None:
         if not self._hinted:
             self._hinted = True
             for status in self._daemon.sources:
@@ -59,7 +70,7 @@ class Display:
             if not self._daemon.until_done and (self._daemon.role == "router" or sys.stderr.isatty()):
                 is_default = DEFAULT_ENDPOINT in self._daemon.endpoints
                 where = "" if is_default else f" -c {self._daemon.endpoints[0]}"
-                self._print(_HINT.format(where=where))
+                self._print(_HINT.format(nedbus=_program(), where=where))
         if self._progress is not None:
             for status in self._daemon.sources:
                 self._show(self._progress, status)
@@ -81,16 +92,14 @@ class Display:
         if self._progress is not None:
             self._progress.console.print(text, highlight=False)
         else:
-            sys.stderr.write(f"{text}\n")
+            write_stderr(text)
 
     def _start_progress(self) -> None:
         from rich.console import Console
-        from rich.logging import RichHandler
         from rich.progress import BarColumn, Progress, TextColumn
 
         console = Console(stderr=True)
-        handler = RichHandler(console=console, show_path=False, log_time_format="%H:%M:%S")
-        logging.basicConfig(handlers=[handler], format="%(message)s", force=True)
+        log_to(console)
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=24),
@@ -104,7 +113,7 @@ class Display:
             self._tasks[status.source] = progress.add_task(status.source, total=None, state="", numbers="")
         numbers = self._numbers(status)
         if status.error:
-            numbers += f", {status.error}"
+            numbers += f", {to_text(status.error)}"
         total = status.total or (1 if status.ended else None)
         done = status.done if status.total else int(status.ended)
         progress.update(self._tasks[status.source], completed=done, total=total, state=status.state, numbers=numbers)
@@ -126,3 +135,9 @@ class Display:
                 status.published - round((status.published - published) / (now - then)),
             )
         return (status.published - published) / (now - then) if now > then else 0.0
+
+
+def _program() -> str:
+    """Return how a second terminal calls nedbus: by its path, if this one did so and no other is found."""
+    path = sys.argv[0]
+    return path if Path(path).name == "nedbus" and shutil.which("nedbus") is None else "nedbus"

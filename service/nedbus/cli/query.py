@@ -1,19 +1,18 @@
-"""Commands that query once: list, get, info, health, schema."""
+"""Commands that query once: list, get, info, schema."""
 
 from __future__ import annotations
 
 import json
-import socket
 import time
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Final
 
 import typer
 
-from nedbus.client import Bus, Health
-from nedbus.errors import NedbusError
-from nedbus_msgs import ANY, Address, json_schema, layout_table, message_doubts
+from nedbus.client import Bus, Health, Sample, StreamHealth
+from nedbus_msgs import ANY, Address, json_schema, layout_table
 
-from .format import to_age, to_fields, to_json, to_state, to_table
+from .format import to_age, to_fields, to_json, to_text
 from .options import (
     InstanceOption,
     JsonOption,
@@ -26,23 +25,39 @@ from .options import (
     write,
     write_stderr,
 )
+from .state import describe_stream, stream_state
+from .status import sources_of, streams_of
+from .table import terminal_width, to_table
+
+_SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
+_SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
+_STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
+_STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
+_MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a service
+_MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
 
 @on_bus
 def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """List the vehicles and topics that are published now, and how old their last message is."""
-    addresses = [address for addresses in bus.vehicles().values() for address in addresses]
+    """List the vehicles and topics that are published now, how old their last message is, and their state."""
+    published = {address for addresses in bus.vehicles().values() for address in addresses}
     newest = {sample.address: sample for sample in bus.latest(ANY)}
     rows = []
-    for address in addresses:
+    for address in sorted(published | newest.keys()):
         sample = newest.get(address)
-        age = None if sample is None or sample.sent is None else (time.time_ns() - sample.sent) / 1e9
+        health = _health_of(sample) if sample else None
+        state = stream_state(health, alive=address in published) if health else None
+        age = health.age if health else None
         if json_output:
-            write(json.dumps({**_chunks(address), "age": age}))
-        state = message_doubts(sample.message) if sample else "no answer"
-        rows.append([str(address), "-" if age is None else to_age(age), state])
+            told = {"state": state.name, "reason": state.reason} if state else {"state": None, "reason": "no answer"}
+            stored = sample is not None and sample.stored
+            write(json.dumps({**_chunks(address), "age": age, **told, "stored": stored}))
+        text = describe_stream(health, state) if health and state else "no answer"
+        if sample is not None and sample.stored:
+            text = f"stored, {text}"
+        rows.append([str(address), "-" if age is None else to_age(age), text])
     if not json_output and rows:
-        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
+        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows, width=terminal_width()))
     if not rows:
         write_stderr(f"no vehicle is published at {' or '.join(bus.routers)}: start a source with 'nedbus serve'")
 
@@ -57,13 +72,19 @@ def get(
     instance: InstanceOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Show the last message of each vehicle and topic, all fields; exit 1 when there is none."""
+    """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
+
+    What only a storage kept is shown as such.
+    """
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
         write(to_json(sample) if json_output else to_fields(sample))
     if not samples:
         write_stderr(f"nothing is published on {selection.key_expr(prefix=bus.prefix)}: 'nedbus list' shows what is")
+    elif all(sample.stored for sample in samples):
+        write_stderr("no publisher answers: these are what a storage kept")
+    if all(sample.stored for sample in samples):
         raise typer.Exit(1)
 
 
@@ -77,31 +98,19 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             write(json.dumps(service))
         return
     write(f"router    {' or '.join(bus.routers)}")
-    write(f"vehicles  {', '.join(vehicles) or 'none'}")
-    for service in services:
-        write(f"\nservice {service.get('service')}, nedbus {service.get('version')}, as {service.get('role')}")
-        rows = [_source_row(source) for source in _sources(service)]
-        if rows:
-            write(to_table(["SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK"], rows))
-        streams = [row for source in _sources(service) for row in _stream_rows(source)]
-        if streams:
-            write("\n" + to_table(["VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE"], streams))
+    write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
+    width = terminal_width()
+    for service in services[:_MAX_ROWS]:
+        name, version, role = (to_text(service.get(key)) for key in ("service", "version", "role"))
+        write(f"\nservice {name}, nedbus {version}, as {role}")
+        rows = [_source_row(source) for source in sources_of(service)]
+        _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
+        streams = [_stream_row(source, *each) for source in sources_of(service) for each in streams_of(source)]
+        _write_rows("\n" + to_table(_STREAM_HEAD, streams[:_MAX_ROWS], width=width, optional=_STREAM_OPTIONAL), streams)
+    if len(services) > _MAX_ROWS:
+        write(f"{len(services) - _MAX_ROWS} services more")
     if not services:
         write_stderr("no nedbus service answers here")
-
-
-@on_bus
-def health(bus: Bus) -> None:
-    """Exit 0 when the services of this host answer and all their sources work, else 1 with the reason."""
-    host = socket.gethostname()
-    own = [service for service in bus.services() if service.get("host") == host]
-    if not own:
-        raise NedbusError(f"no service of {host} answers at {' or '.join(bus.routers)}")
-    sources = [source for service in own for source in _sources(service)]
-    for source in sources:
-        if source.get("state") in {"retrying", "failed"}:
-            raise NedbusError(f"{source.get('source')} is {source.get('state')}: {source.get('error')}")
-    write(f"{len(own)} services, {len(sources)} sources, {sum(map(_published, sources))} messages published")
 
 
 @command
@@ -116,34 +125,37 @@ def _chunks(address: Address) -> dict[str, object]:
     return {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
 
 
-def _sources(service: dict[str, object]) -> list[dict[str, object]]:
-    """Return the sources in the status of a service; the status comes from the network."""
-    sources = service.get("sources")
-    return [source for source in sources if isinstance(source, dict)] if isinstance(sources, list) else []
+def _health_of(sample: Sample) -> Health:
+    """Return the health of a stream of which only the last message is known; its age is of the wall clock."""
+    stream = StreamHealth(sample.topic)
+    stream.add(sample.message, received=0)
+    if sample.sent is None:
+        return stream.snapshot(0)
+    return stream.snapshot(max(0, time.time_ns() - sample.sent))
 
 
-def _published(source: dict[str, object]) -> int:
-    count = source.get("published")
-    return count if isinstance(count, int) else 0
+def _write_rows(table: str, rows: Sequence[object]) -> None:
+    if rows:
+        write(table)
+    if len(rows) > _MAX_ROWS:
+        write(f"{len(rows) - _MAX_ROWS} more")
 
 
 def _source_row(source: dict[str, object]) -> list[str]:
     keys = ("source", "state", "published", "rejected", "lost", "reboots", "retries")
     stale = source.get("stale")
     remark = f"stale: {', '.join(map(str, stale))}" if stale and isinstance(stale, list) else "-"
-    return [*(str(source.get(key, "-")) for key in keys), str(source.get("error") or remark)]
+    return [*(to_text(source.get(key, "-")) for key in keys), to_text(source.get("error") or remark)]
 
 
-def _stream_rows(source: dict[str, object]) -> list[list[str]]:
-    """Return a row for each stream of a source that can be parsed; the status comes from the network."""
-    streams = source.get("streams")
-    rows = []
-    for stream in streams if isinstance(streams, list) else ():
-        try:
-            health = Health(**stream["health"])
-            rate = "-" if health.rate is None else f"{health.rate:.1f}"
-            age = "-" if health.age is None else to_age(health.age)
-            rows.append([stream["address"], rate, f"{health.nominal:g}", age, str(health.messages), to_state(health)])
-        except (TypeError, KeyError, AttributeError, ValueError):
-            continue  # of another version of nedbus
-    return rows
+def _stream_row(source: dict[str, object], address: str, health: Health) -> list[str]:
+    addresses = source.get("addresses")
+    alive = address in addresses if isinstance(addresses, list) else None
+    return [
+        to_text(address),
+        "-" if health.rate is None else f"{health.rate:.1f}",
+        f"{health.nominal:g}",
+        "-" if health.age is None else to_age(health.age),
+        str(health.messages),
+        describe_stream(health, stream_state(health, alive=alive)),
+    ]

@@ -55,13 +55,20 @@ def run_until_signal(
         signals.append(number)
         stop()
 
+    hangups: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
+    signal.signal(signal.SIGHUP, lambda number, _: hangups.append(number))
     thread = threading.Thread(target=body, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:
+        if hangups:
+            hangups.clear()
+            _log.info("SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process")
         on_tick()
         thread.join(0.1)
+    if signals:
+        _log.info("ending: %s", signal.Signals(signals[0]).name)
     deadline = time.monotonic() + _LIMIT
     while thread.is_alive() and time.monotonic() < deadline:
         thread.join(0.05)

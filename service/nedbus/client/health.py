@@ -1,6 +1,7 @@
 """The health of a stream: rate, jitter, age, gaps, order, reboots, and the share of its flags; no I/O.
 
 The same object serves `nedbus hz`, the status of a service, and scripts.
+Rates and ages are of a monotonic clock: the wall clock may be set at any time.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ _WEIGHT: Final = 0.05  # of a new step in the usual one
 _MAX_LATENCIES: Final = 1000  # that are kept of a window
 _WINDOW: Final = 1_000_000_000  # ns
 _STALE: Final = 3.0  # s without a message after which a stream has no rate
+_SLOW_WEIGHT: Final = 0.05  # of a new second in the usual rate: a stream that became slow differs from it for a minute
+_MAX_STREAMS: Final = 4096  # that a monitor follows
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,7 @@ class Health:
     `out_of_order`, `reboots` (that time went back by more than 1 s), and `flags_ever`.
     `nominal`: the rate that PX4 has for this topic [Hz]; logs and links have less.
     `age`: seconds since the last message.
+    `usual_rate`: the rate that this stream has had so far [Hz]; `rate` is far below it when a stream becomes slow.
     """
 
     rate: float | None
@@ -50,6 +54,12 @@ class Health:
     reboots: int
     flags: dict[str, float] | None
     flags_ever: dict[str, float] | None
+    usual_rate: float | None = None
+
+    @property
+    def stale_after(self) -> float:
+        """Seconds without a message after which this stream is stale: 3, or more where it is slow by nature."""
+        return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
 
 
 @dataclass(slots=True, eq=False)
@@ -73,7 +83,10 @@ class _Window:
 
 
 class StreamHealth:
-    """Follow one stream, message by message, in a fixed amount of memory."""
+    """Follow one stream, message by message, in a fixed amount of memory.
+
+    All times are of one clock, which the caller chooses: `time.monotonic_ns` unless it gives another.
+    """
 
     def __init__(self, topic: str) -> None:
         self._nominal = TOPICS[topic].rate
@@ -81,6 +94,7 @@ class StreamHealth:
         self._received: int | None = None
         self._time: int | None = None
         self._usual = 0.0  # us between two messages
+        self._usual_rate: float | None = None
         self._steps = 0
         self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
         self._window = self._last_window = _Window(0)
@@ -89,7 +103,9 @@ class StreamHealth:
         """Add a message that was received at this time [ns]."""
         window = self._window
         if received - window.start >= _WINDOW:
-            self._last_window = window if window.messages else self._last_window
+            if window.messages:
+                self._last_window = window
+                self._add_rate(window)
             window = self._window = _Window(received)
         self._messages += 1
         self._lost += lost
@@ -107,7 +123,7 @@ class StreamHealth:
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at this time [ns]."""
-        now = time.time_ns() if now is None else now
+        now = time.monotonic_ns() if now is None else now
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
         is_live = window.intervals and window.mean > 0 and age is not None and age < max(_STALE, 2 * window.mean)
@@ -125,7 +141,15 @@ class StreamHealth:
             reboots=self._reboots,
             flags=_shares(window.flags, window.messages),
             flags_ever=_shares(self._ever, self._messages),
+            usual_rate=self._usual_rate,
         )
+
+    def _add_rate(self, window: _Window) -> None:
+        """Let the usual rate follow slowly, and a burst, such as what was recovered, count little."""
+        if window.mean > 0:
+            rate = 1 / window.mean
+            usual = rate if self._usual_rate is None else self._usual_rate
+            self._usual_rate = usual + _SLOW_WEIGHT * (min(rate, 2 * usual) - usual)
 
     def _add_time(self, timestamp: int) -> None:
         last = self._time
@@ -146,28 +170,34 @@ class StreamHealth:
 
 
 class Monitor:
-    """Follow all streams of a subscription.
+    """Follow all streams of a subscription, at most 4096: then the one that was silent for longest is forgotten.
 
     The first sample of each address does not count: it may be the last value that a subscription starts with.
     """
 
     def __init__(self) -> None:
-        self._streams: dict[Address, StreamHealth | None] = {}
+        self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
 
     def add(self, sample: Sample[Message]) -> bool:
-        """Add a sample; return whether it counts."""
-        if sample.address not in self._streams:
-            self._streams[sample.address] = None
-            return False
-        stream = self._streams[sample.address]
-        if stream is None:
-            stream = self._streams[sample.address] = StreamHealth(sample.topic)
-        stream.add(sample.message, received=sample.received, latency=sample.latency, lost=sample.lost)
-        return True
+        """Add a sample that was received just now; return whether it counts."""
+        address = sample.address
+        known = address in self._streams
+        stream = self._streams.pop(address, None)
+        if known:
+            stream = stream or StreamHealth(sample.topic)
+            stream.add(sample.message, received=time.monotonic_ns(), latency=sample.latency, lost=sample.lost)
+        elif len(self._streams) >= _MAX_STREAMS:
+            del self._streams[next(iter(self._streams))]
+        self._streams[address] = stream
+        return known
 
     def snapshot(self) -> dict[Address, Health]:
         """Return the health of each stream, sorted by address."""
         return {address: stream.snapshot() for address in sorted(self._streams) if (stream := self._streams[address])}
+
+    def forget(self, address: Address) -> None:
+        """Forget a stream; it is followed anew if it comes back."""
+        self._streams.pop(address, None)
 
 
 def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from collections.abc import Sequence
 from typing import Final
 
@@ -11,16 +12,38 @@ from nedbus.errors import ConfigError
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where `nedbus serve` listens, and what clients join, unless something else is set."""
 
-_ENDPOINT = re.compile(r"(?:tcp|tls|udp|ws|quic)/\S+:\d{1,5}(?:[?#]\S*)?|unixsock-stream/\S+")
+_MAX_PORT: Final = 65_535
+_ENDPOINT = re.compile(r"(?:tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+")
 
 
 def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
     """Raise ConfigError, with `where` as the name of the setting, unless each of these is a Zenoh endpoint."""
     for endpoint in endpoints:
-        if not _ENDPOINT.fullmatch(endpoint):
+        found = _ENDPOINT.fullmatch(endpoint)
+        if found is None:
             raise ConfigError(
                 where, f"{endpoint!r} is not an endpoint: write PROTOCOL/HOST:PORT, as in {DEFAULT_ENDPOINT}"
             )
+        if int(found["port"] or 0) > _MAX_PORT:
+            raise ConfigError(where, f"{endpoint!r} has port {found['port']}: ports are 0 to {_MAX_PORT}")
+
+
+def explain_endpoints(endpoints: Sequence[str]) -> str | None:
+    """Return why none of these can be reached, as far as this host knows: names without an address; else None."""
+    unknown = []
+    for endpoint in endpoints:
+        found = _ENDPOINT.fullmatch(endpoint)
+        if found is None or found["host"] is None:
+            return None
+        host = found["host"].strip("[]")
+        try:
+            socket.getaddrinfo(host, None)
+        except OSError:
+            unknown.append(host)
+        else:
+            return None
+    hosts = " and ".join(unknown)
+    return f"this host finds no address of {hosts}: correct the name, or write the IP address" if unknown else None
 
 
 def dial_endpoint(endpoint: str) -> str:

@@ -16,7 +16,7 @@ import zenoh
 
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 
-from .endpoints import check_endpoints
+from .endpoints import check_endpoints, explain_endpoints
 from .tls import Tls
 
 Session = zenoh.Session
@@ -108,7 +108,8 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # Of most failures Zenoh says no more than that there is no connection.
-    raise ConnectError(endpoints, timeout, "" if "Unable to connect" in reason else reason)
+    known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
+    raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 
 
 def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:

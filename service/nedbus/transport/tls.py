@@ -1,12 +1,26 @@
-"""TLS of a client: the files that it needs for `tls/` endpoints."""
+"""TLS of a client: the files that it needs for `tls/` endpoints, and what is wrong with them."""
 
 from __future__ import annotations
 
 import os
+import re
+import ssl
+import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from nedbus.errors import ConfigError
+
+_LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
+_UNSIGNED: Final = "is not signed by the authority in tls_ca"
+_VERIFY_REASONS: Final = {  # by OpenSSL's codes
+    7: _UNSIGNED,
+    9: "or its authority is not valid yet: is the clock of this host right?",
+    10: "or its authority has expired",
+    **dict.fromkeys((18, 19, 20, 21), _UNSIGNED),
+}
+_STEPS: Final = 10  # of a handshake; four are enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +42,85 @@ class Tls:
             raise ConfigError("tls", "a certificate needs its key, and a key its certificate: give both or none")
 
     def zenoh_settings(self) -> dict[str, object]:
-        """Return Zenoh's `transport/link/tls` section; raise ConfigError for a file that cannot be read."""
-        for path in (self.ca, self.certificate, self.key):
-            if path is not None and not os.access(path, os.R_OK):
-                raise ConfigError("tls", f"{path} cannot be read: does it exist, and may this user read it?")
-        own = {"connect_certificate": str(self.certificate), "connect_private_key": str(self.key), "enable_mtls": True}
-        return {"root_ca_certificate": str(self.ca), **(own if self.certificate else {})}
+        """Return Zenoh's `transport/link/tls` section.
+
+        Raises ConfigError for a file that cannot be read or is none of its kind, and for a key that does not fit.
+        """
+        _check_pem(self.ca, "CERTIFICATE")
+        settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}
+        if self.certificate is not None and self.key is not None:
+            _check_pem(self.certificate, "CERTIFICATE")
+            _check_pem(self.key, "PRIVATE KEY")
+            _load_pair(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
+            own = {"connect_certificate": str(self.certificate), "connect_private_key": str(self.key)}
+            settings |= {**own, "enable_mtls": True}
+        return settings
+
+    def explain(self) -> str | None:
+        """Return why a router may refuse these files: one has expired, or they do not belong together; else None.
+
+        It needs no network, and no package but Python's: the certificate is shown to a server in this process that
+        trusts the authority.
+        """
+        try:
+            authority = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            authority.load_verify_locations(self.ca)
+        except (OSError, ssl.SSLError):
+            return f"{self.ca} is not the certificate of an authority"
+        if self.certificate is not None and self.key is not None:
+            return _refusal(authority, self.certificate, self.key)
+        if not authority.get_ca_certs():
+            return f"{self.ca} is not the certificate of an authority: it may sign nothing"
+        until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
+        return f"{self.ca} has expired" if until < time.time() else None
+
+
+def _check_pem(path: str | Path, kind: str) -> None:
+    """Raise ConfigError unless a file can be read and holds a certificate, or a private key, as PEM."""
+    if not os.access(path, os.R_OK) or not Path(path).is_file():
+        raise ConfigError("tls", f"{path} cannot be read: does it exist, and may this user read it?")
+    labels = _LABEL.findall(Path(path).read_text(errors="replace"))
+    if any(label.endswith(kind) for label in labels):
+        return
+    found = f"a {labels[0].lower()}" if labels else "nothing" if not Path(path).stat().st_size else "no PEM"
+    hint = "are two files swapped?" if labels else "'nedbus pki' makes such files"
+    raise ConfigError("tls", f"{path} holds {found}, where a {kind.lower()} is needed: {hint}")
+
+
+def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
+    try:
+        context.load_cert_chain(certificate, key, password=lambda: "")
+    except ssl.SSLError as exc:
+        if exc.reason == "KEY_VALUES_MISMATCH":
+            reason = f"{key} is not the key of {certificate}: give the two that were made together"
+        else:
+            reason = f"{certificate} or {key} is damaged, or the key has a password: make them anew"
+        raise ConfigError("tls", reason) from exc
+
+
+def _refusal(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
+    """Return why a server that trusts this authority refuses this certificate, None if it accepts it."""
+    authority.verify_mode = ssl.CERT_REQUIRED
+    _load_pair(authority, certificate, key)
+    own = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    own.check_hostname = False
+    own.verify_mode = ssl.CERT_NONE
+    _load_pair(own, certificate, key)
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    server = authority.wrap_bio(to_server, to_client, server_side=True)
+    client = own.wrap_bio(to_client, to_server)
+    for _ in range(_STEPS):
+        done = 0
+        for side in (client, server):
+            try:
+                side.do_handshake()
+                done += 1
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLCertVerificationError as exc:
+                return f"{certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
+            except ssl.SSLError:
+                return None
+        if done == 2:
+            break
+    return None

@@ -1,0 +1,107 @@
+"""The command that prints messages as they arrive: echo."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated
+
+import typer
+
+from nedbus.client import Bus, Sample, Subscription
+from nedbus.errors import ConfigError
+from nedbus_msgs import ANY, FIELD_TYPES, Address
+
+from .follow import Link, follow
+from .format import to_csv, to_csv_head, to_fields, to_json, to_line
+from .options import (
+    CountOption,
+    CsvOption,
+    DurationOption,
+    InstanceOption,
+    JsonOption,
+    PositionTopicOption,
+    TopicArgument,
+    VehicleOption,
+    choose,
+    on_bus,
+    require_one,
+    write,
+    write_stderr,
+)
+
+
+@on_bus
+def echo(
+    bus: Bus,
+    topic: TopicArgument = None,
+    *,
+    topic_option: PositionTopicOption = None,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    field: Annotated[
+        str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z; nedbus schema")
+    ] = None,
+    full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
+    every: Annotated[
+        bool,
+        typer.Option(
+            "--every",
+            help="Print every message, in order; a replay at speed=max then waits for this terminal or pipe",
+        ),
+    ] = False,
+    json_output: JsonOption = False,
+    csv_output: CsvOption = False,
+    interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
+    once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,
+    count: CountOption = None,
+    duration: DurationOption = None,
+) -> None:
+    """Print messages as they arrive, a line each; a terminal that is too slow skips to the newest (see --every)."""
+    require_one({"--full": full, "--json": json_output, "--csv": csv_output})
+    require_one({"--once": once, "--count": count is not None})
+    fields = _parse_fields(field)
+    form = to_json if json_output else to_csv if csv_output else to_fields if full else to_line
+    show: Callable[[Sample], str] = partial(form, fields=fields)
+    due: dict[Address, float] = {}
+
+    def print_one(sample: Sample) -> bool:
+        if interval:
+            now = time.monotonic()
+            if now < due.get(sample.address, 0.0):
+                return False
+            due[sample.address] = now + interval
+        write(show(sample))
+        return True
+
+    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    with bus.subscribe_to(selection, mode="every" if every else "latest") as subscription:
+        try:
+            if csv_output:
+                write(to_csv_head(fields))
+            follow(subscription, print_one, link=Link(bus), count=1 if once else count, duration=duration)
+        finally:
+            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
+                _write_counts(subscription)
+
+
+def _parse_fields(text: str | None) -> list[str]:
+    """Return the names in `x,y,z`; raise ConfigError for one that no field has."""
+    names = [name.strip() for name in text.split(",") if name.strip()] if text else []
+    for name in names:
+        if name not in FIELD_TYPES:
+            near = difflib.get_close_matches(name, FIELD_TYPES, 3, 0.5)
+            hint = f"did you mean {' or '.join(near)}?" if near else "'nedbus schema' lists them"
+            raise ConfigError("--field", f"there is no field {name!r}: {hint}")
+    return names
+
+
+def _write_counts(subscription: Subscription) -> None:
+    counts = subscription.counts
+    if counts.lost or counts.dropped or counts.invalid:
+        write_stderr(
+            f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
+        )

@@ -1,0 +1,66 @@
+"""A table that is redrawn in place on a terminal, and written anew elsewhere; its size is bounded either way."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, Self
+
+from .logs import log_to
+from .options import write
+from .table import terminal_width, to_table
+
+if TYPE_CHECKING:
+    from rich.live import Live
+
+_MAX_ROWS: Final = 50
+_MIN_ROWS: Final = 3
+
+
+class LiveTable:
+    """Show a table again and again; `optional` are the columns that a narrow terminal leaves out, in that order."""
+
+    def __init__(self, head: Sequence[str], optional: Sequence[str]) -> None:
+        self._head = head
+        self._optional = optional
+        self._live: Live | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, rows: Sequence[Sequence[str]]) -> None:
+        """Show these rows, the first 50 at most, and on a terminal no more than it has lines."""
+        width = terminal_width()
+        if width is None:
+            write(self._table(rows, _MAX_ROWS, None))
+            return
+        from rich.text import Text
+
+        if self._live is None:
+            self._live = self._start()
+        height = shutil.get_terminal_size().lines - 1
+        count = min(_MAX_ROWS, len(rows), height)
+        while (text := self._table(rows, count, width)).count("\n") >= height and count > _MIN_ROWS:
+            count -= 1
+        self._live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
+
+    def _table(self, rows: Sequence[Sequence[str]], count: int, width: int | None) -> str:
+        text = to_table(self._head, rows[:count], width=width, optional=self._optional)
+        return text if len(rows) <= count else f"{text}\n{len(rows) - count} more"
+
+    def _start(self) -> Live:
+        from rich.console import Console
+        from rich.live import Live
+
+        console = Console()
+        log_to(console)
+        live = Live(console=console, auto_refresh=False)
+        live.start()
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # the cursor is hidden until the end
+        return live

@@ -1,0 +1,63 @@
+"""The state of a stream: ok, slow, stale, gone or disconnected, each with its reason; no I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from nedbus.client import Health
+from nedbus_msgs import describe_flags
+
+from .format import to_age
+
+StateName = Literal["ok", "slow", "stale", "gone", "disconnected"]
+
+_LATE: Final = 1.0  # s of latency from which on a stream is slow
+_SLOW: Final = 0.5  # of the usual rate, below which a stream is slow
+_ABSENT: Final = 1.0  # s without a message after which a stream without a liveliness token is gone
+_SEVERITY: Final = ("disconnected", "gone", "stale", "slow", "ok")
+
+
+@dataclass(frozen=True, slots=True)
+class StreamState:
+    """The state of a stream now, and the reason unless it is ok."""
+
+    name: StateName
+    reason: str = ""
+
+    @property
+    def severity(self) -> int:
+        """Its place among the states, the worst first."""
+        return _SEVERITY.index(self.name)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.reason}" if self.reason else self.name
+
+
+def stream_state(health: Health, *, alive: bool | None = None, connected: bool = True) -> StreamState:
+    """Return the state of a stream with this health.
+
+    `alive`: whether its publisher's liveliness token is there; None if that is not known.
+    `connected`: whether there is a link to the router.
+    """
+    if not connected:
+        return StreamState("disconnected", "no link")
+    age = health.age
+    if age is not None and age > _ABSENT and alive is False:
+        return StreamState("gone", f"last message {to_age(age)} ago")
+    if age is not None and age > health.stale_after:
+        return StreamState("stale", f"nothing for {to_age(age)}")
+    reasons = []
+    if health.rate is not None and health.usual_rate is not None and health.rate < _SLOW * health.usual_rate:
+        reasons.append(f"{health.rate:.1f} Hz, usually {health.usual_rate:.0f}")
+    if health.latency is not None and health.latency > _LATE:
+        reasons.append(f"{to_age(health.latency)} late, or clocks differ")
+    return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")
+
+
+def describe_stream(health: Health, state: StreamState) -> str:
+    """Return what is wrong with a stream: its state, its flags, and its gaps, order and reboots; "ok" if nothing is."""
+    doubts = describe_flags(health.flags) if health.flags else "ok"
+    counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
+    events = [f"{count} {name}" for count, name in counts if count]
+    return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"

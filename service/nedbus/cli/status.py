@@ -1,0 +1,41 @@
+"""The status that services answer with, parsed: it comes from the network, perhaps from another version of nedbus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from pydantic import TypeAdapter, ValidationError
+
+from nedbus.client import Health
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    address: str
+    health: Health
+
+
+_STREAM: Final[TypeAdapter[_Stream]] = TypeAdapter(_Stream)
+
+
+def sources_of(service: dict[str, object]) -> list[dict[str, object]]:
+    """Return the sources in the status of a service."""
+    return [source for source in _list(service, "sources") if isinstance(source, dict)]
+
+
+def streams_of(source: dict[str, object]) -> list[tuple[str, Health]]:
+    """Return address and health of each stream in the status of a source; what cannot be parsed is left out."""
+    streams = []
+    for each in _list(source, "streams"):
+        try:
+            stream = _STREAM.validate_python(each)
+        except ValidationError:
+            continue
+        streams.append((stream.address, stream.health))
+    return streams
+
+
+def _list(status: dict[str, object], name: str) -> list[object]:
+    value = status.get(name)
+    return value if isinstance(value, list) else []

@@ -1,0 +1,373 @@
+"""What a person meets at a terminal: tables of any width, hostile text, closed streams, signals at any moment."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+
+import pytest
+
+import nedbus
+from nedbus.cli.format import printable, to_text
+from nedbus.cli.table import to_table
+from nedbus.transport import Session, open_router
+from nedbus_msgs import DEFAULT_TOPIC
+from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+
+VLP = DEFAULT_TOPIC
+EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
+
+
+def has_control(text: str) -> bool:
+    """Return whether anything in a text would act on a terminal."""
+    return any(not (char.isprintable() or char == "\n") for char in text)
+
+
+# Text
+
+
+def test_text_of_a_peer_is_one_short_printable_line() -> None:
+    """Escape sequences, directions of writing and line breaks are spelt out, and what is long is cut."""
+    assert to_text(EVIL) == r"\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
+    assert len(to_text("x" * 100_000)) == 120
+    assert len(to_text("\x1b" * 100_000)) < 500
+    assert printable("déjà vu\n世界") == "déjà vu\n世界"
+    assert printable("name-\udcff") == r"name-\udcff"
+
+
+# Tables
+
+HEAD = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
+ROWS = [
+    ("1/vehicle_local_position_groundtruth", "100.0", "12.3 ms", "999 ms", "119.9 s", "12345", "ok"),
+    ("1/vehicle_local_position", "-", "-", "-", "-", "0", "stale: nothing for 4.2 s, xy z invalid, dead reckoning"),
+]
+
+
+@pytest.mark.parametrize("width", [30, 40, 80, 110])
+def test_table_fits(width: int) -> None:
+    """No line is longer than the terminal, the name and the state are complete, and wide ones show more columns."""
+    optional = ("JITTER", "MAX", "LATENCY", "LOST")
+    lines = to_table(HEAD, ROWS, width=width, optional=optional).splitlines()
+    assert all(len(line) <= width for line in lines)
+    shown = "".join("".join(lines).split())
+    assert shown.count("vehicle") == 2
+    assert {word in shown for word in ("stale:", "nothing", "invalid", "reckoning")} == {True}
+    assert ("JITTER" in lines[0]) == (width >= 80)
+
+
+def test_table_without_a_terminal_is_complete() -> None:
+    """A row is a line."""
+    assert len(to_table(HEAD, ROWS).splitlines()) == 3
+
+
+# On a terminal
+
+
+class Terminal:
+    """A command on a terminal of its own, and what it shows."""
+
+    def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
+        self._main, terminal = pty.openpty()
+        self._output = bytearray()
+        self._stopping = threading.Event()
+        environment = {**os.environ, "COLUMNS": str(columns), "LINES": str(lines), "TERM": "xterm"}
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", "nedbus", *arguments],
+            stdout=terminal,
+            stderr=terminal,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+        )
+        os.close(terminal)
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    @property
+    def shown(self) -> str:
+        return self._output.decode(errors="replace")
+
+    def has_shown(self, text: str) -> bool:
+        return text in self.shown
+
+    def close(self) -> None:
+        self.popen.kill()
+        self.popen.wait(DEADLINE)
+        self._reader.join(DEADLINE)
+
+    def hang_up(self) -> None:
+        """Close the terminal, as `sshd` does when a connection breaks."""
+        self._stopping.set()
+        self._reader.join(DEADLINE)
+        self.popen.send_signal(signal.SIGHUP)
+
+    def _read(self) -> None:
+        with suppress(OSError):  # the other side is closed
+            while not self._stopping.is_set():
+                if select.select([self._main], [], [], 0.1)[0]:
+                    self._output.extend(os.read(self._main, 4096))
+        os.close(self._main)
+
+
+@contextmanager
+def on_terminal(*arguments: str, columns: int = 80, lines: int = 24) -> Iterator[Terminal]:
+    terminal = Terminal(*arguments, columns=columns, lines=lines)
+    try:
+        yield terminal
+    finally:
+        terminal.close()
+
+
+@pytest.mark.process
+def test_hz_redraws_in_place(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """On a terminal the table is drawn over the last one, as high as the terminal at most, and stays at the end."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:", *(f"-ssim:?vehicle={number}" for number in range(2, 5)))
+    wait_for(lambda: len(bus.latest("*")) == 20, what="four vehicles")
+    with on_terminal("hz", "-c", endpoint, "-d", "4", lines=10) as terminal:
+        assert terminal.popen.wait(DEADLINE) == 0
+    assert "\x1b[1A\x1b[2K" in terminal.shown
+    assert " more" in terminal.shown
+    drawings = terminal.shown.split("VEHICLE/TOPIC")[1:]
+    assert len(drawings) >= 3
+    assert all(drawing.count("\n") <= 10 for drawing in drawings)
+
+
+@pytest.mark.process
+def test_hz_leaves_the_cursor_as_it_was(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """Ctrl-C and SIGTERM, as of `timeout`, end the redrawing and show the cursor again."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:")
+    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        with on_terminal("hz", "-c", endpoint) as terminal:
+            wait_for(partial(terminal.has_shown, "\x1b[?25l"), what="the table")
+            terminal.popen.send_signal(number)
+            assert terminal.popen.wait(DEADLINE) == code
+        assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
+        assert "Traceback" not in terminal.shown
+
+
+# Links and states
+
+
+@pytest.fixture
+def restarted_router() -> Iterator[tuple[str, Callable[[], None], Callable[[], None]]]:
+    """Run a router that a test can end and start again."""
+    where = free_endpoint()
+    sessions = [open_router(listen=(where,))]
+
+    def begin() -> None:
+        sessions.append(open_router(listen=(where,)))
+
+    yield where, lambda: sessions.pop().close(), begin
+    for session in sessions:
+        session.close()
+
+
+@pytest.mark.parametrize("command", ["echo", "hz"])
+def test_link_that_breaks_is_reported(
+    run_nedbus: Start, restarted_router: tuple[str, Callable[[], None], Callable[[], None]], command: str
+) -> None:
+    """`echo` and `hz` say when the link to the router breaks, and when it is back; `hz` says so of each stream."""
+    where, end, begin = restarted_router
+    run_nedbus("serve", "-c", where, "-s", "sim:")
+    follower = run_nedbus(command, "-c", where, "--json")
+    wait_for(lambda: follower.out, what="data")
+    end()
+    wait_for(lambda: f"the link to {where} is broken: waiting for it" in follower.err, what="the break")
+    if command == "hz":
+        wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
+    begin()
+    wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
+    lines = follower.out.count("\n")
+    wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
+
+
+def states(lines: str) -> list[str]:
+    return [json.loads(line)["state"] for line in lines.splitlines() if line.endswith("}")]
+
+
+def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A stream whose service was killed is not "ok", in `hz` as in `list`, and `hz` tells it once, first of all."""
+    service = run_nedbus("serve", "-c", endpoint, "-s", "sim:")
+    wait_for(bus.latest, what="data")
+    with bus.publisher(VLP, vehicle="other") as other:
+        hz = run_nedbus("hz", "-c", endpoint, "--json", "-t", VLP)
+        wait_for(lambda: "ok" in states(hz.out), what="a healthy stream")
+        service.kill()
+        wait_for(lambda: "gone" in states(hz.out), what="its end")
+        other.publish(message(1))
+
+        def is_seen() -> bool:
+            other.publish(message(2))
+            return '"vehicle": "other"' in hz.out
+
+        wait_for(is_seen, what="another second")
+    assert states(hz.out).count("gone") == 1
+
+
+def test_finished_replay_is_stale(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=4&wait=1")
+    hz = run_nedbus("hz", "-c", endpoint, "--json", "-t", VLP)
+    wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
+    listed = run_nedbus("list", "-c", endpoint)
+    assert listed.wait() == 0
+    assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
+    info = run_nedbus("info", "-c", endpoint)
+    assert info.wait() == 0
+    assert info.out.count("stale: nothing for ") == 5
+
+
+# What peers send
+
+
+def answer(raw: Session, key: str, status: object) -> object:
+    """Answer queries for a status as a hostile service would."""
+    return raw.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
+
+
+def test_hostile_status_is_shown_harmless(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+    """Escape sequences, forged lines and endless texts of a service are shown as short text, or left out."""
+    flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
+    stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
+    source = {**flood[0], "stale": [EVIL], "streams": [stream, None, {"address": 1}], "addresses": EVIL}
+    status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
+    hostile = answer(raw, "nedbus/@service/hostile/status", status)
+    for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
+        shown = run_nedbus(*arguments, "-c", endpoint)
+        assert shown.wait() == (arguments[0] == "health"), shown.err
+        assert not has_control(shown.out + shown.err)
+        assert "\nforged line" not in shown.out + shown.err
+        assert len(shown.out + shown.err) < 5000
+    del hostile
+
+
+def test_hostile_keys_are_shown_harmless(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+    """Keys and tokens with escape sequences reach neither the output nor the log."""
+    tokens = [raw.liveliness().declare_token(f"nedbus/{name}/@alive/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)]
+    listed = run_nedbus("list", "-c", endpoint)
+    assert listed.wait() == 0, listed.err
+    echo = run_nedbus("echo", "-c", endpoint, "*", "-d", "2")
+    hz = run_nedbus("hz", "-c", endpoint, "-d", "2")
+    while echo.popen.poll() is None or hz.popen.poll() is None:
+        raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
+        raw.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
+    for process in (listed, echo, hz):
+        assert not has_control(process.out + process.err)
+        assert len(process.out + process.err) < 5000
+    assert len(tokens) == 3
+
+
+def test_flood_of_keys_leaves_hz_small(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """Of 1000 vehicles there are 50 rows a second and a number, not 1000."""
+    hz = run_nedbus("hz", "-c", endpoint)
+    publishers = [bus.publisher(VLP, vehicle=f"flood-{number}") for number in range(1000)]
+
+    def is_shown() -> bool:
+        for each in publishers:
+            each.publish(message(1))
+        return " more\n" in hz.out
+
+    wait_for(is_shown, what="more than 50 rows")
+    hz.signal(signal.SIGINT)
+    assert hz.wait() == 130
+    assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
+
+
+# Streams and signals
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", ["list", "schema", "get", "--version", "pki ca ."])
+def test_closed_stdout_is_one_line(endpoint: str, bus: nedbus.Bus, command: str) -> None:
+    """`nedbus list >&-` says that nothing can be written, and exits with 1."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(bus.latest, what="the message")
+    connect = f"-c {endpoint}" if command in {"list", "get"} else ""
+    line = f"{sys.executable} -m nedbus {command} {connect} >&-"
+    ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
+    assert (ended.returncode, ended.stderr) == (1, "nedbus: cannot write: standard output is closed\n")
+
+
+@pytest.mark.process
+def test_closed_stderr_changes_nothing(endpoint: str, bus: nedbus.Bus) -> None:
+    """Without stderr there is nowhere to complain, and output and exit codes are as ever."""
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    wait_for(bus.latest, what="the message")
+    for command, code, lines in (("list", 0, 2), ("get -v 9", 1, 0)):
+        line = f"{sys.executable} -m nedbus {command} -c {endpoint} 2>&-"
+        ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
+        assert (ended.returncode, len(ended.stdout.splitlines())) == (code, lines)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", [["list"], ["serve", "-s", "sim:"], ["schema"]])
+def test_too_few_files_are_no_traceback(command: list[str]) -> None:
+    """`ulimit -n 12` ends in a sentence: Zenoh would abort the process with a page of Rust."""
+    ended = subprocess.run(
+        ["bash", "-c", f"ulimit -n 12; {sys.executable} -m nedbus {' '.join(command)}"],
+        capture_output=True,
+        timeout=DEADLINE,
+        check=False,
+        text=True,
+    )
+    expected = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
+    assert (ended.returncode, ended.stderr) == (1, expected)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("command", [["echo"], ["hz"], ["list"], ["serve", "-s", "sim:"], ["router"]])
+def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: list[str]) -> None:
+    """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
+    where = ["-l", free_endpoint()] if command[0] in {"serve", "router"} else ["-c", endpoint]
+    for imports in (1, 50, 150, 300, 10_000):
+        arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command, *where]
+        with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            started, seen = False, 0
+            for line in process.stderr:  # the moment is one of the program, not of a clock
+                seen += started
+                started = started or line.rstrip().endswith(" nedbus.cli")
+                if seen == imports or line.rstrip().endswith(" nedbus.cli.app"):
+                    break
+            process.send_signal(signal.SIGINT)
+            rest = process.stderr.read()
+            assert process.wait(DEADLINE) in {-signal.SIGINT, 130, 0}
+        assert "Traceback" not in rest
+
+
+@pytest.mark.parametrize("command", [["serve", "-s", "sim:"], ["router"]])
+def test_hangup_ends_no_service(run_nedbus: Start, command: list[str]) -> None:
+    """SIGHUP, which a closed terminal sends, is logged and ignored; what ends a service is logged, with the date."""
+    where = free_endpoint()
+    service = run_nedbus(*command, "-l", where)
+    wait_for(lambda: f"router on {where}" in service.err, what="the service")
+    service.signal(signal.SIGHUP)
+    wait_for(lambda: "SIGHUP is ignored" in service.err, what="the hang-up")
+    service.signal(signal.SIGTERM)
+    assert service.wait() == 0
+    last = service.err.splitlines()[-1]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    ending: SIGTERM", last)
+
+
+@pytest.mark.process
+def test_closed_terminal_ends_no_service(bus: nedbus.Bus, endpoint: str) -> None:
+    """A service whose terminal is gone publishes on."""
+    with on_terminal("serve", "-c", endpoint, "-s", "sim:") as terminal:
+        wait_for(bus.latest, what="data")
+        terminal.hang_up()
+        with bus.subscribe(mode="every") as subscription:
+            for _ in range(100):
+                subscription.receive(DEADLINE)
+        assert terminal.popen.poll() is None
+        terminal.popen.send_signal(signal.SIGTERM)
+        assert terminal.popen.wait(DEADLINE) == 0
