@@ -19,7 +19,8 @@ from tests.conftest import Start
 ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
-    "errors", "extras", "whole_file", "transport", "settings", "client", "recording", "sources", "daemon", "bridges", "cli",
+    "errors", "extras", "whole_file", "transport", "settings", "client", "recording", "sources", "daemon", "bridges",
+    "cli",
 ]  # fmt: skip
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {

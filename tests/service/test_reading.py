@@ -22,7 +22,9 @@ from nedbus_msgs import FIELD_TYPES, Address, Provenance, VehicleLocalPosition, 
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.conftest import LOGS, Start, message
 from tests.replays import convert_replay, open_replay
+from tests.ulogs import UlogWriter
 
+DOCS = Path(__file__).parents[2] / "docs"
 VLP = "vehicle_local_position"
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams of a plot, in order
 
@@ -125,7 +127,8 @@ def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):
         nedbus.read(flight, frame="pandas")
-    monkeypatch.delitem(sys.modules, "nedbus.recording.reader")
+    for name in ("reader", "chunks"):
+        monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
     with pytest.raises(ConfigError, match=r"mcap: not installed: pip install 'nedbus\[mcap\]'"):
         nedbus.read(flight)
@@ -142,8 +145,9 @@ def test_flight_is_plotted(run_nedbus: Start, flight: Path, arguments: list[str]
     assert plot.out.strip() == str(picture)
     pixels = imread(picture)[..., :3]
     height, width, _ = pixels.shape
-    assert (width, height) == (1440, 960)
-    track, flags = pixels[: height // 2, : width * 2 // 5], pixels[height * 3 // 4 :]
+    assert width == 1440
+    assert height == 960 if streams == 1 else height > 1200  # a row for each flag of each stream
+    track, flags = pixels[:480, : width * 2 // 5], pixels[720:]
     for color in COLORS[:streams]:
         assert count_pixels(flags, color) > 1000, color
         assert count_pixels(track, color) > 40, color
@@ -172,7 +176,7 @@ def test_plot_shows_every_valid_message(tmp_path: Path) -> None:
     svg = (tmp_path / "a.svg").read_text()
     texts = set(re.findall(r"<text[^>]*>([^<]*)</text>", svg))
     flags = {"xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning"}
-    assert {"a flight", f"7/{VLP}", "track", "east [m]", "north [m]", "z resets", "heading resets", *flags} <= texts
+    assert {"a flight", f"7/{VLP}", "east [m]", "north [m]", "z resets", "heading resets", *flags} <= texts
     assert not {"xy resets", "vz resets"} & texts
     paths = re.findall(r'<path [^>]*?d="([^"]*)"[^>]*?style="([^"]*)"', svg)
     [track] = [path for path, style in paths if "stroke-width: 1.2" in style and path.count("L") > 10]
@@ -190,11 +194,144 @@ def test_plot_shows_every_valid_message(tmp_path: Path) -> None:
     assert second == pytest.approx(first * 0.24 / 0.2, rel=1e-4)
 
 
+def texts_of(streams: list[tuple[Address, np.ndarray]], path: Path, *, title: str = "") -> list[str]:
+    """Draw, and return the texts in the picture."""
+    with mpl.rc_context({"svg.fonttype": "none"}):
+        draw(streams, path, title=title)
+    return re.findall(r"<text[^>]*>([^<]*)</text>", path.read_text())
+
+
+def test_plot_leaves_out_what_the_flight_does_not_have(tmp_path: Path) -> None:
+    """Flags and resets that a log lacks have no row, and the picture says so."""
+    path = tmp_path / "a.ulg"
+    writer = UlogWriter(layout="1.13")
+    writer.define([VLP], without=["heading_reset_counter"])
+    for number in range(20):
+        writer.add(VLP, message(number + 1))
+    texts = texts_of([(Address("1", VLP), nedbus.read(writer.write(path)))], tmp_path / "a.svg")
+    assert "xy_valid" in texts
+    assert "dead_reckoning" not in texts
+    assert "heading resets" not in texts
+    assert f"1/{VLP} does not have dead_reckoning, heading_reset_counter" in texts
+
+
+def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
+    """A flight without one valid position, with NaN for all of them, is drawn, and the picture says why it is empty."""
+    array = to_array([message(each + 1) for each in range(20)])
+    texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg")
+    assert {"xy_valid is never set", "z_valid is never set", "v_xy_valid is never set"} <= set(texts)
+
+
+def test_plot_of_messages_that_are_all_invalid_is_an_error(run_nedbus: Start, tmp_path: Path) -> None:
+    """A flight of which no message is valid is one line and exit code 1."""
+    array = to_array([message(1), message(2)])
+    array["xy_valid"] = True
+    with RecordingWriter(tmp_path / "a.mcap") as writer:
+        writer.write(array, repeat((Address("1", VLP), Provenance())), logged=[1, 2], published=[1, 2])
+    plot = run_nedbus("plot", str(tmp_path / "a.mcap"))
+    assert plot.wait(60) == 1
+    assert "no message of what is selected is valid" in plot.err
+    assert "Traceback" not in plot.err
+
+
+@pytest.mark.parametrize(
+    "name", ["flight $1$ of $x.ulg", "飛行 3.ulg", "\u0631\u062d\u0644\u0629.ulg", "broken \udcff.ulg"]
+)
+def test_title_in_any_script_is_drawn(tmp_path: Path, name: str) -> None:
+    """No name is taken for a formula, and characters that the font lacks are a question mark that is explained."""
+    texts = texts_of([(Address("1", VLP), to_array([message(1)]))], tmp_path / "a.svg", title=name)
+    if "$" in name:
+        assert name in texts
+    elif "broken" in name or "3" in name:
+        assert any(
+            text.endswith("?.ulg (?: a character that this font lacks)") or "?? 3.ulg (" in text for text in texts
+        )
+
+
+def test_labels_of_many_streams_do_not_overlap(tmp_path: Path) -> None:
+    """Each row of six streams has its own line of text."""
+    array = to_array([message(each + 1, xy_reset_counter=each, z_reset_counter=each) for each in range(20)])
+    draw([(Address(f"v{number}", VLP), array) for number in range(6)], tmp_path / "a.svg", title="")
+    svg = (tmp_path / "a.svg").read_text()
+    height = float(re.findall(r'<svg[^>]* height="([0-9.]+)pt"', svg)[0])
+    labels = 6 * 9
+    assert height / 72 >= 6.0 + 0.16 * labels
+
+
+def test_missing_fields_are_named(tmp_path: Path) -> None:
+    """`read` tells a field that a log lacks from a fact: by `missing_of`, and as null in frames."""
+    writer = UlogWriter(layout="1.13")
+    writer.define([VLP])
+    for number in range(5):
+        writer.add(VLP, message(number + 1, x=1.0))
+    path = writer.write(tmp_path / "a.ulg")
+    array = nedbus.read(path)
+    assert array.dtype == DTYPE
+    missing = nedbus.missing_of(array)
+    assert {"dead_reckoning", "heading_var", "dist_bottom_reset_counter"} <= missing
+    assert not {"x", "xy_valid", "hagl_max_z", "hagl_max_xy"} & missing
+    for kept in (array[1:3], array[array["x"] > 0], array.copy(), np.sort(array, order="timestamp"), array[0]):
+        assert nedbus.missing_of(kept) == missing
+    panda = nedbus.read(path, frame="pandas")
+    bear = nedbus.read(path, frame="polars")
+    assert panda.attrs["missing"] == sorted(missing)
+    for name in ("dead_reckoning", "heading_var", "dist_bottom_reset_counter"):
+        assert panda[name].isna().all()
+        assert bear[name].is_null().all()
+    assert str(panda["dead_reckoning"].dtype) == "boolean"
+    assert bear["dead_reckoning"].dtype == pl.Boolean
+    assert panda["xy_valid"].dtype == np.bool_
+    assert not bear["x"].has_nulls()
+
+
+def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
+    """A recording of two sources of one vehicle: what one lacks is null in its messages only."""
+    path = tmp_path / "a.mcap"
+    array = to_array([message(1, eph=1.0), message(2, eph=2.0)])
+    without = Provenance("mavlink", frozenset({"dead_reckoning", "delta_xy", "eph"}))
+    with RecordingWriter(path) as writer:
+        for row, provenance in zip((array[:1], array[1:]), (Provenance("sim"), without), strict=True):
+            writer.write(row, [(Address("1", VLP), provenance)], logged=[1], published=[1])
+    assert nedbus.missing_of(nedbus.read(path)) == without.missing
+    assert nedbus.read(path, frame="pandas")["dead_reckoning"].isna().tolist() == [False, True]
+    bear = nedbus.read(path, frame="polars")
+    assert bear["delta_xy[1]"].is_null().to_list() == [False, True]
+    assert bear["eph"].to_list() == [1.0, None]
+
+
+def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What docs/data.md and docs/recordings.md name is in `nedbus`, and the scripts about files run."""
+    data, recordings = ((DOCS / name).read_text() for name in ("data.md", "recordings.md"))
+    names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings)))
+    names |= set(re.findall(r"`(\w+_to_\w+)`", data))
+    assert len(names) > 15
+    assert names <= set(nedbus.__all__)
+    log = UlogWriter(layout="1.13")
+    log.define(["estimator_local_position"])
+    log.add("estimator_local_position", message(1), instance=1)
+    log.write(flight.with_suffix(".ulg"))
+    monkeypatch.chdir(flight.parent)
+    scope: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", recordings, re.DOTALL):
+        exec(block, scope)  # noqa: S102 - our own page
+    assert isinstance(scope["frame"], pd.DataFrame)
+
+
+def test_unknown_frame_is_refused(flight: Path) -> None:
+    """A misspelt frame is not something to install."""
+    with pytest.raises(ConfigError, match="'foo' is neither pandas nor polars"):
+        nedbus.read(flight, frame="foo")  # type: ignore[call-overload] # that is the mistake
+
+
 def test_plot_that_cannot_be_written_is_an_error(run_nedbus: Start, flight: Path, tmp_path: Path) -> None:
     """A vehicle that is not in the file is exit code 2, a folder that does not exist is exit code 1."""
     plot = run_nedbus("plot", str(flight), "-v", "9")
     assert plot.wait() == 2
     assert "expected one of 1/estimator_local_position/0" in plot.err
+    for name in ("a.foo", "/dev/full"):
+        plot = run_nedbus("plot", str(flight), "-o", name)
+        assert plot.wait(60) == 2
+        assert f"{name}: expected a picture: a file that ends with .png or .svg or .pdf" in plot.err
     plot = run_nedbus("plot", str(flight), "-o", "/nowhere/a.png")
     assert plot.wait(60) == 1
     assert "cannot be written" in plot.err

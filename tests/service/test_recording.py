@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import resource
 import signal
 import threading
@@ -18,6 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import nedbus
 from nedbus.errors import OutputError, SourceError
 from nedbus.recording import Recorder, RecordingReader, RecordingWriter, convert
+from nedbus.sources import SourceMessage
 from nedbus_msgs import (
     ANY,
     LAYOUTS,
@@ -33,7 +35,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import to_array
 from tests.conftest import DEADLINE, LOGS, Start, message, wait_for, wait_for_reader
-from tests.replays import open_replay
+from tests.replays import convert_replay, open_replay
 
 VLP = "vehicle_local_position"
 ADDRESS = Address("7", VLP)
@@ -211,10 +213,12 @@ def test_bags_of_ros2_are_replayed(tmp_path: Path, layout: str) -> None:
 def test_channels_of_other_encodings_are_left_out(tmp_path: Path) -> None:
     """A channel whose encoding is not supported is left out, with a warning."""
     path = tmp_path / "a.mcap"
-    write(path, message(1))
-    with path.open("rb") as file:
-        data = file.read()
-    path.write_bytes(data.replace(b"ros2msg", b"ros2idl"))
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(ROS2_TYPE, "ros2idl", b"")
+        writer.add_message(writer.register_channel(f"/{ADDRESS}", "cdr", schema), 1, b"", 1)
+        writer.finish()
     with RecordingReader(path, vehicle="1") as reader:
         assert reader.counts == {}
         assert "cdr with ros2idl, not cdr" in reader.warnings[0]
@@ -254,6 +258,84 @@ def test_full_disk_ends_cleanly(tmp_path: Path) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert flushed
     assert len(read_independently(path)) == flushed
+
+
+FULL_DISK = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv.pop(1)),) * 2)
+from nedbus.cli import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("size", "arguments", "reason"),
+    [
+        (50_000, ["convert", "flight.mcap", "new.mcap"], "new.mcap cannot be written (file too large)"),
+        (5_000, ["plot", "flight.mcap", "-o", "new.png"], "new.png cannot be written (file too large)"),
+        (200, ["pki", "ca", "new"], "new/ca cannot be written: file too large"),
+        (300, ["pki", "ca", "new"], "new/ca cannot be written: file too large"),
+    ],
+)
+def test_full_disk_leaves_nothing_behind(
+    start: Start, tmp_path: Path, size: int, arguments: list[str], reason: str
+) -> None:
+    """convert, plot and pki say what failed, exit with 1, and leave no half file: no empty key above all."""
+    convert_replay("sim:?duration=20", tmp_path / "flight.mcap")
+    arguments = [each.replace("flight", str(tmp_path / "flight")) for each in arguments]
+    folder = tmp_path / "full"
+    folder.mkdir()
+    arguments[-1] = str(folder / arguments[-1])
+    process = start("-c", FULL_DISK, str(size), *arguments)
+    assert process.wait(60) == 1, process.err
+    assert reason in process.err
+    assert not [path for path in folder.rglob("*") if path.is_file()]
+
+
+def test_conversion_replaces_nothing(run_nedbus: Start, tmp_path: Path) -> None:
+    """A recording of the same name stays as it is, and nothing else is left."""
+    convert_replay("sim:?duration=1", tmp_path / "flight.mcap")
+    path = tmp_path / "new" / "a.mcap"
+    path.parent.mkdir()
+    path.write_text("precious")
+    convert = run_nedbus("convert", str(tmp_path / "flight.mcap"), str(path))
+    assert convert.wait() == 1
+    assert "file exists): choose another name, or remove it" in convert.err
+    assert path.read_text() == "precious"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def dues(path: Path, *logged: float) -> list[float]:
+    """Return when the messages of a recording are due that were recorded at these seconds, stamped as it likes."""
+    with RecordingWriter(path) as writer:
+        for number, time in enumerate(logged):
+            address = Address(str(number % 2), VLP)
+            published = number % 2 * 3600 * 10**9 + (10**19 if number == 3 else number)
+            rows = to_array([message(number)])
+            writer.write(rows, [(address, Provenance())], logged=[round(time * 1e9)], published=[published])
+    return [round(each.due, 6) for each in open_replay(f"mcap:{path}").messages]
+
+
+@pytest.mark.parametrize(
+    ("logged", "due"),
+    [
+        ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour: side by side
+        ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # the last value of three hours ago comes first
+        ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # a stray time
+        ([5, 6, 5.5, 7], [0, 1, 1, 2]),  # one that was recorded late
+        ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set
+    ],
+)
+def test_replay_follows_the_times_of_recording(tmp_path: Path, logged: list[float], due: list[float]) -> None:
+    """What the publishers' clocks say does not matter, and no gap of more than a minute is waited for."""
+    assert dues(tmp_path / "a.mcap", *logged) == due
+
+
+def test_conversion_keeps_the_pace_of_several_vehicles(tmp_path: Path) -> None:
+    """A converted recording is replayed as the original: the clocks of its vehicles differ, its times do not."""
+    expected = dues(tmp_path / "a.mcap", 0, 1, 2, 3, 4)
+    convert_replay(f"mcap:{tmp_path / 'a.mcap'}", tmp_path / "b.mcap")
+    assert [each.due for each in open_replay(f"mcap:{tmp_path / 'b.mcap'}").messages] == expected
 
 
 def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
@@ -307,24 +389,40 @@ def test_log_is_converted_whole(run_nedbus: Start, tmp_path: Path, log: Path) ->
 def test_damaged_times_are_converted(tmp_path: Path) -> None:
     """An impossible timestamp is kept in the message; the file's own time is limited to 64 bits of ns."""
     path = tmp_path / "a.mcap"
-    pairs = [(ADDRESS, {"timestamp": each}) for each in (1, 2**64 - 1)]
-    assert convert(pairs, path, source="ulog", on_progress=lambda _: None) == "2 messages"
+    messages = [SourceMessage(0.0, ADDRESS, {"timestamp": each}) for each in (1, 2**64 - 1)]
+    assert convert(messages, path, source="ulog", on_progress=lambda _: None) == "2 messages"
     assert [each.timestamp for *_, each in read_independently(path)] == [1, 2**64 - 1]
 
 
 def test_rejected_messages_are_counted(tmp_path: Path) -> None:
     """A message that violates the rules is left out of the recording, and counted."""
-    pairs = [(ADDRESS, {"timestamp": 1}), (ADDRESS, {"timestamp": 2, "xy_valid": True})]
+    messages = [
+        SourceMessage(0.0, ADDRESS, fields) for fields in ({"timestamp": 1}, {"timestamp": 2, "xy_valid": True})
+    ]
     path = tmp_path / "a.mcap"
-    assert convert(pairs, path, source="ulog", on_progress=lambda _: None) == "1 messages, 1 rejected"
+    assert convert(messages, path, source="ulog", on_progress=lambda _: None) == "1 messages, 1 rejected"
     assert [each.timestamp for *_, each in read_independently(path)] == [1]
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".ulg"])
+def test_pipe_is_refused_in_a_sentence(run_nedbus: Start, tmp_path: Path, suffix: str) -> None:
+    """A FIFO would be waited for, for ever: it is refused, and so is a folder."""
+    pipe = tmp_path / f"pipe{suffix}"
+    os.mkfifo(pipe)
+    plot = run_nedbus("plot", str(pipe))
+    assert plot.wait() == 1, plot.err
+    assert "not a regular file" in plot.err
+    folder = tmp_path / f"folder{suffix}"
+    folder.mkdir()
+    with pytest.raises(SourceError, match="not a regular file"):
+        nedbus.read(folder)
 
 
 def test_progress_counts_messages(tmp_path: Path) -> None:
     """A long conversion reports how many messages it has handled."""
     done: list[int] = []
-    pairs = [(ADDRESS, {"timestamp": each}) for each in range(3000)]
-    convert(pairs, tmp_path / "a.mcap", source="ulog", on_progress=done.append)
+    messages = [SourceMessage(0.0, ADDRESS, {"timestamp": each}) for each in range(3000)]
+    convert(messages, tmp_path / "a.mcap", source="ulog", on_progress=done.append)
     assert done == [1024, 2048]
 
 

@@ -247,3 +247,31 @@ def test_log_that_loops_is_an_error(tmp_path: Path) -> None:
     writer.data += b"\x60\xea\x00" + b"\x60\xea\x00"
     with pytest.raises(SourceError):
         open_log(writer.write(tmp_path / "a.ulg"))
+
+
+def test_pyulog_of_others_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A script that uses pyulog itself still sees what it prints; what it prints for us is a warning."""
+    path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000))
+    data = bytearray(path.read_bytes())
+    data[7] = 9  # the version of the format
+    path.write_bytes(data)
+    assert "damaged: Warning: unknown file version" in open_log(path).warnings[0]
+    assert capsys.readouterr().out == ""
+    ULog(str(path))
+    assert "unknown file version" in capsys.readouterr().out
+
+
+def test_damaged_definition_is_noticed(tmp_path: Path) -> None:
+    """A field whose type changed, or that every release has and the log lacks, is damage, and never read as another."""
+    path = write_log(tmp_path / "a.ulg", range(0, 100_000, 1000), topic="estimator_local_position")
+    good = path.read_bytes()
+    for before, after in ((b"float[2] delta_xy;", b"float[0] delta_xy;"), (b"float z;", b"float \0;")):
+        assert good.count(before) == 1
+        path.write_bytes(good.replace(before, after))
+        try:
+            run = open_log(path)
+        except SourceError as exc:
+            assert "damaged" in str(exc)
+        else:
+            assert run.damage
+            assert all("z" not in each.fields for each in run.messages)

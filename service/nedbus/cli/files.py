@@ -13,7 +13,7 @@ import typer
 
 from nedbus import recording
 from nedbus.client import Bus
-from nedbus.errors import AddressError, ConfigError
+from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus.sources import LiveSource, parse_source, source_text_of_file
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection
 
@@ -79,12 +79,14 @@ def convert(
         write_stderr(f"{source}: {warning}")
     with _progress() as show:
         report = recording.convert(
-            ((each.address, each.fields) for each in run.messages),
+            run.messages,
             output,
             source=spec.kind,
             on_progress=lambda done: show(f"{output}", done, run.total),
         )
     write_stderr(f"{output}: {report}")
+    if run.damage:
+        raise SourceError(str(source), "damage cost messages: what could be read is written")
 
 
 @command
@@ -101,20 +103,24 @@ def plot(
     """Draw a flight: track, altitude, speed, flags, and resets of the estimator."""
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
-    recorded = recording.addresses_of(source)
-    selected = [address for address in recorded if selection.matches(address)]
-    if not selected:
-        raise AddressError("topic", topic, f"one of {', '.join(map(str, recorded))}")
-    if len(selected) > limit:
-        write_stderr(f"{source}: {len(selected)} streams, of which the first {limit} are drawn: choose with -v, -t, -i")
-    streams = []
-    for address in selected[:limit]:
-        messages = recording.read(source, address.topic, vehicle=address.vehicle, instance=address.instance)
-        if len(messages):
-            streams.append((address, messages))
-    target = output or source.with_suffix(".png")
-    draw(streams, target, title=source.name)
-    write(str(target))
+    with recording.Flight(source) as flight:
+        selected = [address for address in flight.addresses if selection.matches(address)]
+        if not selected:
+            raise AddressError("topic", topic, f"one of {', '.join(map(str, flight.addresses))}")
+        if len(selected) > limit:
+            hint = f"of which the first {limit} are drawn: choose with -v, -t, -i"
+            write_stderr(f"{source}: {len(selected)} streams, {hint}")
+        streams = [(address, flight.read(address)[0]) for address in selected[:limit]]
+        for warning in flight.warnings:
+            write_stderr(f"{source}: {warning}")
+        streams = [(address, messages) for address, messages in streams if len(messages)]
+        if not streams:
+            raise SourceError(str(source), "nothing to draw: no message of what is selected is valid")
+        target = output or source.with_suffix(".png")
+        draw(streams, target, title=source.name)
+        write(str(target))
+        if flight.damaged:
+            raise SourceError(str(source), "damage cost messages: what could be read is drawn")
 
 
 @contextmanager

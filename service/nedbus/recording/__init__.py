@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .arrays import addresses_of, read
+    from .arrays import Flight, addresses_of, missing_of, read
     from .conversion import convert
     from .formats import SUFFIXES, format_of
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
-    from .ulog import UlogColumns, read_ulog
+    from .ulog import UlogColumns, UlogTopics, read_ulog
     from .writer import RecordingWriter
 else:
     # No submodule has the name of an export: importing it would replace the export.
     __getattr__ = lazy_exports(
         __name__,
         {
+            "Flight": ("", "arrays"),
             "MAX_STREAMS": ("plot", "plot"),
             "SUFFIXES": ("", "formats"),
             "RecordedMessage": ("mcap", "reader"),
@@ -31,10 +32,12 @@ else:
             "RecordingReader": ("mcap", "reader"),
             "RecordingWriter": ("mcap", "writer"),
             "UlogColumns": ("", "ulog"),
+            "UlogTopics": ("", "ulog"),
             "addresses_of": ("", "arrays"),
             "convert": ("mcap", "conversion"),
             "draw": ("plot", "plot"),
             "format_of": ("", "formats"),
+            "missing_of": ("", "arrays"),
             "read": ("", "arrays"),
             "read_ulog": ("", "ulog"),
         },
@@ -43,16 +46,19 @@ else:
 __all__ = [
     "MAX_STREAMS",
     "SUFFIXES",
+    "Flight",
     "RecordedMessage",
     "RecordedStream",
     "Recorder",
     "RecordingReader",
     "RecordingWriter",
     "UlogColumns",
+    "UlogTopics",
     "addresses_of",
     "convert",
     "draw",
     "format_of",
+    "missing_of",
     "read",
     "read_ulog",
 ]

@@ -2,52 +2,88 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from pydantic import ValidationError
 
-from nedbus_msgs import Address, Provenance, VehicleLocalPosition, upgrade
+from nedbus.errors import OutputError
+from nedbus.whole_file import whole_file
+from nedbus_msgs import Address, Provenance, VehicleLocalPosition, describe, upgrade
 from nedbus_msgs.arrays import to_array
 
 from .writer import RecordingWriter
 
+_log = logging.getLogger(__name__)
+
 _MAX_TIME: Final = 2**64 - 1  # ns: a damaged log may have any timestamp
+_MAX_START: Final = 2**63  # ns: what follows must fit as well
 _CHUNK: Final = 1024  # messages that are written together
+_CHUNK_SIZE: Final = 2**18  # bytes: what damage costs, some seconds of a flight
+_MAX_LOGGED: Final = 5  # rejected messages that are logged
+
+
+class ConvertibleMessage(Protocol):
+    """A message of a source: when it is due [s], its address and its fields, or why it cannot be decoded."""
+
+    @property
+    def due(self) -> float: ...  # noqa: D102
+    @property
+    def address(self) -> Address: ...  # noqa: D102
+    @property
+    def fields(self) -> Mapping[str, object]: ...  # noqa: D102
+    @property
+    def error(self) -> str | None: ...  # noqa: D102
 
 
 def convert(
-    messages: Iterable[tuple[Address, Mapping[str, object]]],
-    path: Path,
-    *,
-    source: str,
-    on_progress: Callable[[int], object],
+    messages: Iterable[ConvertibleMessage], path: Path, *, source: str, on_progress: Callable[[int], object]
 ) -> str:
-    """Write messages, given as address and fields, to a new MCAP file with PX4's own times; return a summary.
+    """Write messages to a new MCAP file and return a summary; without success there is no file.
 
+    A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
     `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far.
 
     Raises OutputError when the file exists already or cannot be written.
     """
+    try:
+        with whole_file(path) as part:
+            return _write(messages, part, source=source, on_progress=on_progress)
+    except OSError as exc:
+        cause = exc.__cause__ if isinstance(exc, OutputError) else exc
+        raise OutputError(path, cause if isinstance(cause, OSError) else exc) from exc
+
+
+def _write(
+    messages: Iterable[ConvertibleMessage], path: Path, *, source: str, on_progress: Callable[[int], object]
+) -> str:
     pending: list[tuple[Address, Provenance, VehicleLocalPosition]] = []
-    rejected = 0
-    with RecordingWriter(path) as writer:
+    logged: list[int] = []
+    rejected, start = 0, None
+    with RecordingWriter(path, chunk_size=_CHUNK_SIZE) as writer:
 
         def write_pending() -> None:
-            times = [min(message.timestamp * 1000, _MAX_TIME) for *_, message in pending]
             streams = ((address, provenance) for address, provenance, _ in pending)
-            writer.write(to_array([message for *_, message in pending]), streams, logged=times, published=times)
+            published = [min(message.timestamp * 1000, _MAX_TIME) for *_, message in pending]
+            writer.write(to_array([message for *_, message in pending]), streams, logged=logged, published=published)
             pending.clear()
+            logged.clear()
 
-        for done, (address, fields) in enumerate(messages, 1):
+        for done, each in enumerate(messages, 1):
             try:
-                message = upgrade(fields)
-            except ValidationError:
+                message = upgrade(each.fields)
+            except ValidationError as exc:
                 rejected += 1
+                if rejected <= _MAX_LOGGED:
+                    _log.warning("%s rejected: %s", each.address, each.error or describe(exc))
                 continue
+            if start is None:
+                start = min(message.timestamp * 1000, _MAX_START)
             missing = frozenset(VehicleLocalPosition.model_fields.keys() - message.model_fields_set)
-            pending.append((address, Provenance(source, missing), message))
+            pending.append((each.address, Provenance(source, missing), message))
+            logged.append(start + round(each.due * 1e9))
             if len(pending) >= _CHUNK:
                 write_pending()
                 on_progress(done)

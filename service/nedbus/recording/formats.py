@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePath
-from typing import Final
+from pathlib import Path, PurePath
+from typing import BinaryIO, Final
 
-from nedbus.errors import ConfigError
+from nedbus.errors import ConfigError, SourceError
 
 SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap"}
 """The kind of source that replays a file, by the file's suffix."""
@@ -18,3 +18,13 @@ def format_of(path: str | PurePath) -> str:
     if found is None:
         raise ConfigError(str(path), f"expected a flight log: a file that ends with {' or '.join(SUFFIXES)}")
     return found
+
+
+def open_flight(path: Path) -> BinaryIO:
+    """Open a file for reading; raise SourceError when that fails, and for what is no file: a flight is read twice."""
+    try:
+        if path.exists() and not path.is_file():
+            raise SourceError(str(path), "not a regular file: save it as one first")
+        return path.open("rb")
+    except OSError as exc:
+        raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc

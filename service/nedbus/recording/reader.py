@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
-from mcap.exceptions import McapError
-from mcap.reader import McapReader, NonSeekingReader, make_reader
-from mcap.records import Channel, Schema
-from zstandard import ZstdError
+from mcap.records import Channel, Message, Schema
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import ROS2_TYPES, Address, find_layout, split_ros2_topic
+from nedbus_msgs import (
+    FIELD_TYPES,
+    LAYOUTS,
+    ROS2_TYPES,
+    Address,
+    find_layout,
+    split_ros2_topic,
+    upgraded_names,
+)
 
-_MAX_RECORD: Final = 2**30  # bytes; a longer record is damage
-_READ_ERRORS: Final = (McapError, EOFError, ValueError, struct.error, ZstdError)  # of a damaged file
+from .chunks import READ_ERRORS, ChunkFile, records_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +32,11 @@ class RecordedStream:
     address: Address
     layout: str
     missing: frozenset[str]
+
+    @property
+    def lacking(self) -> frozenset[str]:
+        """The fields of a message that its source or its layout lacks."""
+        return _lacking(self.layout) | self.missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,26 +52,32 @@ class RecordedMessage:
 class RecordingReader:
     """An MCAP file that is open for reading; a context manager. Messages are read one chunk at a time.
 
-    `vehicle` is that of channels that name none. `warnings` is complete when `messages` has ended.
+    `vehicle` is that of channels that name none.
+    What is damaged is left out; `warnings` say so, and are complete when `messages` or `check` has ended.
 
     Raises SourceError for a file that is not MCAP or cannot be opened.
     """
 
     def __init__(self, path: str | Path, *, vehicle: str) -> None:
         self.path = Path(path).expanduser()
-        self.warnings: list[str] = []
         self._vehicle = vehicle
-        self._complete = True
-        self._streams: dict[int, RecordedStream | None] = {}
-        self._by_topic: dict[str, RecordedStream] = {}  # of the channel
+        self._file = ChunkFile(self.path)
+        self._schemas: dict[int, Schema] = {}
+        self._streams: dict[int, RecordedStream | None] = {}  # by channel
+        summary = self._file.summary
+        if summary is not None:
+            self._schemas.update(summary.schemas)
+            for channel in summary.channels.values():
+                self._add(channel)
+        totals = summary.statistics.channel_message_counts if summary and summary.statistics else {}
+        self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
         try:
-            self._file = self.path.open("rb")
-        except OSError as exc:
-            raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
-        try:
-            self._counts = self._read_counts()
+            if self._all_known:
+                self._counts = self._sum((self._streams[number], total) for number, total in totals.items())
+            else:
+                self._counts = self._count()
         except SourceError:
-            self._file.close()
+            self.close()
             raise
 
     @property
@@ -70,16 +85,40 @@ class RecordingReader:
         """The number of messages of each stream."""
         return self._counts
 
+    @property
+    def warnings(self) -> list[str]:
+        """What is damaged or left out."""
+        return self._file.warnings
+
+    @property
+    def damaged(self) -> bool:
+        """Whether damage cost messages."""
+        return self._file.damaged
+
+    def check(self) -> None:
+        """Read the file once, so that `warnings` and `damaged` are complete and `counts` has what can be read."""
+        for _ in self._file.parts(self._channels()):
+            pass
+        if self.damaged:
+            self._counts = self._count()
+
     def messages(self, only: Address | None = None) -> Iterator[RecordedMessage]:
         """Yield all messages of local position topics, or of one address, in the order of the file."""
-        topics = None if only is None else [name for name, stream in self._by_topic.items() if stream.address == only]
-        try:
-            for schema, channel, message in self._reader().iter_messages(topics=topics, log_time_order=False):
-                stream = self._stream(schema, channel)
-                if stream is not None and only in (None, stream.address):
-                    yield RecordedMessage(stream, message.data, message.publish_time, message.log_time)
-        except _READ_ERRORS:
-            self._warn("cut: it ends inside a record; everything before that is read")
+        for part in self._file.parts(self._channels(only)):
+            try:
+                records = records_of(part)
+            except READ_ERRORS:
+                self._file.warn("damaged: records without a CRC are left out", lost=True)
+                continue
+            for record in records:
+                if isinstance(record, Schema):
+                    self._schemas.setdefault(record.id, record)
+                elif isinstance(record, Channel):
+                    self._add(record)
+                elif isinstance(record, Message):
+                    stream = self._stream(record)
+                    if stream is not None and only in (None, stream.address):
+                        yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
 
     def close(self) -> None:
         """Close the file."""
@@ -93,56 +132,54 @@ class RecordingReader:
     ) -> None:
         self.close()
 
-    def _reader(self) -> McapReader:
-        """Return a reader that uses the index of chunks, or reads sequentially where there is none."""
-        self._file.seek(0)
-        return (
-            make_reader(self._file) if self._complete else NonSeekingReader(self._file, record_size_limit=_MAX_RECORD)
-        )
+    def _channels(self, only: Address | None = None) -> list[int] | None:
+        """Return the channels of an address, or of all local position topics; None before all are known."""
+        if not self._all_known:
+            return None
+        return [
+            number for number, stream in self._streams.items() if stream is not None and only in (None, stream.address)
+        ]
 
-    def _read_counts(self) -> dict[RecordedStream, int]:
-        """Return the counts of the file's summary; without one, after a power cut, count the messages."""
-        try:
-            summary = self._reader().get_summary()
-        except _READ_ERRORS:
-            summary, self._complete = None, False
+    def _count(self) -> dict[RecordedStream, int]:
+        """Count the messages that can be read."""
+        counts = self._sum((recorded.stream, 1) for recorded in self.messages())
+        if not counts and self.damaged:
+            raise SourceError(str(self.path), f"no message can be read: {'; '.join(self.warnings[:3])}")
+        return counts
+
+    def _sum(self, parts: Iterable[tuple[RecordedStream | None, int]]) -> dict[RecordedStream, int]:
         counts: dict[RecordedStream, int] = {}
-        if summary is None or summary.statistics is None:
-            for recorded in self.messages():
-                counts[recorded.stream] = counts.get(recorded.stream, 0) + 1
-            if not counts and self.warnings:
-                raise SourceError(str(self.path), "not a readable MCAP file")
-            return counts
-        for number, channel in summary.channels.items():
-            stream = self._stream(summary.schemas.get(channel.schema_id), channel)
+        for stream, count in parts:
             if stream is not None:
-                count = summary.statistics.channel_message_counts.get(number, 0)
                 counts[stream] = counts.get(stream, 0) + count
         return counts
 
-    def _stream(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
+    def _add(self, channel: Channel) -> None:
         if channel.id not in self._streams:
-            stream = self._streams[channel.id] = self._describe(schema, channel)
-            if stream is not None:
-                self._by_topic[channel.topic] = stream
-        return self._streams[channel.id]
+            self._streams[channel.id] = self._describe(self._schemas.get(channel.schema_id), channel)
+
+    def _stream(self, message: Message) -> RecordedStream | None:
+        if message.channel_id not in self._streams:
+            self._streams[message.channel_id] = None
+            self._file.warn(f"the messages of channel {message.channel_id} are left out: its name is lost", lost=True)
+        return self._streams[message.channel_id]
 
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
         if schema is None or schema.name not in ROS2_TYPES:
             return None
         if channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
-            self._warn(
+            self._file.warn(
                 f"{channel.topic} is left out: {channel.message_encoding} with {schema.encoding}, not cdr, ros2msg"
             )
             return None
         layout = find_layout(_field_names(schema.data))
         if layout is None:
-            self._warn(f"{channel.topic} is left out: no known layout has these fields")
+            self._file.warn(f"{channel.topic} is left out: no known layout has these fields")
             return None
         try:
             address = self._address(channel)
         except (AddressError, ValueError) as exc:
-            self._warn(f"{channel.topic} is left out: {exc}")
+            self._file.warn(f"{channel.topic} is left out: {exc}")
             return None
         return RecordedStream(address, layout.name, frozenset(channel.metadata.get("missing", "").split()))
 
@@ -154,9 +191,10 @@ class RecordingReader:
         namespace, topic, instance_number = split_ros2_topic(channel.topic)
         return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
 
-    def _warn(self, warning: str) -> None:
-        if warning not in self.warnings:
-            self.warnings.append(warning)
+
+@cache
+def _lacking(layout: str) -> frozenset[str]:
+    return frozenset(FIELD_TYPES.keys() - upgraded_names(LAYOUTS[layout].fields).keys())
 
 
 def _field_names(definition: bytes) -> list[str]:

@@ -32,11 +32,12 @@ class RecordingWriter:
     """Write messages to a new MCAP file; a context manager that finishes it.
 
     The file is in the layout of PX4 1.16 to main, one channel for each address and provenance.
+    A chunk, of up to `chunk_size` bytes before compression, is what damage of one bit costs.
 
     Raises OutputError when the file exists already, or cannot be written: then what was flushed can still be read.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
         self.path = Path(path)
         self.messages = 0
         try:
@@ -44,7 +45,7 @@ class RecordingWriter:
         except OSError as exc:
             raise OutputError(self.path, exc) from exc
         # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
-        self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=_CHUNK)
+        self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=chunk_size)
         self._writer.start(profile="ros2", library="nedbus")
         self._schema = self._writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(CURRENT.name).encode())
         self._channels: dict[tuple[Address, Provenance], int] = {}

@@ -1,15 +1,18 @@
-"""Replay the local position topics of an MCAP file, at the times at which they were published."""
+"""Replay the local position topics of an MCAP file, at the times at which they were recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
-from nedbus.errors import ConfigError, SourceError
-from nedbus.recording import RecordingReader
+from nedbus.errors import ConfigError, DecodeError, SourceError
+from nedbus.recording import RecordedMessage, RecordingReader
 from nedbus_msgs import FIELD_TYPES, Address, decode_cdr
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
+
+_MAX_GAP: Final = 60 * 10**9  # ns: a longer step is a damaged time, or a pause, and not waited for
 
 
 class McapSource:
@@ -25,36 +28,48 @@ class McapSource:
         self.wait = options.wait
 
     def open(self) -> ReplayRun:
-        """Read the file's index; raise SourceError when it is not an MCAP file, or has none of the topics."""
-        reader = RecordingReader(self._path, vehicle=self._default_vehicle)
+        """Check the file; raise SourceError when it is not an MCAP file, or has none of the topics."""
+        with self._reader() as reader:
+            reader.check()
         addresses = sorted({stream.address for stream in reader.counts})
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
-            reader.close()
             raise SourceError(self._path, "no message of the local position topics is in this recording")
         if self._vehicle is not None and len(vehicles) > 1:
-            reader.close()
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
         total = sum(reader.counts.values())
         return ReplayRun(
-            messages=self._messages(reader),
+            messages=self._messages(),
             addresses=tuple(sorted({self._rename(address) for address in addresses})),
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
             warnings=tuple(reader.warnings),
+            damage=f"{self._path}: damage cost messages: {'; '.join(reader.warnings)}" if reader.damaged else None,
         )
+
+    def _reader(self) -> RecordingReader:
+        return RecordingReader(self._path, vehicle=self._default_vehicle)
 
     def _rename(self, address: Address) -> Address:
         return Address(self._vehicle, address.topic, address.instance) if self._vehicle else address
 
-    def _messages(self, reader: RecordingReader) -> Iterator[SourceMessage]:
-        start, due = None, 0.0
-        with reader:
-            for recorded in reader.messages():
-                if start is None:
-                    start = recorded.published
-                due = max(due, (recorded.published - start) / 1e9)
-                fields = decode_cdr(recorded.payload, layout=recorded.stream.layout)
-                for name in recorded.stream.missing & FIELD_TYPES.keys():
-                    fields.pop(name, None)
-                yield SourceMessage(due, self._rename(recorded.stream.address), fields)
+    def _messages(self) -> Iterator[SourceMessage]:
+        latest, due = None, 0
+        with self._reader() as reader:
+            for number, recorded in enumerate(reader.messages(), 1):
+                step = 0 if latest is None else recorded.logged - latest
+                if 0 < step <= _MAX_GAP:
+                    due += step
+                if latest is None or step > 0 or step < -_MAX_GAP:
+                    latest = recorded.logged
+                yield self._decode(recorded, number, due / 1e9)
+
+    def _decode(self, recorded: RecordedMessage, number: int, due: float) -> SourceMessage:
+        address = self._rename(recorded.stream.address)
+        try:
+            fields = decode_cdr(recorded.payload, layout=recorded.stream.layout)
+        except DecodeError as exc:
+            return SourceMessage(due, address, {}, error=f"message {number} of the recording: {exc}")
+        for name in recorded.stream.missing & FIELD_TYPES.keys():
+            fields.pop(name, None)
+        return SourceMessage(due, address, fields)

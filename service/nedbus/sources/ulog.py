@@ -56,7 +56,8 @@ class UlogSource:
 
     def open(self) -> ReplayRun:
         """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
-        topics, warnings = read_ulog(self._path, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        log = read_ulog(self._path, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        topics, warnings = log.topics, list(log.warnings)
         vehicle = topics[0][0].vehicle
         clocks = [_monotonic(columns["timestamp"]) for _, columns in topics]
         for (address, columns), clock in zip(topics, clocks, strict=True):
@@ -79,6 +80,7 @@ class UlogSource:
             summary=f"vehicle {vehicle}, {total} messages of {len(tracks)} streams, layout {layouts},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
+            damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
         )
 
 

@@ -19,6 +19,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from nedbus.errors import PkiError
+from nedbus.whole_file import whole_file
 
 CA_DAYS: Final = 3650
 DAYS: Final = 825
@@ -119,20 +120,21 @@ def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePri
 
 
 def _write(folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> list[Path]:
-    """Write key and certificate; neither ever replaces a file, and nobody else may read the key."""
+    """Write key and certificate, both or neither; neither ever replaces a file, and nobody else may read the key."""
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
     public = certificate.public_bytes(serialization.Encoding.PEM)
     paths = [folder / f"{name}.key", folder / f"{name}.crt"]
-    for path in paths:
-        if path.exists():
-            raise PkiError(f"{path} exists: it is not overwritten; move it away, or take another folder or name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for path, content, mode in zip(paths, (secret, public), (0o600, 0o644), strict=True):
-            with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-                file.write(content)
+        with whole_file(paths[0]) as first, whole_file(paths[1]) as second:
+            for path, content, mode in ((first, secret, 0o600), (second, public, 0o644)):
+                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+                    file.write(content)
+    except FileExistsError as exc:
+        reason = "it is not overwritten; move it away, or take another folder or name"
+        raise PkiError(f"{exc.filename} exists: {reason}") from exc
     except OSError as exc:
-        raise PkiError(f"{exc.filename}: {(exc.strerror or '').lower()}") from exc
+        raise PkiError(f"{folder / name} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
     return paths

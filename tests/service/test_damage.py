@@ -1,0 +1,389 @@
+"""Damaged recordings and logs: what is hit is left out and reported, what is read is right, in every try.
+
+The chunks of a recording have CRCs, so that every message that is read equals the original to the bit.
+A log has no checksums: a bit inside a value cannot be noticed by anybody.
+There the rule is that only messages that were hit differ, and that damage of the structure is noticed.
+
+`DAMAGE_TRIES=10000 pytest tests/service/test_damage.py` tries more, on the real logs of ../shared as well.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+import nedbus
+from nedbus.errors import SourceError
+from nedbus.recording import RecordingReader, RecordingWriter
+from nedbus_msgs import (
+    FIELD_TYPES,
+    ROS2_TYPE,
+    Address,
+    Provenance,
+    downgrade,
+    encode_cdr,
+    message_definition,
+    upgrade,
+)
+from nedbus_msgs.arrays import MessageArray, to_array
+from tests.conftest import LOGS, Start, free_endpoint, message
+from tests.replays import convert_replay, open_replay
+from tests.ulogs import UlogWriter
+
+_log = logging.getLogger(__name__)
+
+VLP = "vehicle_local_position"
+TRIES = int(os.environ.get("DAMAGE_TRIES", "320"))
+MAX_LOG = 150_000  # bytes of a real log that a try reads
+
+Rows = Counter[tuple[str, bytes]]  # topic and values of messages
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Which bytes were hit, and the damaged file."""
+
+    name: str
+    hit: int
+    data: bytes
+
+
+def damage(data: bytes, rng: random.Random) -> Damage:
+    """Flip a bit, cut the end off, or zero a range."""
+    kind, damaged = rng.choice(("bit", "bit", "cut", "zeros")), bytearray(data)
+    offset = rng.randrange(len(data))
+    if kind == "bit":
+        damaged[offset] ^= 1 << rng.randrange(8)
+        return Damage(f"bit at {offset}", 1, bytes(damaged))
+    if kind == "cut":
+        return Damage(f"cut at {offset}", 0, data[:offset])
+    length = min(rng.choice((1, 4, 16, 64, 512, 4096)), len(data) - offset)
+    damaged[offset : offset + length] = bytes(length)
+    return Damage(f"{length} zeros at {offset}", length, bytes(damaged))
+
+
+# recordings
+
+
+def write_recording(path: Path, *, finish: bool) -> Path:
+    """Write a flight of two vehicles in a dozen chunks; without `finish` as a power cut leaves it."""
+    messages = [(each.address, upgrade(each.fields)) for each in open_replay("sim:?duration=1").messages]
+    writer = RecordingWriter(path)
+    for start in range(0, len(messages), 40):
+        part = messages[start : start + 40]
+        streams = [(Address(vehicle, a.topic, a.instance), Provenance("sim")) for vehicle in "12" for a, _ in part]
+        both = to_array([each for _, each in part] * 2)
+        times = [each * 1000 for each in both["timestamp"].tolist()]
+        writer.write(both, streams, logged=times, published=times)
+        writer.flush()
+    if finish:
+        writer.close()
+    else:
+        writer._file.close()
+    return path
+
+
+def make_recordings(folder: Path) -> list[Path]:
+    found = [write_recording(folder / "whole.mcap", finish=True), write_recording(folder / "cut.mcap", finish=False)]
+    for log in sorted(LOGS.glob("*.ulg")) if TRIES > 1000 else []:
+        convert_replay(f"ulog:{log}", folder / f"{log.stem}.mcap")
+        found.append(folder / f"{log.stem}.mcap")
+    return found
+
+
+def payloads_of(path: Path) -> tuple[Counter[tuple[Address, bytes]], RecordingReader]:
+    with RecordingReader(path, vehicle="1") as reader:
+        found = Counter(
+            (each.stream.address, each.payload + repr(sorted(each.stream.missing)).encode())
+            for each in reader.messages()
+        )
+    return found, reader
+
+
+@pytest.mark.timeout(120 + TRIES)
+def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path) -> None:
+    """Whatever is hit, each message that is read is one of the original, none twice, and what is lost is reported."""
+    rng = random.Random(12)
+    originals = [(path.read_bytes(), payloads_of(path)[0], path.stem) for path in make_recordings(tmp_path)]
+    path = tmp_path / "damaged.mcap"
+    outcomes: Counter[str] = Counter()
+    for number in range(TRIES * 3 // 4):
+        data, original, name = originals[number % 2] if number % 4 < 3 else rng.choice(originals)
+        damaged = damage(data, rng)
+        path.write_bytes(damaged.data)
+        where = f"{name}, try {number}, {damaged.name}"
+        try:
+            read, reader = payloads_of(path)
+            run = open_replay(f"mcap:{path}?speed=max")
+        except SourceError:
+            outcomes["refused"] += 1
+            continue
+        lost = original - read
+        assert not read - original, where
+        assert reader.damaged or not lost, f"{where}: {sum(lost.values())} lost: {reader.warnings}"
+        assert bool(run.damage) == reader.damaged, where
+        assert run.total == sum(read.values()), where
+        # Where the index is lost as well, nobody knows whether there was anything in what cannot be read.
+        assert lost or not reader.damaged or reader._file.summary is None, f"{where}: nothing lost: {reader.warnings}"
+        outcomes["lost" if lost else "whole"] += 1
+        if number % 20 == 0:
+            assert sum(1 for _ in run.messages) == run.total, where
+            address = rng.choice([each for each, _ in original])
+            expected = sum(count for (each, _), count in read.items() if each == address)
+            if expected:
+                array = nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+                assert len(array) == expected, where
+    assert outcomes["lost"] > outcomes["refused"], outcomes
+    assert outcomes["whole"], outcomes
+    _log.info("%s", outcomes)
+
+
+# logs
+
+
+def write_log(path: Path) -> Path:
+    """Write a log of two instances of the estimate and of the selected one, all of one format."""
+    writer = UlogWriter()
+    writer.define([VLP, "estimator_local_position"])
+    for number in range(60):
+        for instance in (0, 1):
+            writer.add(
+                "estimator_local_position", message(number + 1, x=number / 7, y=float(instance)), instance=instance
+            )
+        writer.add(VLP, message(number + 1, x=number / 7, z=-5.0, z_valid=True))
+    return writer.write(path)
+
+
+def shorten(log: Path, path: Path) -> Path:
+    """Write the first messages of a real log."""
+    data = log.read_bytes()
+    end = offset = 16
+    while offset + 3 <= len(data) and (offset < MAX_LOG or data[offset + 2] != ord("D")):
+        offset += 3 + int.from_bytes(data[offset : offset + 2], "little")
+    for _ in range(1000):  # of the data section
+        if offset + 3 > len(data):
+            break
+        offset += 3 + int.from_bytes(data[offset : offset + 2], "little")
+        end = offset if offset <= len(data) else end
+    path.write_bytes(data[:end])
+    return path
+
+
+def make_logs(folder: Path) -> list[Path]:
+    logs = sorted([*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").glob("*.ulg")])
+    return [write_log(folder / "ours.ulg"), *(shorten(log, folder / f"{log.stem}.ulg") for log in logs)]
+
+
+def rows_of(path: Path) -> dict[Address, MessageArray]:
+    return {
+        address: nedbus.read(path, address.topic, vehicle=address.vehicle, instance=address.instance)
+        for address in nedbus.addresses_of(path)
+    }
+
+
+def count_rows(streams: dict[Address, MessageArray], fields: Iterable[str]) -> Counter[tuple[str, bytes]]:
+    """Count the messages of each topic by their values of these fields; names of vehicles and instances are values."""
+    found: Counter[tuple[str, bytes]] = Counter()
+    for address, messages in streams.items():
+        columns = [np.ascontiguousarray(messages[name]).view(np.uint8).reshape(len(messages), -1) for name in fields]
+        found.update((address.topic, row.tobytes()) for row in np.hstack(columns))
+    return found
+
+
+def is_shorter(damaged: bytes, data: bytes) -> bool:
+    """Return whether a log is the beginning of another one, up to the end of a message."""
+    offset = 16
+    while offset < len(damaged):
+        offset += 3 + int.from_bytes(damaged[offset : offset + 2], "little")
+    return offset == len(damaged) and data.startswith(damaged)
+
+
+@pytest.mark.timeout(120 + TRIES)
+def test_damaged_logs_are_read_in_part(tmp_path: Path) -> None:
+    """No more messages differ than were hit, and what is lost with the structure is reported."""
+    rng = random.Random(13)
+    originals = [(path.read_bytes(), rows_of(path), path.stem) for path in make_logs(tmp_path)]
+    path = tmp_path / "damaged.ulg"
+    outcomes: Counter[str] = Counter()
+    for number in range(TRIES // 4):
+        data, original, name = rng.choice(originals)
+        damaged = damage(data, rng)
+        path.write_bytes(damaged.data)
+        where = f"{name}, try {number}, {damaged.name}"
+        try:
+            read, run = rows_of(path), open_replay(f"ulog:{path}")
+        except SourceError:
+            outcomes["refused"] += 1
+            continue
+        missing = {field for messages in read.values() for field in nedbus.missing_of(messages)}
+        present = [field for field in FIELD_TYPES if field not in missing]
+        before, after = count_rows(original, present), count_rows(read, present)
+        hit = 0 if damaged.name.startswith("cut") else 1 + damaged.hit // 50
+        strange, lost = (after - before).total(), (before - after).total()
+        assert strange <= hit, f"{where}: {strange} messages differ: {run.warnings}"
+        # A log has no end: one that was cut between two messages is a whole log.
+        assert run.damage or lost <= hit or is_shorter(damaged.data, data), f"{where}: {lost} lost: {run.warnings}"
+        outcomes["reported" if run.damage else "lost" if lost else "whole"] += 1
+    assert outcomes["whole"], outcomes
+    assert outcomes["reported"], outcomes
+    _log.info("%s", outcomes)
+
+
+def damage_chunk(path: Path, number: int) -> int:
+    """Flip a bit in the middle of a chunk of a recording; return how many messages are in it."""
+    data = bytearray(path.read_bytes())
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[number - 1]
+    data[index.chunk_start_offset + index.chunk_length - 100] ^= 4
+    path.write_bytes(data)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+        return total - sum(1 for _ in reader.messages())
+
+
+def test_damaged_chunk_is_named(tmp_path: Path) -> None:
+    """The report says which chunk is damaged, its time, and how many messages were in it."""
+    path = write_recording(tmp_path / "a.mcap", finish=True)
+    lost = damage_chunk(path, 3)
+    run = open_replay(f"mcap:{path}")
+    assert lost == 80
+    [warning] = run.warnings
+    assert re.fullmatch(r"chunk 3 \(10\.\d to 10\.\d s\) at byte \d+ is damaged: its 80 messages are left out", warning)
+    assert run.damage is not None
+    assert str(path) in run.damage
+
+
+def test_commands_read_the_rest_and_fail(run_nedbus: Start, tmp_path: Path) -> None:
+    """One flipped bit: convert, plot and serve --until-done use what can be read, say what is lost, and exit with 1."""
+    path = write_recording(tmp_path / "a.mcap", finish=True)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+    lost = damage_chunk(path, 3)
+    converted, picture = tmp_path / "b.mcap", tmp_path / "b.png"
+    commands = [
+        run_nedbus("convert", str(path), str(converted)),
+        run_nedbus("plot", str(path), "-v", "1", "-o", str(picture)),
+        run_nedbus("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max"),
+    ]
+    for command in commands:
+        assert command.wait(60) == 1, command.err
+        assert "chunk 3 (" in command.err
+        assert "is damaged: its " in command.err
+    assert f"{total - lost} messages" in commands[0].err
+    assert f"{total - lost} published" in commands[2].err
+    assert picture.stat().st_size > 10_000
+    with RecordingReader(converted, vehicle="1") as reader:
+        assert sum(reader.counts.values()) == total - lost
+
+
+def test_damage_of_a_converted_flight_costs_seconds(tmp_path: Path) -> None:
+    """`convert` writes chunks that are small enough for the rest to be worth reading."""
+    path = tmp_path / "a.mcap"
+    convert_replay("sim:?duration=30", path)
+    with RecordingReader(path, vehicle="1") as reader:
+        total = sum(reader.counts.values())
+    assert 0 < damage_chunk(path, 3) < total / 5
+
+
+def test_cut_log_is_converted_and_fails(run_nedbus: Start, tmp_path: Path) -> None:
+    """A log that was cut inside a message is converted up to there, with exit code 1."""
+    path = write_log(tmp_path / "a.ulg")
+    path.write_bytes(path.read_bytes()[:-50])
+    convert = run_nedbus("convert", str(path), str(tmp_path / "a.mcap"))
+    assert convert.wait() == 1
+    assert "179 messages" in convert.err
+    assert "cut: it ends inside a message" in convert.err
+
+
+def write_payloads(path: Path, payloads: Iterable[bytes], *, layout: str = "1.16") -> Path:
+    """Write a recording of one vehicle as another program may write it: any payload, one a millisecond."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        schema = writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(layout).encode())
+        channel = writer.register_channel("/fmu/out/vehicle_local_position", "cdr", schema)
+        for number, payload in enumerate(payloads):
+            writer.add_message(channel, number * 10**6, payload, number * 10**6)
+        writer.finish()
+    return path
+
+
+def payload(timestamp: int, *, layout: str = "1.16", **fields: object) -> bytes:
+    return encode_cdr(downgrade(message(timestamp, **fields), layout), layout=layout)
+
+
+def bad_bool() -> bytes:
+    bad = bytearray(payload(7))
+    bad[4 + 16] = 2  # xy_valid
+    return bytes(bad)
+
+
+POISON = {
+    "bool of 2": bad_bool(),
+    "big-endian": b"\x00\x00" + payload(7)[2:],
+    "short": payload(7)[:-4],
+    "long": payload(7) + bytes(100),
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("poison", POISON.values(), ids=POISON)
+def test_message_that_cannot_be_decoded_is_skipped(
+    tmp_path: Path, poison: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is rejected with its place, and counted; the others are replayed, converted and read."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(1), payload(2), poison, payload(3)])
+    run = open_replay(f"mcap:{path}")
+    messages = list(run.messages)
+    assert [each.error is None for each in messages] == [True, True, False, True]
+    assert str(messages[2].error).startswith("message 3 of the recording: ")
+    assert run.damage is None
+    assert convert_replay(f"mcap:{path}", tmp_path / "b.mcap") == "3 messages, 1 rejected"
+    assert "rejected: message 3 of the recording: " in caplog.text
+    assert nedbus.read(path)["timestamp"].tolist() == [1, 2, 3]
+    assert "1 of 4 messages" in caplog.text
+
+
+def test_service_goes_on_after_a_message_that_cannot_be_decoded(run_nedbus: Start, tmp_path: Path) -> None:
+    """The replay is not started again: what follows is published once, and the exit code is 0."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(1), bad_bool(), payload(2)])
+    service = run_nedbus("serve", "--listen", free_endpoint(), "--until-done", "-s", f"mcap:{path}?speed=max")
+    assert service.wait() == 0, service.err
+    assert "rejected: message 2 of the recording: " in service.err
+    assert "xy_valid: 2, where a bool is 0 or 1" in service.err
+    assert "done, 2 published, 1 rejected" in service.err
+
+
+def test_wrong_sizes_do_not_shift_into_each_other(tmp_path: Path) -> None:
+    """55 payloads that are all too long by the same number of bytes are 55 invalid messages, not 56 of garbage."""
+    path = write_payloads(tmp_path / "a.mcap", [payload(each) + bytes(60) for each in range(55)])
+    assert len(nedbus.read(path)) == 0
+
+
+@pytest.mark.parametrize("layout", ["1.13", "V0", "1.16"])
+def test_message_that_breaks_a_rule_is_left_out_in_every_layout(
+    tmp_path: Path, layout: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`read` leaves one invalid message out and counts it, whatever the layout."""
+    bad = bytearray(payload(2, layout=layout, ref_lat=12.5))
+    offset = bad.index(struct.pack("<d", 12.5))
+    bad[offset : offset + 8] = struct.pack("<d", 91.0)
+    path = write_payloads(
+        tmp_path / "a.mcap", [payload(1, layout=layout), bytes(bad), payload(3, layout=layout)], layout=layout
+    )
+    assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
+    assert "1 of 3 messages" in caplog.text
