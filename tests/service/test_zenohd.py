@@ -143,7 +143,8 @@ def test_vehicle_that_restarted_wins_over_the_storage(start: Start, run_nedbus: 
         assert "stored" in listed.out
         with nedbus.connect(zenohd) as vehicle:
             vehicle.publisher(VLP, vehicle="1").publish(message(1))
-            wait_for(lambda: last_messages(reader) == [1], what="the live answer")
+            wait_for(lambda: not reader.latest()[0].stored, what="the live answer")
+            assert reader.latest()[0].message == message(1)
             live = run_nedbus("get", "-c", zenohd)
             assert live.wait() == 0, live.err
             assert "timestamp: 1\n" in live.out
