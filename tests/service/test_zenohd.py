@@ -101,12 +101,15 @@ def test_storage_keeps_what_a_vehicle_sent_last(start: Start, zenohd: str) -> No
     with nedbus.connect(zenohd) as reader, nedbus.connect(zenohd) as vehicle:
         raw = vehicle._session
         subscription = reader.subscribe(VLP, mode="every")
-        ahead = zenoh.Timestamp(raw.new_timestamp().get_time() + dt.timedelta(hours=1), b"\x07")
+        ahead = raw.new_timestamp().get_time() + dt.timedelta(hours=1)
         timestamps = itertools.count(1)
         received: list[nedbus.Sample] = []
+        stamps: list[zenoh.Timestamp] = []
 
         def are_both_there() -> bool:
-            raw.put(f"nedbus/1/{VLP}", encode(message(next(timestamps))), timestamp=ahead)
+            number = next(timestamps)
+            stamps.append(zenoh.Timestamp(ahead + dt.timedelta(milliseconds=number), b"\x07"))
+            raw.put(f"nedbus/1/{VLP}", encode(message(number)), timestamp=stamps[-1])
             with suppress(nedbus.NoDataError):
                 received.append(subscription.receive(0.1))
             return bool(received and last_messages(reader))
@@ -117,7 +120,7 @@ def test_storage_keeps_what_a_vehicle_sent_last(start: Start, zenohd: str) -> No
         wait_for(lambda: last_messages(reader) == [last], what="the last message")
         while received[-1].message.timestamp != last:
             received.append(subscription.receive(DEADLINE))
-        assert {sample.stamp for sample in received} == {ahead}
+        assert {sample.stamp for sample in received} <= set(stamps)
         assert reader.vehicles() == {}
 
 
