@@ -69,6 +69,10 @@ class PublisherRegistry:
                 self._queries.answer(key_expr, _weakly(self._last_messages, address.vehicle))
         return publisher
 
+    def is_published(self, address: Address) -> bool:
+        """Return whether this address has a publisher here."""
+        return address in self._publishers
+
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
         """Publish why a message of this address was rejected; what JSON cannot hold is written as text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)

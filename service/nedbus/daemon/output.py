@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -71,6 +71,18 @@ class SourceOutput:
     def warnings(self) -> tuple[str, ...]:
         """Why something was rejected, once for each place that it came from."""
         return tuple(self._warnings.values())
+
+    def claim_all(self, addresses: Collection[Address], *, lossless: bool) -> None:
+        """Make sure that all of these have a publisher, or none: two sources must not keep each other from starting.
+
+        Raises AddressInUseError if another source of ours has one of them.
+        """
+        own = set(self.addresses)
+        for address in addresses:
+            if address not in own and self._registry.is_published(address):
+                raise AddressInUseError(address)
+        for address in addresses:
+            self.claim(address, lossless=lossless)
 
     def claim(self, address: Address, *, lossless: bool = False) -> None:
         """Make sure that an address has a publisher; raise AddressInUseError if another source of ours has it."""

@@ -137,8 +137,7 @@ class Worker:
         if source.wait and first:
             self._wait_for_reader(run)
         self._output.release(keep=run.addresses)
-        for address in run.addresses:
-            self._output.claim(address, lossless=source.speed is None)
+        self._output.claim_all(run.addresses, lossless=source.speed is None)
         self._set_state("running")
         replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
         self._error = run.damage
