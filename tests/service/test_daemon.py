@@ -408,7 +408,19 @@ def test_service_says_what_made_it_a_client(run_nedbus: Start, endpoint: str, tm
     wait_for(lambda: f"client of {endpoint}\n" in by_flag.err, what="the flag")
     here = free_endpoint()
     router = run_nedbus("serve", "-s", "sim:?vehicle=4", "--listen", here, NEDBUS_CONNECT=endpoint)
-    wait_for(lambda: f"router on {here}, joined to {endpoint}" in router.err, what="the router")
+    wait_for(lambda: f"router on {here}, joining {endpoint}" in router.err, what="the router")
+
+
+def test_links_to_other_routers_are_said(run_nedbus: Start) -> None:
+    """A router that joins another says when the link is up, that it does not come up, and that it is lost."""
+    near, far = free_endpoint(), free_endpoint()
+    service = run_nedbus("serve", "-s", "sim:", "--listen", near, "--connect", far)
+    wait_for(lambda: f"no link to {far}: still trying" in service.err, what="the warning")
+    assert "joined" not in service.err
+    router = run_nedbus("router", "--listen", far)
+    wait_for(lambda: f"joined {far}" in service.err, what="the link")
+    router.kill()
+    wait_for(lambda: f"the link to {far} is lost" in service.err, what="the loss")
 
 
 def test_signal_ends_a_service_that_waits_for_its_router(run_nedbus: Start) -> None:

@@ -185,6 +185,34 @@ def test_commands_use_certificates(secure: str, pki: Path, run_nedbus: Start) ->
     assert "sim:" in info.out
 
 
+def test_service_as_a_router_joins_with_its_certificate(secure: str, pki: Path, join: Join, run_nedbus: Start) -> None:
+    """The embedded router of a vehicle shows its certificate to the router that it joins, as a client does."""
+    files = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/vehicle-1.crt", f"--tls-key={pki}/vehicle-1.key"]
+    near = free_endpoint()
+    service = run_nedbus("serve", "--listen", near, "--connect", secure, *files, "-s", "sim:")
+    wait_for(lambda: f"joined {secure}" in service.err, what=f"the link: {service.err}")
+    wait_for(join("reader").latest, what="the vehicle behind its router")
+    swapped = run_nedbus("serve", "--listen", free_endpoint(), "--connect", secure, "--tls-ca", "no.crt", "-s", "sim:")
+    assert swapped.wait() == 2
+    assert "no.crt cannot be read" in swapped.err
+
+
+def test_health_of_a_vehicle_is_what_readers_get(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """A service that may not write its vehicle says that it publishes; a reader gets nothing, and health says so."""
+    files = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/vehicle-1.crt", f"--tls-key={pki}/vehicle-1.key"]
+    reader = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/reader.crt", f"--tls-key={pki}/reader.key"]
+    run_nedbus("serve", "--connect", secure, *files, "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
+
+    def health(vehicle: str) -> tuple[int, str]:
+        process = run_nedbus("health", "-c", secure, "-v", vehicle, *reader)
+        return process.wait(), process.err
+
+    wait_for(lambda: health("1")[0] == 0, what="the vehicle that it may write")
+    code, reason = health("2")
+    assert code == 1
+    assert "vehicle 2 is not published, though its service reports that it is" in reason
+
+
 def test_pki_commands_never_overwrite(tmp_path: Path, run_nedbus: Start) -> None:
     """Keys are made once, for their owner only, and never shown."""
     folder = tmp_path / "pki"

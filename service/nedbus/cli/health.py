@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from dataclasses import asdict, dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -17,13 +17,18 @@ from .format import to_age, to_text
 from .options import JsonOption, on_bus, write
 from .status import sources_of, streams_of
 
+_DENIED: Final = (
+    ", though its service reports that it is: does the router let that service write this vehicle, and this client"
+    " read? (docs/security.md)"
+)
+
 
 @on_bus
 def health(
     bus: Bus,
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, whoever publishes it")
+        str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, whoever publishes it, by an answer")
     ] = None,
     services: Annotated[
         int | None, typer.Option("--services", metavar="N", min=1, help="Expect N services, on all hosts together")
@@ -35,7 +40,8 @@ def health(
 ) -> None:
     """Exit 0 when all is well: services answer, all their sources work, and messages flow; else 1 with the reason.
 
-    Without --vehicle and --services it judges the services of this host.
+    Without --vehicle and --services it judges the services of this host, by what they report of themselves.
+    With --vehicle that vehicle must answer, as it does to any reader.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -70,11 +76,13 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
     found = [each for each in bus.services() if anywhere or each.get("host") == host]
     sources = [source for service in found for source in sources_of(service)]
     ages = _ages(sources)
-    if vehicle is not None and vehicle not in ages:
-        latencies = [sample.latency for sample in bus.latest(ANY, vehicle=vehicle)]
-        ages |= {vehicle: max(0.0, min(known))} if (known := [each for each in latencies if each is not None]) else {}
+    denied = ""
     if vehicle is not None:
-        ages = {name: age for name, age in ages.items() if name == vehicle}
+        # A status says what a service publishes, and not what a router lets through.
+        answers = [sample.latency for sample in bus.latest(ANY, vehicle=vehicle) if not sample.stored]
+        denied = _DENIED if vehicle in ages and not answers else ""
+        known = [ages[vehicle]] if vehicle in ages else [max(0.0, each) for each in answers if each is not None]
+        ages = {vehicle: min(known)} if answers and known else {}
     report = _Report(None, len(found), len(sources), ages)
     at = " or ".join(bus.routers)
     failed = [source for source in sources if source.get("state") in {"retrying", "failed"}]
@@ -90,7 +98,7 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
     elif not ages:
         states = ", ".join(f"{to_text(each.get('source'), 60)} is {to_text(each.get('state'), 20)}" for each in sources)
         what = "no vehicle is published" if vehicle is None else f"vehicle {vehicle} is not published"
-        report.reason = f"{what}{f': {states[:300]}' if states else ''}"
+        report.reason = f"{what}{denied or (f': {states[:300]}' if states else '')}"
     elif min(ages.values()) > max_age:
         name = min(ages, key=lambda each: ages[each])
         report.reason = f"the newest message is {to_age(ages[name])} old, from vehicle {name}: at most {max_age:g} s"

@@ -13,7 +13,7 @@ from nedbus import __version__
 from nedbus.daemon import Daemon
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import DEFAULT_ENDPOINT, open_router, router_endpoints
+from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, open_router, router_endpoints
 
 from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
 from .progress import Display
@@ -85,19 +85,26 @@ def router(
     connect: Annotated[
         list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Another router to join")
     ] = None,
+    tls_ca: TlsCaOption = None,
+    tls_certificate: TlsCertificateOption = None,
+    tls_key: TlsKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
     """Run a Zenoh router, without sources, that services and scripts connect to.
 
     Endpoints that are given replace those of the file, as the flags of zenohd do.
     """
-    endpoints = load_settings(config, listen=listen).listen
+    settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
+    endpoints, routers = settings.listen, tuple(connect or ())
+    tls = settings.tls if routers else None
 
     def run(stop: threading.Event) -> None:
-        session = open_router(listen=endpoints, connect=tuple(connect or ()), config_file=config_file)
-        joined = f", joined to {', '.join(connect)}" if connect else ""
-        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joined)
-        stop.wait()
+        session = open_router(listen=endpoints, connect=routers, config_file=config_file, tls=tls)
+        joining = f", joining {', '.join(routers)}" if routers else ""
+        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joining)
+        uplinks = Uplinks(session, routers, tls=tls)
+        while not stop.wait(UPLINK_POLL if routers else None):
+            uplinks.check()
         session.close()
 
     run_until_stopped(run)

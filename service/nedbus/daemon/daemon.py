@@ -15,7 +15,7 @@ from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, Sample
 from nedbus.errors import ConfigError, ConnectError
 from nedbus.settings import Settings
 from nedbus.sources import LiveSource, Source, parse_source
-from nedbus.transport import Session, dial_endpoint, open_client, open_router
+from nedbus.transport import UPLINK_POLL, Session, Uplinks, dial_endpoint, open_client, open_router
 from nedbus_msgs import decode, provenance_of, status_key
 
 from .clock import SystemClock
@@ -106,7 +106,7 @@ class Daemon:
             return True
         if self.role == "router":
             self._log_router()
-        queries = QueryServer(session)
+        settings, queries = self._settings, QueryServer(session)
         registry = self._registry = PublisherRegistry(session, queries, prefix=self._settings.prefix)
         threads: list[threading.Thread] = []
         try:
@@ -121,7 +121,7 @@ class Daemon:
             for thread in threads:
                 thread.start()
             self.ready.set()
-            self._wait(registry)
+            self._wait(registry, Uplinks(session, settings.connect, tls=settings.tls) if router else None)
         finally:
             self._stop.set()
             deadline = time.monotonic() + _GRACE
@@ -145,14 +145,19 @@ class Daemon:
 
     def _log_router(self) -> None:
         connect = self._settings.connect
-        joined = f", joined to {', '.join(connect)}" if connect else ""
-        _log.info("router on %s%s", ", ".join(self.endpoints), joined)
+        joining = f", joining {', '.join(connect)}" if connect else ""
+        _log.info("router on %s%s", ", ".join(self.endpoints), joining)
 
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router for as long as it takes."""
         if self.role == "router":
             settings = self._settings
-            return open_router(listen=settings.listen, connect=settings.connect, config_file=settings.router_config)
+            return open_router(
+                listen=settings.listen,
+                connect=settings.connect,
+                config_file=settings.router_config,
+                tls=settings.tls if settings.connect else None,
+            )
         logged = False
         while not self._stop.is_set():
             try:
@@ -163,8 +168,9 @@ class Daemon:
                 logged = True
         return None
 
-    def _wait(self, registry: PublisherRegistry) -> None:
+    def _wait(self, registry: PublisherRegistry, uplinks: Uplinks | None) -> None:
         """Wait for `stop`, or for the end of all finite sources and for their readers to have all of it."""
+        watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if _is_finite(worker.source)]
@@ -173,8 +179,10 @@ class Daemon:
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
-            self._changed.wait()
+            self._changed.wait(UPLINK_POLL if watches else None)
             self._changed.clear()
+            if uplinks is not None:
+                uplinks.check()
 
 
 def _is_finite(source: Source) -> bool:

@@ -22,6 +22,7 @@ from .rmw_zenoh import (
 from .router import open_router, router_endpoints
 from .session import RawSample, Session, is_forked, open_client, require_unforked, translate_error, while_open
 from .tls import Tls
+from .uplink import UPLINK_POLL, Uplinks
 
 if TYPE_CHECKING:
     from .pki import CA_DAYS, DAYS, make_authority, make_certificate
@@ -37,12 +38,14 @@ __all__ = [
     "DEFAULT_ENDPOINT",
     "MAX_ANSWERS",
     "NO_HASH",
+    "UPLINK_POLL",
     "Attachment",
     "PublisherToken",
     "RawSample",
     "Session",
     "Tls",
     "TopicKey",
+    "Uplinks",
     "alive_keys",
     "ask_alive_keys",
     "ask_all",

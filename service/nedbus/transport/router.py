@@ -15,19 +15,27 @@ from nedbus.errors import ConfigError, ListenError
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings, open_session
+from .tls import Tls
 
 _log = logging.getLogger(__name__)
 
 
-def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), config_file: Path | None = None) -> Session:
+def open_router(
+    *,
+    listen: Sequence[str] = (),
+    connect: Sequence[str] = (),
+    config_file: Path | None = None,
+    tls: Tls | None = None,
+) -> Session:
     """Open a session that is itself a router, by default on loopback, or as a JSON5 file for `zenohd` configures it.
 
     Endpoints that are given replace those of the file, as the flags of `zenohd` do.
+    `tls` is for the `tls/` routers that it joins, unless the file has a TLS section of its own.
 
     Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
 
-    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, or a plugin that the file
-    requires.
+    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, a TLS file that cannot be
+    read, or a plugin that the file requires.
     """
     check_endpoints(listen, where="listen")
     check_endpoints(connect, where="connect")
@@ -51,6 +59,9 @@ def open_router(*, listen: Sequence[str] = (), connect: Sequence[str] = (), conf
         if plugins:
             _log.warning("%s: without %s: this router loads no plugins, as zenohd does", config_file, _names(plugins))
         insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
+    if tls is not None and not json.loads(config.get_json("transport/link/tls")).get("root_ca_certificate"):
+        files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
+        insert_settings(config, files, where="tls")
     try:
         return open_session(config)
     except zenoh.ZError as exc:
