@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 import nedbus
 from nedbus_msgs import ANY
-from tests.conftest import Process, Start, wait_for
+from tests.conftest import Process, Start, free_endpoint, message, wait_for
 from tests.replays import convert_replay
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -23,6 +23,7 @@ PRINTS = {
     "batches.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",
     "health.py": "1/vehicle_local_position: ",
+    "alarm.py": "vehicle 1: good",
 }
 
 
@@ -68,6 +69,41 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
     assert second.timestamp > first.timestamp
     assert (first.x, first.y) != (second.x, second.y)
     assert process.popen.poll() is None
+
+
+def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
+    """examples/alarm.py: the service, which is the router too, is killed and started again; alarm, then good again."""
+    endpoint = free_endpoint()
+    states = ["vehicle 1: good", "vehicle 1: ALARM: nothing arrived for 1 s", "vehicle 1: good"]
+
+    def serve() -> Process:
+        service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", measured=False)
+        wait_for(lambda: "router on" in service.err, what="the router")
+        return service
+
+    service = serve()
+    alarm = run_example(start, "alarm.py", endpoint, tmp_path)
+    wait_for(lambda: alarm.out.splitlines()[-1:] == states[:1], what="the first message")
+    service.kill()
+    wait_for(lambda: alarm.out.splitlines()[-2:] == states[:2], what="the alarm")
+    serve()
+    wait_for(lambda: alarm.out.splitlines()[-3:] == states, what="the end of the alarm")
+    alarm.signal(signal.SIGINT)
+    assert alarm.wait() == 0
+
+
+def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
+    """examples/alarm.py: xy_valid goes false and true again, and each is said once."""
+    alarm = run_example(start, "alarm.py", endpoint, tmp_path)
+    publisher = bus.publisher("vehicle_local_position", vehicle="1")
+
+    def is_said(text: str, *, valid: bool) -> bool:
+        publisher.publish(message(1, x=0.0, y=0.0, xy_valid=valid))
+        return alarm.out.rstrip().endswith(text)
+
+    for text, valid in (("good", True), ("ALARM: xy_valid is false", False), ("good", True)):
+        wait_for(lambda text=text, valid=valid: is_said(text, valid=valid), what=text)  # type: ignore[misc]
+    assert alarm.out.count("xy_valid is false") == 1
 
 
 def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from matplotlib.image import imread
 import nedbus
 from nedbus.errors import AddressError, ConfigError, OutputError, SourceError
 from nedbus.recording import RecordingWriter, draw
-from nedbus_msgs import FIELD_TYPES, Address, Provenance, VehicleLocalPosition, upgrade
+from nedbus_msgs import FIELD_TYPES, Address, MapProjection, Provenance, VehicleLocalPosition, upgrade
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.conftest import LOGS, Start, message
 from tests.replays import convert_replay, open_replay
@@ -89,12 +89,36 @@ def test_invalid_messages_are_left_out(tmp_path: Path, caplog: pytest.LogCapture
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     """A selection that matches several streams or none is an error that names the available ones."""
-    with pytest.raises(AddressError, match="name vehicle and instance too"):
+    with pytest.raises(
+        AddressError, match=r"^instance None is not valid: .*several match: name instance too, of 1/est"
+    ):
         nedbus.read(flight, "estimator_local_position")
-    with pytest.raises(AddressError, match=f"which has 1/estimator_local_position/0, .*1/{VLP}"):
+    has = f"which has 1/estimator_local_position/0, .*1/{VLP}"
+    with pytest.raises(AddressError, match=f"^vehicle '2' is not valid: expected one that is in {flight}, {has}"):
         nedbus.read(flight, vehicle="2")
+    with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one of est.* in {flight}, {has}"):
+        nedbus.read(flight, "estimator_local_position", instance=5)
     with pytest.raises(SourceError, match="no such file"):
         nedbus.read(tmp_path / "none.ulg")
+
+
+def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
+    """What several streams differ in is what has to be named; a topic that only another vehicle has is to blame."""
+    path = tmp_path / "a.mcap"
+    addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 14)]
+    addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
+    with RecordingWriter(path) as writer:
+        rows = to_array([message(1)] * len(addresses))
+        writer.write(rows, ((address, Provenance()) for address in addresses), logged=repeat(1), published=repeat(1))
+    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: .*name vehicle too, of 1/.* and 3 more$"):
+        nedbus.read(path)
+    with pytest.raises(AddressError, match="name topic and vehicle and instance too"):
+        nedbus.read(path, "*")
+    truth = f"{VLP}_groundtruth"
+    with pytest.raises(AddressError, match=f"topic '{truth}' is not valid: expected one that is in .* has 1/.* more$"):
+        nedbus.read(path, truth)
+    with pytest.raises(AddressError, match=f"topic '{VLP}' is not valid: expected one of vehicle 99 that is in"):
+        nedbus.read(path, vehicle="99")
 
 
 def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
@@ -307,7 +331,8 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     assert len(names) > 15
     assert names <= set(nedbus.__all__)
     log = UlogWriter(layout="1.13")
-    log.define(["estimator_local_position"])
+    log.define(["estimator_local_position", VLP])
+    log.add(VLP, message(1, x=2.5))
     log.add("estimator_local_position", message(1), instance=1)
     log.write(flight.with_suffix(".ulg"))
     monkeypatch.chdir(flight.parent)
@@ -315,6 +340,36 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     for block in re.findall(r"```python\n(.*?)```", recordings, re.DOTALL):
         exec(block, scope)  # noqa: S102 - our own page
     assert isinstance(scope["frame"], pd.DataFrame)
+    assert pd.read_csv(flight.with_name("flight.csv"))["x"].tolist() == [2.5]
+    assert 0.0 < float(str(scope["rms"])) < 30.0
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, sampled: bool) -> None:
+    """The script of the page finds 5 m, whatever the delay, the rates, and the origins of the two topics."""
+    origin = MapProjection(47.0, 8.0)
+    latitude, longitude = origin.reproject(100.0, -50.0)
+    streams: dict[str, list[VehicleLocalPosition]] = {VLP: [], f"{VLP}_groundtruth": []}
+    common = {"xy_valid": True, "z_valid": True, "xy_global": True, "z_global": True, "ref_alt": 400.0, "z": 0.0}
+    for time in range(1_000_000, 9_000_000, 10_000):
+        north, east = time / 1e5, -time / 2e5
+        if time % 20_000 == 0 and time < 8_000_000:
+            stamps = {"timestamp": time + 3000 * sampled, "timestamp_sample": time * sampled}
+            there = {"x": north - 100.0, "y": east + 50.0, "ref_lat": latitude, "ref_lon": longitude}
+            streams[f"{VLP}_groundtruth"].append(VehicleLocalPosition.model_validate(common | stamps | there))
+        stamps = {"timestamp": time + 40_000, "timestamp_sample": time}
+        here = {"x": north + 3.0, "y": east - 4.0, "ref_lat": 47.0, "ref_lon": 8.0}
+        streams[VLP].append(VehicleLocalPosition.model_validate(common | stamps | here))
+    with RecordingWriter(tmp_path / "flight.mcap") as writer:
+        for topic, messages in streams.items():
+            addresses = repeat((Address("1", topic), Provenance()))
+            writer.write(to_array(messages), addresses, logged=repeat(1), published=repeat(1))
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
+    [recipe] = [block for block in blocks if "rms" in block]
+    scope: dict[str, object] = {"nedbus": nedbus}
+    exec(recipe, scope)  # noqa: S102 - our own page
+    assert scope["rms"] == pytest.approx(5.0, abs=0.01)
 
 
 def test_unknown_frame_is_refused(flight: Path) -> None:
@@ -327,7 +382,7 @@ def test_plot_that_cannot_be_written_is_an_error(run_nedbus: Start, flight: Path
     """A vehicle that is not in the file is exit code 2, a folder that does not exist is exit code 1."""
     plot = run_nedbus("plot", str(flight), "-v", "9")
     assert plot.wait() == 2
-    assert "expected one of 1/estimator_local_position/0" in plot.err
+    assert f"vehicle '9' is not valid: expected one that is in {flight}, which has 1/estimator_local_pos" in plot.err
     for name in ("a.foo", "/dev/full"):
         plot = run_nedbus("plot", str(flight), "-o", name)
         assert plot.wait(60) == 2

@@ -36,6 +36,7 @@ from nedbus_msgs import (
 from nedbus_msgs.arrays import to_array
 from tests.conftest import DEADLINE, LOGS, Start, message, wait_for, wait_for_reader
 from tests.replays import convert_replay, open_replay
+from tests.ulogs import write_log
 
 VLP = "vehicle_local_position"
 ADDRESS = Address("7", VLP)
@@ -356,6 +357,46 @@ def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.B
     found = read_independently(path)
     assert {topic for topic, *_ in found} == {f"/1/{VLP}"}
     assert f"{len(found)} messages" in recorder.err
+
+
+@pytest.mark.parametrize("ended", ["by its duration", "by Ctrl-C"])
+def test_recording_of_nothing_is_said(run_nedbus: Start, endpoint: str, tmp_path: Path, ended: str) -> None:
+    """A vehicle that is not there: stderr says after 2 s that nothing came, and at the end that no file is left."""
+    path = tmp_path / "a.mcap"
+    duration = ["-d", "3"] if ended == "by its duration" else []
+    recorder = run_nedbus("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration, measured=False)
+    wait_for(lambda: "nothing on nedbus/9/** yet, waiting; 'nedbus list' shows" in recorder.err, what="the notice")
+    assert path.exists()
+    if not duration:
+        recorder.signal(signal.SIGINT)
+    assert recorder.wait() == 1
+    assert recorder.err.count("yet, waiting") == 1
+    assert f"{path}: 0 messages: the empty file is removed" in recorder.err
+    assert "nothing arrived on nedbus/9/** within" in recorder.err
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["convert", "a.ulg", "x.csv"], '; for a table: nedbus.read("a.ulg", frame="pandas").to_csv("x.csv")'),
+        (["convert", "a.ulg", "b.png"], "; for a picture: nedbus plot a.ulg -o b.png"),
+        (["convert", "a.ulg", "b"], ""),
+        (["record", "-o", "a.txt"], ""),
+        (["record", "-o", "a.csv"], '; for a table: nedbus.read("flight.mcap", frame="pandas").to_csv("a.csv")'),
+    ],
+)
+def test_other_suffix_is_refused(
+    run_nedbus: Start, endpoint: str, tmp_path: Path, arguments: list[str], hint: str
+) -> None:
+    """MCAP is written under no other name: exit code 2, one line, and no file."""
+    log = str(write_log(tmp_path / "a.ulg", [1, 2]))
+    connect = ["-c", endpoint] if arguments[0] == "record" else []
+    process = run_nedbus(*(each.replace("a.ulg", log) for each in arguments), *connect)
+    assert process.wait() == 2, process.err
+    expected = f"{arguments[-1]}: expected a recording: a file that ends with .mcap{hint.replace('a.ulg', log)}\n"
+    assert expected in process.err
+    assert {each.name for each in tmp_path.rglob("*") if each.is_file()} == {"a.ulg", "stdout", "stderr"}
 
 
 @pytest.fixture

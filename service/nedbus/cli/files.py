@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from nedbus import recording
 from nedbus.client import Bus
-from nedbus.errors import AddressError, ConfigError, SourceError
+from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.sources import LiveSource, parse_source, source_text_of_file
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection
 
@@ -30,6 +32,8 @@ from .options import (
     write_stderr,
 )
 from .run import run_until_signal
+
+_NOTICE: Final = 2.0  # s without a message after which stderr says so
 
 FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
 OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")]
@@ -50,6 +54,7 @@ def record(
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
     open_recorder = recording.Recorder
     stop = threading.Event()
+    notice = time.monotonic() + _NOTICE
     with bus.subscribe_to(selection, mode="every") as subscription:
         recorder = open_recorder(subscription, output)
 
@@ -57,8 +62,19 @@ def record(
             recorder.run(stop, duration=duration)
             return True
 
-        with _progress() as show:
-            run_until_signal(run, stop.set, on_tick=lambda: show(recorder.status, None, None))
+        def tick() -> None:
+            nonlocal notice
+            show(recorder.status, None, None)
+            if not recorder.messages and time.monotonic() > notice:
+                notice = math.inf
+                write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")
+
+        try:
+            with _progress() as show:
+                run_until_signal(run, stop.set, on_tick=tick)
+        except NoDataError:
+            write_stderr(f"{output}: {recorder.status}: the empty file is removed")
+            raise
     write_stderr(f"{output}: {recorder.status}")
 
 
@@ -82,6 +98,7 @@ def convert(
             run.messages,
             output,
             source=spec.kind,
+            flight=str(source),
             on_progress=lambda done: show(f"{output}", done, run.total),
         )
     write_stderr(f"{output}: {report}")
@@ -104,9 +121,7 @@ def plot(
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
     with recording.Flight(source) as flight:
-        selected = [address for address in flight.addresses if selection.matches(address)]
-        if not selected:
-            raise AddressError("topic", topic, f"one of {', '.join(map(str, flight.addresses))}")
+        selected = recording.matching(source, flight.addresses, selection)
         if len(selected) > limit:
             hint = f"of which the first {limit} are drawn: choose with -v, -t, -i"
             write_stderr(f"{source}: {len(selected)} streams, {hint}")

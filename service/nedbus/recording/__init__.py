@@ -11,6 +11,7 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .arrays import Flight, addresses_of, missing_of, read
+    from .choice import matching
     from .conversion import convert
     from .formats import SUFFIXES, format_of
     from .plot import MAX_STREAMS, draw
@@ -37,6 +38,7 @@ else:
             "convert": ("mcap", "conversion"),
             "draw": ("plot", "plot"),
             "format_of": ("", "formats"),
+            "matching": ("", "choice"),
             "missing_of": ("", "arrays"),
             "read": ("", "arrays"),
             "read_ulog": ("", "ulog"),
@@ -58,6 +60,7 @@ __all__ = [
     "convert",
     "draw",
     "format_of",
+    "matching",
     "missing_of",
     "read",
     "read_ulog",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus.errors import AddressError, ConfigError, DecodeError, SourceError
+from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.extras import needs
 from nedbus_msgs import (
     ANY,
@@ -29,6 +29,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import DTYPE, MessageArray, decode_cdr_array, to_array, valid_mask
 
+from .choice import the_one
 from .formats import SUFFIXES
 from .ulog import UlogTopics, read_ulog
 
@@ -84,7 +85,7 @@ def read(
     path = Path(path).expanduser()
     selection = Selection(topic, vehicle, instance)
     with Flight(path) as flight:
-        messages, absent = flight.read(_choose(path, flight.addresses, selection))
+        messages, absent = flight.read(the_one(path, flight.addresses, selection))
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning)
     return messages if frame is None else _frame(messages, absent, frame)
@@ -197,17 +198,6 @@ def _decode(chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, npt.NDArray
         array[rows] = to_array(list(decoded.values()))
         valid[rows] = True
     return array, valid
-
-
-def _choose(path: Path, addresses: Iterable[Address], selection: Selection) -> Address:
-    """Return the only address that matches."""
-    available = sorted(addresses)
-    matching = [address for address in available if selection.matches(address)]
-    if len(matching) != 1:
-        choice = ", ".join(map(str, (matching or available)[:10]))
-        reason = f"one stream of {path}, which has {choice}: name vehicle and instance too"
-        raise AddressError("topic", selection.topic, reason)
-    return matching[0]
 
 
 def _frame(messages: MessageArray, absent: Absent, frame: str) -> Any:

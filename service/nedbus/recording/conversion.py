@@ -14,6 +14,7 @@ from nedbus.whole_file import whole_file
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition, describe, upgrade
 from nedbus_msgs.arrays import to_array
 
+from .formats import check_recording
 from .writer import RecordingWriter
 
 _log = logging.getLogger(__name__)
@@ -39,15 +40,22 @@ class ConvertibleMessage(Protocol):
 
 
 def convert(
-    messages: Iterable[ConvertibleMessage], path: Path, *, source: str, on_progress: Callable[[int], object]
+    messages: Iterable[ConvertibleMessage],
+    path: Path,
+    *,
+    source: str,
+    on_progress: Callable[[int], object],
+    flight: str = "flight.ulg",
 ) -> str:
     """Write messages to a new MCAP file and return a summary; without success there is no file.
 
     A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
-    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far.
+    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far,
+    and `flight` is the file that the hint of an error names.
 
-    Raises OutputError when the file exists already or cannot be written.
+    Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
     """
+    check_recording(path, flight=flight)
     try:
         with whole_file(path) as part:
             return _write(messages, part, source=source, on_progress=on_progress)

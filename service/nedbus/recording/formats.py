@@ -20,6 +20,20 @@ def format_of(path: str | PurePath) -> str:
     return found
 
 
+def check_recording(path: Path, *, flight: str) -> None:
+    """Raise ConfigError for a recording that is to be written under a name of something else.
+
+    `flight` is the file to read instead, for who wants a table or a picture.
+    """
+    if SUFFIXES.get(path.suffix) == "mcap":
+        return
+    hints = {
+        ".csv": f'; for a table: nedbus.read("{flight}", frame="pandas").to_csv("{path.name}")',
+        **dict.fromkeys((".png", ".svg", ".pdf"), f"; for a picture: nedbus plot {flight} -o {path.name}"),
+    }
+    raise ConfigError(str(path), f"expected a recording: a file that ends with .mcap{hints.get(path.suffix, '')}")
+
+
 def open_flight(path: Path) -> BinaryIO:
     """Open a file for reading; raise SourceError when that fails, and for what is no file: a flight is read twice."""
     try:

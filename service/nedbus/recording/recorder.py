@@ -11,6 +11,7 @@ from typing import Final
 from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
 
+from .formats import check_recording
 from .writer import RecordingWriter
 
 _FLUSH_INTERVAL: Final = 1.0  # s: what a power cut costs at most
@@ -20,12 +21,18 @@ _POLL_INTERVAL: Final = 0.2  # s between two checks of whether to stop
 class Recorder:
     """Write every message of a subscription of mode "every" to a new MCAP file.
 
-    Raises OutputError when the file exists already or cannot be written.
+    Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
     """
 
     def __init__(self, subscription: Subscription, path: Path) -> None:
+        check_recording(path, flight="flight.mcap")
         self._subscription = subscription
         self._writer = RecordingWriter(path)
+
+    @property
+    def messages(self) -> int:
+        """The number of messages that were recorded so far."""
+        return self._writer.messages
 
     @property
     def status(self) -> str:
@@ -37,8 +44,11 @@ class Recorder:
         return f"{self._writer.messages} messages" + (f", {trouble}" if trouble else "")
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
-        """Record until `stop` is set, for `duration` seconds, or until the subscription is closed."""
-        now = time.monotonic()
+        """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.
+
+        Raises NoDataError when there was no message: then there is no file.
+        """
+        start = now = time.monotonic()
         end = float("inf") if duration is None else now + duration
         next_flush = now + _FLUSH_INTERVAL
         with self._writer:
@@ -48,11 +58,14 @@ class Recorder:
                 except NoDataError:
                     pass
                 except ClosedError:
-                    return
+                    break
                 now = time.monotonic()
                 if now >= next_flush:
                     self._writer.flush()
                     next_flush = now + _FLUSH_INTERVAL
+        if not self.messages:
+            self._writer.path.unlink(missing_ok=True)
+            raise NoDataError(self._subscription.name, time.monotonic() - start)
 
     def _write(self, batch: Batch) -> None:
         received = batch.received
