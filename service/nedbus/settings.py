@@ -28,6 +28,7 @@ from .transport import Tls, check_endpoints, dial_endpoint, router_endpoints
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE = Path("nedbus.toml")
+_BEGUN = len("NEDBUS_TLS")  # characters of a variable from which on it is taken for the beginning of a setting
 
 
 def _split_sources(value: object) -> object:
@@ -157,8 +158,9 @@ def _warn_of_misspelt_variables() -> None:
     """Warn of environment variables that look like a setting, and are none."""
     known = {f"NEDBUS_{name.upper()}" for name in (*Settings.model_fields, "config")}
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
-        if near := difflib.get_close_matches(variable, known, 1, 0.85):
-            _log.warning("%s is not a setting: did you mean %s?", variable, near[0])
+        begun = sorted(each for each in known if each.startswith(variable) and len(variable) >= _BEGUN)
+        if near := begun or difflib.get_close_matches(variable, known, 1, 0.85):
+            _log.warning("%s is not a setting: did you mean %s?", variable, " or ".join(near))
 
 
 def _with_file(content: Mapping[str, object]) -> type[Settings]:

@@ -13,12 +13,22 @@ from pathlib import Path
 
 import pytest
 
+from nedbus.cli.progress import what_to_type
+from nedbus.transport import DEFAULT_ENDPOINT
 from tests.conftest import DEADLINE, free_endpoint, wait_for
 from tests.ulogs import write_log
 
-pytestmark = pytest.mark.process
+
+def test_hint_needs_no_flag_that_it_lacks() -> None:
+    """What can be pasted needs no certificate; where one is needed, that is said in one line."""
+    assert " list  what" in what_to_type([DEFAULT_ENDPOINT])
+    assert " hz -c tcp/b:1 " in what_to_type(["tls/a:1", "tcp/b:1"])
+    for endpoint in ("tls/a:1", "quic/a:1"):
+        hint = f"Readers at {endpoint} need a certificate of their own: docs/security.md"
+        assert what_to_type([endpoint]) == hint
 
 
+@pytest.mark.process
 def test_terminal_shows_progress_and_what_to_type(tmp_path: Path) -> None:
     """A bar for each source with its state and numbers, what went wrong, and the next commands with their endpoint."""
     path = write_log(tmp_path / "flight.ulg", range(0, 2_000_000, 10_000))

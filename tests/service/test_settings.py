@@ -119,6 +119,23 @@ def test_misspelt_variable_is_reported(monkeypatch: pytest.MonkeyPatch, caplog: 
 
 
 @pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("NEDBUS_TLS_CERT", "NEDBUS_TLS_CERTIFICATE"),
+        ("NEDBUS_TLS_K", "NEDBUS_TLS_KEY"),
+        ("NEDBUS_TLS", "NEDBUS_TLS_CA or NEDBUS_TLS_CERTIFICATE or NEDBUS_TLS_KEY"),
+    ],
+)
+def test_beginning_of_a_variable_is_completed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str, meant: str
+) -> None:
+    """What begins as a setting is more like it than one that differs in fewer letters."""
+    monkeypatch.setenv(name, "x")
+    load_settings()
+    assert [record.getMessage() for record in caplog.records] == [f"{name} is not a setting: did you mean {meant}?"]
+
+
+@pytest.mark.parametrize(
     ("text", "sources"),
     [
         ("sim:", ["sim:"]),

@@ -18,10 +18,10 @@ from functools import partial
 import pytest
 
 import nedbus
-from nedbus.cli.format import printable, to_text
+from nedbus.cli.format import printable, to_line, to_text
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
-from nedbus_msgs import DEFAULT_TOPIC
+from nedbus_msgs import DEFAULT_TOPIC, TOPICS
 from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
 
 VLP = DEFAULT_TOPIC
@@ -63,7 +63,93 @@ def test_table_fits(width: int) -> None:
     shown = "".join("".join(lines).split())
     assert shown.count("vehicle") == 2
     assert {word in shown for word in ("stale:", "nothing", "invalid", "reckoning")} == {True}
-    assert ("JITTER" in lines[0]) == (width >= 80)
+    assert ("JITTER" in lines[0]) == (width >= 110)
+
+
+@pytest.mark.parametrize("width", [30, 40, 64, 80])
+def test_names_are_not_broken_inside_words(width: int) -> None:
+    """A name is whole while there are columns to leave out; then it is folded after slashes, then after underscores."""
+    optional = ("JITTER", "MAX", "LATENCY", "LOST")
+    lines = to_table(HEAD, ROWS, width=width, optional=optional).splitlines()
+    names = [line.split()[0] for line in lines if not line.startswith(" ")]
+    assert (ROWS[0][0] in names) == (width >= 60)
+    assert all(re.search(r"[/_]$|groundtruth$|position$|^VEHICLE|^TOPIC$", name) for name in names)
+    remark = "/a/rather/long/path/to/some/flight_of_today.ulg: no such file or directory"
+    folded = to_table(("SOURCE", "REMARK"), [("sim:", remark)], width=24)
+    assert [line[8:] for line in folded.splitlines()[1:]] == [
+        "/a/rather/long/",
+        "path/to/some/",
+        "flight_of_today.",
+        "ulg: no such",
+        "file or",
+        "directory",
+    ]
+    long = f"{'v' * 64}/vehicle_local_position"
+    lines = to_table(HEAD, [(long, *ROWS[0][1:])], width=80, optional=optional).splitlines()
+    assert [line.split()[0] for line in lines[1:]] == ["v" * 64 + "/", "vehicle_local_position"]
+    assert all(len(line) <= 80 for line in lines)
+
+
+# Lines
+
+
+def sample(address: nedbus.Address) -> nedbus.Sample:
+    position = {"x": -1234.5678, "y": 2.0, "z": -3.0, "vx": -1.0, "heading": 1.5, "eph": 0.5, "xy_valid": True}
+    return nedbus.Sample(message(99_999_123_456, **position), address, 0, lost=3)
+
+
+def test_line_leaves_out_columns_in_order() -> None:
+    """Narrower and narrower: eph goes first, then heading, then velocity; position, doubts and loss never."""
+    one = sample(nedbus.Address("1", VLP))
+    complete = to_line(one)
+    assert to_line(one, width=len(complete)) == complete
+    seen: list[list[str]] = []
+    for width in range(len(complete) - 1, 83, -1):
+        line = to_line(one, width=width)
+        assert len(line) <= width
+        assert all(text in line for text in ("1/veh", "-1234.57", "  z vxy vz invalid", "[3 lost]"))
+        columns = [name for name in (" v ", " hdg ", " eph ") if name in line]
+        if not seen or seen[-1] != columns:
+            seen.append(columns)
+    assert seen == [[" v ", " hdg ", " eph "], [" v ", " hdg "], [" v "], []]
+
+
+def test_short_addresses_remain_different() -> None:
+    """The four topics of a vehicle are told apart where only a part of their names has room."""
+    addresses = [nedbus.Address("1", topic, 0 if topic.startswith("estimator") else None) for topic in TOPICS]
+    lines = {to_line(sample(address), width=1).split()[0] for address in addresses}
+    assert len(lines) == len(TOPICS)
+    assert "1/veh…tion" in lines
+
+
+@pytest.mark.process
+def test_echo_fits_a_terminal(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+    """At 80 columns a line is a line; the addresses of two vehicles are a column."""
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:", "-s", "sim:?vehicle=wing")
+    wait_for(lambda: len(bus.latest()) == 2, what="two vehicles")
+    with on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
+        assert terminal.popen.wait(DEADLINE) == 0
+    lines = [line for line in terminal.shown.splitlines() if " ned " in line]
+    assert len(lines) == 40
+    assert max(map(len, lines)) <= 80
+    assert len({line.index(" ned ") for line in lines[20:]}) == 1
+
+
+def test_info_names_what_is_gone(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+    """The number stands in the table, the addresses below it; on a terminal no address is broken."""
+    gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
+    sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
+    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    info = run_nedbus("info", "-c", endpoint)
+    assert info.wait() == 0, info.err
+    assert "  5 gone\n" in info.out
+    assert f"\ngone: {', '.join(gone)}\n" in info.out
+    with on_terminal("info", "-c", endpoint) as terminal:
+        assert terminal.popen.wait(DEADLINE) == 0
+    lines = terminal.shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(address in line for line in lines) for address in gone)
+    del service
 
 
 def test_table_without_a_terminal_is_complete() -> None:

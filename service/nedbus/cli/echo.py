@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated
 
@@ -16,7 +16,7 @@ from nedbus.errors import ConfigError
 from nedbus_msgs import ANY, FIELD_TYPES, Address
 
 from .follow import Link, follow
-from .format import to_csv, to_csv_head, to_fields, to_json, to_line
+from .format import shorten_address, to_csv, to_csv_head, to_fields, to_json, to_line
 from .options import (
     CountOption,
     CsvOption,
@@ -32,6 +32,7 @@ from .options import (
     write,
     write_stderr,
 )
+from .table import terminal_width
 
 
 @on_bus
@@ -64,7 +65,7 @@ def echo(
     require_one({"--full": full, "--json": json_output, "--csv": csv_output})
     require_one({"--once": once, "--count": count is not None})
     fields = _parse_fields(field)
-    form = to_json if json_output else to_csv if csv_output else to_fields if full else to_line
+    form = to_json if json_output else to_csv if csv_output else to_fields if full else _Lines()
     show: Callable[[Sample], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
 
@@ -86,6 +87,18 @@ def echo(
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
                 _write_counts(subscription)
+
+
+class _Lines:
+    """Samples as lines for the terminal, as wide as it is now, the addresses in a column; complete if it is none."""
+
+    def __init__(self) -> None:
+        self._widths = (0, 0)
+
+    def __call__(self, sample: Sample, fields: Sequence[str]) -> str:
+        address, (whole, shortened) = str(sample.address), self._widths
+        self._widths = max(whole, len(address)), max(shortened, len(shorten_address(address)))
+        return to_line(sample, fields, width=terminal_width(), address_widths=self._widths)
 
 
 def _parse_fields(text: str | None) -> list[str]:

@@ -6,6 +6,7 @@ import logging
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
@@ -30,6 +31,8 @@ _HINT: Final = """In a second terminal:
   {nedbus} echo{where}  messages as they arrive, a line each
   {nedbus} hz{where}    rate, jitter, latency, loss
   {nedbus} get{where}   all fields of the last message"""
+_TLS_HINT: Final = "Readers at {endpoint} need a certificate of their own: docs/security.md"
+_ENCRYPTED: Final = ("tls/", "quic/")
 
 
 class Display:
@@ -68,9 +71,7 @@ class Display:
             for status in self._daemon.sources:
                 self._rate(status)  # measured from here on
             if not self._daemon.until_done and (self._daemon.role == "router" or sys.stderr.isatty()):
-                is_default = DEFAULT_ENDPOINT in self._daemon.endpoints
-                where = "" if is_default else f" -c {self._daemon.endpoints[0]}"
-                self._print(_HINT.format(nedbus=_program(), where=where))
+                self._print(what_to_type(self._daemon.endpoints))
         if self._progress is not None:
             for status in self._daemon.sources:
                 self._show(self._progress, status)
@@ -122,8 +123,8 @@ class Display:
         count = f"{status.done} of {status.total}" if status.total else f"{status.published}"
         rejected = f", {status.rejected} rejected" if status.rejected else ""
         lost = f", {status.lost} lost" if status.lost else ""
-        stale = f", stale: {', '.join(status.stale)}" if status.stale else ""
-        return f"{count} messages, {self._rate(status):.0f}/s{rejected}{lost}{stale}"
+        gone = f", gone: {', '.join(status.stale)}" if status.stale else ""
+        return f"{count} messages, {self._rate(status):.0f}/s{rejected}{lost}{gone}"
 
     def _rate(self, status: SourceStatus) -> float:
         """Return messages a second, averaged over the last one to two seconds."""
@@ -135,6 +136,16 @@ class Display:
                 status.published - round((status.published - published) / (now - then)),
             )
         return (status.published - published) / (now - then) if now > then else 0.0
+
+
+def what_to_type(endpoints: Sequence[str]) -> str:
+    """Return what to type in a second terminal; it has not the certificate of this service, and must not need it."""
+    if DEFAULT_ENDPOINT in endpoints:
+        return _HINT.format(nedbus=_program(), where="")
+    plain = [each for each in endpoints if not each.startswith(_ENCRYPTED)]
+    if not plain:
+        return _TLS_HINT.format(endpoint=endpoints[0])
+    return _HINT.format(nedbus=_program(), where=f" -c {plain[0]}")
 
 
 def _program() -> str:

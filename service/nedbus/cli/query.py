@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 import time
 from collections.abc import Sequence
 from typing import Annotated, Final
@@ -105,6 +106,8 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [_source_row(source) for source in sources_of(service)]
         _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
+        if gone := [str(address) for source in sources_of(service) for address in _gone(source)]:
+            write(_fold_list("gone: ", to_text(", ".join(gone), _MAX_VEHICLES), width))
         streams = [_stream_row(source, *each) for source in sources_of(service) for each in streams_of(source)]
         _write_rows("\n" + to_table(_STREAM_HEAD, streams[:_MAX_ROWS], width=width, optional=_STREAM_OPTIONAL), streams)
     if len(services) > _MAX_ROWS:
@@ -143,9 +146,23 @@ def _write_rows(table: str, rows: Sequence[object]) -> None:
 
 def _source_row(source: dict[str, object]) -> list[str]:
     keys = ("source", "state", "published", "rejected", "lost", "reboots", "retries")
+    gone = len(_gone(source))
+    return [
+        *(to_text(source.get(key, "-")) for key in keys),
+        to_text(source.get("error") or (f"{gone} gone" if gone else "-")),
+    ]
+
+
+def _gone(source: dict[str, object]) -> list[object]:
+    """Return the addresses of a source that were withdrawn as nothing arrived: `stale` in the status, then gone."""
     stale = source.get("stale")
-    remark = f"stale: {', '.join(map(str, stale))}" if stale and isinstance(stale, list) else "-"
-    return [*(to_text(source.get(key, "-")) for key in keys), to_text(source.get("error") or remark)]
+    return stale if isinstance(stale, list) else []
+
+
+def _fold_list(head: str, text: str, width: int | None) -> str:
+    if width is None:
+        return head + text
+    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
 def _stream_row(source: dict[str, object], address: str, health: Health) -> list[str]:

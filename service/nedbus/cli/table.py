@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import sys
-import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Final
 
+_CHUNK: Final = re.compile(r"[^/]+/*|/+")
+_WORD: Final = re.compile(r"[^/_?&=,:.-]+[/_?&=,:.-]*|[/_?&=,:.-]+")
+_BREAKS: Final = (re.compile(r"\s*\S+\s*"), _CHUNK, _WORD)
 _GAP: Final = 2  # characters between two columns
 _LEAST: Final = 10  # characters that a column of text keeps at least
+_READABLE: Final = 16  # characters of the last column, for which others are left out
 
 
 def terminal_width() -> int | None:
@@ -24,14 +28,15 @@ def to_table(
 ) -> str:
     """Return rows in columns: the first and the last one are text, aligned to the left, the others numbers.
 
-    In a `width` that is too small the text is folded, and columns are left out, in the order of `optional`.
+    In a `width` that is too small columns are left out, in the order of `optional`, and then text is folded: at
+    spaces, else at slashes, else at underscores and the like, and within a word only where it alone is too long.
     """
     widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
-    kept = _fit(head, widths, width, optional)
+    kept = _fit(head, rows, widths, width, optional)
     text = {kept[0], kept[-1]}
     lines = []
     for row in [head, *rows]:
-        cells = [textwrap.wrap(row[column], widths[column]) or [""] for column in kept]
+        cells = [_fold(row[column], widths[column]) for column in kept]
         for index in range(max(map(len, cells))):
             parts = [
                 part.ljust(widths[column]) if column in text else part.rjust(widths[column])
@@ -42,24 +47,66 @@ def to_table(
     return "\n".join(lines)
 
 
-def _fit(head: Sequence[str], widths: list[int], width: int | None, optional: Collection[str]) -> list[int]:
+def _fit(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    widths: list[int],
+    width: int | None,
+    optional: Collection[str],
+) -> list[int]:
     """Return the columns that are shown, and make those of text narrower, so that a line fits."""
     kept = list(range(len(head)))
     if width is None:
         return kept
-    text = (0, len(head) - 1)
-    least = [min(each, _LEAST) if column in text else each for column, each in enumerate(widths)]
+    last = len(head) - 1
+    needed = [column for column in kept if head[column] not in optional]
+    names = [row[0] for row in (head, *rows)]
+    least = [*widths]
+    for first, text in (
+        (widths[0], _READABLE),
+        (_longest(_CHUNK, names), _READABLE),
+        (_longest(_WORD, names), _LEAST),
+        (_LEAST, _LEAST),
+    ):
+        least[0], least[last] = min(widths[0], first), min(widths[last], text)
+        if _sum(least, needed) <= width:
+            break
     for name in optional:
         if _sum(least, kept) <= width:
             break
         kept.remove(head.index(name))
-    spare = max(0, width - _sum(least, kept))
-    for column, share in ((text[0], spare // 2), (text[1], spare), (text[0], spare)):
-        left = max(0, width - _sum(least, kept))
-        least[column] = min(widths[column], least[column] + min(share, left))
-    for column in text:
-        widths[column] = least[column]
+    for column, share in ((last, _READABLE), (0, widths[0]), (last, widths[last])):
+        spare = max(0, width - _sum(least, kept))
+        least[column] = min(widths[column], max(least[column], share), least[column] + spare)
+    widths[:] = least
     return kept
+
+
+def _fold(text: str, width: int) -> list[str]:
+    """Return the lines of a cell."""
+    lines = [""]
+    for part in _parts(text, width, _BREAKS):
+        if len(lines[-1]) + len(part.rstrip()) <= width:
+            lines[-1] += part
+        else:
+            lines.append(part)
+    return [line.rstrip() for line in lines]
+
+
+def _parts(text: str, width: int, breaks: Sequence[re.Pattern[str]]) -> Iterator[str]:
+    """Yield a text in parts that fit, cut at the first kind of break that is fine enough, else anywhere."""
+    if not breaks:
+        yield from (text[start : start + width] for start in range(0, len(text), width))
+        return
+    for part in breaks[0].findall(text):
+        if len(part.rstrip()) <= width:
+            yield part
+        else:
+            yield from _parts(part, width, breaks[1:])
+
+
+def _longest(part: re.Pattern[str], names: Sequence[str]) -> int:
+    return max((len(each) for name in names for each in part.findall(name)), default=0)
 
 
 def _sum(widths: Sequence[int], columns: Sequence[int]) -> int:
