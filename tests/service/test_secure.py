@@ -213,6 +213,21 @@ def test_health_of_a_vehicle_is_what_readers_get(secure: str, pki: Path, run_ned
     assert "vehicle 2 is not published, though its service reports that it is" in reason
 
 
+def test_list_does_not_ask_for_a_source_that_is_there(secure: str, pki: Path, run_nedbus: Start) -> None:
+    """Where a service answers and no vehicle is seen, the hint is about what the router lets through."""
+    files = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/vehicle-1.crt", f"--tls-key={pki}/vehicle-1.key"]
+    reader = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/reader.crt", f"--tls-key={pki}/reader.key"]
+
+    def hint() -> str:
+        listed = run_nedbus("list", "-c", secure, *reader)
+        assert listed.wait() == 0
+        return listed.err
+
+    assert "start a source with 'nedbus serve'" in hint()
+    run_nedbus("serve", "--connect", secure, *files, "-s", "sim:?vehicle=2")
+    wait_for(lambda: "a service answers, so see 'nedbus info'" in hint(), what="the other hint")
+
+
 def test_pki_commands_never_overwrite(tmp_path: Path, run_nedbus: Start) -> None:
     """Keys are made once, for their owner only, and never shown."""
     folder = tmp_path / "pki"

@@ -60,7 +60,12 @@ def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
     if not json_output and rows:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows, width=terminal_width()))
     if not rows:
-        write_stderr(f"no vehicle is published at {' or '.join(bus.routers)}: start a source with 'nedbus serve'")
+        hint = (
+            "a service answers, so see 'nedbus info'; with certificates, may it write, and may this client read?"
+            if bus.services()
+            else "start a source with 'nedbus serve'"
+        )
+        write_stderr(f"no vehicle is published at {' or '.join(bus.routers)}: {hint}")
 
 
 @on_bus
