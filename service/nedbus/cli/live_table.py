@@ -42,13 +42,12 @@ class LiveTable:
             return
         from rich.text import Text
 
-        if self._live is None:
-            self._live = self._start()
+        live = self._live or self._start()
         height = shutil.get_terminal_size().lines - 1
         count = min(_MAX_ROWS, len(rows), height)
         while (text := self._table(rows, count, width)).count("\n") >= height and count > _MIN_ROWS:
             count -= 1
-        self._live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
+        live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
     def _table(self, rows: Sequence[Sequence[str]], count: int, width: int | None) -> str:
         text = to_table(self._head, rows[:count], width=width, optional=self._optional)
@@ -60,7 +59,8 @@ class LiveTable:
 
         console = Console()
         log_to(console)
-        live = Live(console=console, auto_refresh=False)
-        live.start()
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # the cursor is hidden until the end
-        return live
+        # The cursor is hidden from the start to the stop, which a signal must not leave out.
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        self._live = Live(console=console, auto_refresh=False)
+        self._live.start()
+        return self._live
