@@ -19,6 +19,7 @@ from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.sources import LiveSource, parse_source, source_text_of_file
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection
 
+from .follow import write_notice
 from .options import (
     DurationOption,
     InstanceOption,
@@ -67,7 +68,7 @@ def record(
             show(recorder.status, None, None)
             if not recorder.messages and time.monotonic() > notice:
                 notice = math.inf
-                write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")
+                write_notice(subscription)
 
         try:
             with _progress() as show:

@@ -62,7 +62,7 @@ def follow(
             next_second = max(next_second + 1.0, now)
         if not seen and not noticed and now > start + _NOTICE:
             noticed = True
-            write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")
+            write_notice(subscription)
         try:
             sample = subscription.receive(max(0.0, min(end, next_second, now + _LINK_INTERVAL) - now))
         except NoDataError:
@@ -72,3 +72,8 @@ def follow(
         each_second()
     if not seen:
         raise NoDataError(subscription.name, duration or 0.0)
+
+
+def write_notice(subscription: Subscription) -> None:
+    """Tell a person that nothing has arrived on a subscription so far."""
+    write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")
