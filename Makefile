@@ -35,13 +35,15 @@ wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and 
 	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
 
-bench: $(DEV)  ## measure: beside the peers, with many vehicles, pacing of a replay, cost of an idle service
+bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck readers, pacing of a replay, an idle service
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
 	$(BIN)/python -m benchmarks.picture
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.load
-	$(BIN)/python -m benchmarks.record 60
+	$(BIN)/python -m benchmarks.record --seconds 60
+	$(BIN)/python -m benchmarks.busy
+	$(BIN)/python -m benchmarks.stuck
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 

@@ -1,23 +1,22 @@
 """A real load: 10 vehicles, all four topics at PX4's rates, one reader of everything; CPU time beside raw Zenoh's.
 
-2,040 messages a second. The publisher makes a validated message of each, the reader gets validated ones.
+2,040 messages a second. The publisher validates the fields of each, the reader gets validated messages.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 
 import psutil
 
-from .scale import expect, start, tell
+from .processes import end, expect, router, start, tell
 
-ENDPOINT = "tcp/127.0.0.1:17464"
-SECONDS = 20
 VEHICLES = 10
 
 PLAN = """
 import sys, time
-from benchmarks.forms.fields import FIELDS
+from benchmarks.forms.fields import PROVIDED
 vehicles, seconds, endpoint = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 STREAMS = {"vehicle_local_position": 1, "vehicle_local_position_groundtruth": 2, "external_ins_local_position": 2,
            "estimator_local_position/0": 50, "estimator_local_position/1": 50}  # every how many ticks of 10 ms
@@ -61,7 +60,7 @@ with nedbus.connect(endpoint) as bus:
         for s in STREAMS:
             topic, _, instance = s.partition("/")
             publishers[v, s] = bus.publisher(topic, vehicle=str(v), instance=int(instance) if instance else None)
-    play(lambda vehicle, stream, stamp: publishers[vehicle, stream].publish({**FIELDS, "timestamp": stamp}))
+    play(lambda vehicle, stream, stamp: publishers[vehicle, stream].publish({**PROVIDED, "timestamp": stamp}))
 """
 READER = """
 import sys, nedbus
@@ -74,30 +73,32 @@ with nedbus.connect(sys.argv[1]) as bus, bus.subscribe() as subscription:
 
 def main() -> None:
     """Measure and print."""
-    print(f"{VEHICLES} vehicles, four topics, {SECONDS} s      CPU: publisher  router  reader")
-    raw = measure("raw Zenoh", PLAN + RAW_PUBLISHER, RAW_READER)
-    own = measure("nedbus", PLAN + PUBLISHER, READER)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=int, default=20)
+    seconds = parser.parse_args().seconds
+    print(f"{VEHICLES} vehicles, four topics, {seconds} s      CPU: publisher  router  reader")
+    raw = measure("raw Zenoh", PLAN + RAW_PUBLISHER, RAW_READER, seconds)
+    own = measure("nedbus", PLAN + PUBLISHER, READER, seconds)
     ratios = [one / other for one, other in zip(own, raw, strict=True)]
     print(f"{'nedbus / raw':40} {ratios[0]:10.2f} {ratios[1]:7.2f} {ratios[2]:7.2f}, all {sum(own) / sum(raw):.2f}")
 
 
-def measure(name: str, publish: str, read: str) -> list[float]:
+def measure(name: str, publish: str, read: str, seconds: int) -> list[float]:
     """Return the CPU time of publisher, router and reader, as shares of a core."""
-    router = start("-m", "nedbus", "router", "--listen", ENDPOINT)
-    time.sleep(1.0)
-    reader = start("-c", read, ENDPOINT)
-    expect(reader)
-    publisher = start("-c", publish, str(VEHICLES), str(SECONDS), ENDPOINT)
-    expect(publisher)
-    time.sleep(1.0)
-    processes = [psutil.Process(process.pid) for process in (publisher, router, reader)]
-    before = [sum(process.cpu_times()[:2]) for process in processes]
-    tell(publisher)
-    expect(publisher)
-    used = [(sum(process.cpu_times()[:2]) - each) / SECONDS for process, each in zip(processes, before, strict=True)]
-    for process in (reader, publisher, router):
-        process.kill()
-        process.wait()
+    with router() as (routing, endpoint):
+        reader = start("-c", read, endpoint)
+        expect(reader)
+        publisher = start("-c", publish, str(VEHICLES), str(seconds), endpoint)
+        expect(publisher)
+        time.sleep(1.0)
+        processes = [psutil.Process(process.pid) for process in (publisher, routing, reader)]
+        before = [sum(process.cpu_times()[:2]) for process in processes]
+        tell(publisher)
+        expect(publisher)
+        used = [
+            (sum(process.cpu_times()[:2]) - each) / seconds for process, each in zip(processes, before, strict=True)
+        ]
+        end(reader, publisher)
     print(f"{name:40} {used[0]:10.1%} {used[1]:7.1%} {used[2]:7.1%}", flush=True)
     return used
 

@@ -6,14 +6,16 @@ import json
 
 import matplotlib.pyplot as plt
 
-from .compare import RESULTS, title
+from .peers import title
+from .report import RESULTS
+from .results import FULL
 
 
 def main() -> None:
     """Draw messages a second of each form, nedbus in colour."""
     about = json.loads(RESULTS.read_text())
-    rows = sorted(about["results"].items(), key=lambda item: item[1]["rate"])
-    names = [f"nedbus {name}" if title(name).startswith("nedbus") else name.replace("_", " ") for name, _ in rows]
+    rows = sorted(about["results"][about["flight"]][FULL.name].items(), key=lambda item: item[1]["rate"])
+    names = [("nedbus " if title(name).startswith("nedbus") else "") + name.replace("_", " ") for name, _ in rows]
     rates = [row["rate"] for _, row in rows]
     colours = ["tab:blue" if name.startswith("nedbus") else "silver" for name in names]
     figure, axes = plt.subplots(figsize=(9, 0.36 * len(rows) + 1.2))

@@ -1,5 +1,6 @@
-"""One end of a measurement: python -m benchmarks.role FORM publish|receive ENDPOINT COUNT RATE.
+"""One end of a measurement: python -m benchmarks.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...].
 
+COUNT messages of all vehicles together, RATE of each in Hz, 0 for as fast as possible; all vehicles send at once.
 It prints "ready", waits for a line, works, and prints what it measured as JSON.
 """
 
@@ -16,57 +17,70 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, cast
 
+from .forms.case import Case
+
 QUIET = 3.0  # s without a message after which a receiver gives up
+
+Send = Callable[[Any], None]
 
 
 class Form(Protocol):
     """A module of benchmarks.forms."""
 
-    def publish(self, endpoint: str) -> AbstractContextManager[Callable[[Any], None]]: ...
-    def receive(self, endpoint: str, ready: Callable[[], None], seen: Callable[[Any], bool]) -> None: ...
+    def publish(self, case: Case) -> AbstractContextManager[list[Send]]: ...
+    def receive(self, case: Case, ready: Callable[[], None], seen: Callable[[Any], bool]) -> None: ...
 
 
 def main() -> None:
     """Play the role that the arguments name."""
-    form_name, role, endpoint, count, rate = sys.argv[1:6]
+    form_name, role, endpoint, count, rate, *vehicles = sys.argv[1:7]
     form = cast("Form", importlib.import_module(f"benchmarks.forms.{form_name}"))
+    chosen = tuple(vehicles[0].split(",")) if vehicles else ("1",)
     play = publish if role == "publish" else receive
-    play(form, endpoint, int(count), float(rate))
+    play(form, Case(endpoint, chosen, paced=float(rate) > 0), int(count), float(rate))
 
 
-def publish(form: Form, endpoint: str, count: int, rate: float) -> None:
-    """Send this many messages, `rate` a second or as fast as possible."""
+def publish(form: Form, case: Case, count: int, rate: float) -> None:
+    """Send this many messages."""
     size = getattr(form, "BATCH", 1)
-    with form.publish(endpoint) as send:
+    with form.publish(case) as senders:
         print("ready", flush=True)
         sys.stdin.readline()
-        start, cpu = time.monotonic(), time.process_time()
-        if rate:
-            for number in range(count):
-                wait = start + number / rate - time.monotonic()
-                if wait > 0:
-                    time.sleep(wait)
-                stamp = time.monotonic_ns()
-                send(stamp if size == 1 else [stamp])
+        start = now()
+        if case.paced:
+            send_paced(senders, count // len(senders), rate)
         elif size == 1:
+            (send,) = senders
             for number in range(count):
                 send(number + 1)
         else:
+            (send,) = senders
             for number in range(0, count, size):
                 send(range(number + 1, min(count, number + size) + 1))
-        report(start, cpu, end=time.monotonic())
+        report(start, now())
         sys.stdin.readline()
 
 
-def receive(form: Form, endpoint: str, count: int, rate: float) -> None:
+def send_paced(senders: Sequence[Send], ticks: int, rate: float) -> None:
+    """Send one message of each vehicle at each tick."""
+    start = time.monotonic()
+    for tick in range(ticks):
+        wait = start + tick / rate - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
+        for send in senders:
+            send(time.monotonic_ns())
+
+
+def receive(form: Form, case: Case, count: int, rate: float) -> None:
     """Take this many messages, or fewer if no more come."""
-    received, first, cpu = 0, 0.0, 0.0
+    received, start, end = 0, (0.0, 0.0), (0.0, 0.0)
     delays: list[int] = []
 
     def seen(stamp: int | Sequence[int]) -> bool:
-        nonlocal received, first, cpu
+        nonlocal received, start, end
         if not received:
-            first, cpu = time.monotonic(), time.process_time()
+            start = now()
         if isinstance(stamp, int):
             received += 1
             if rate:
@@ -74,37 +88,43 @@ def receive(form: Form, endpoint: str, count: int, rate: float) -> None:
         else:
             received += len(stamp)
             if rate:
-                now = time.monotonic_ns()
-                delays.extend(now - int(each) for each in stamp)
-        return received < count
+                taken = time.monotonic_ns()
+                delays.extend(taken - int(each) for each in stamp)
+        if received < count:
+            return True
+        end = now()  # before anything is closed
+        return False
 
     def watch() -> None:
         sys.stdin.readline()
-        before, changed = -1, time.monotonic()
-        while time.monotonic() < changed + QUIET:
+        before, changed = -1, now()
+        while time.monotonic() < changed[0] + QUIET:
             if received > before:
-                before, changed = received, time.monotonic()
+                before, changed = received, now()
             time.sleep(0.05)
         finish(changed)
 
-    def finish(end: float) -> None:
+    def finish(end: tuple[float, float]) -> None:
         delays.sort()
         found = {f"p{part}": delays[len(delays) * part // 100] / 1e3 for part in (50, 99)} if delays else {}
-        report(first, cpu, end=end, received=received, **found)
+        report(start, end, received=received, **found)
         os._exit(0)  # it may be waiting for ever for the rest
 
     threading.Thread(target=watch, daemon=True).start()
-    form.receive(endpoint, lambda: print("ready", flush=True), seen)
-    finish(time.monotonic())
+    form.receive(case, lambda: print("ready", flush=True), seen)
+    finish(end)
 
 
-def report(start: float, cpu: float, *, end: float, **measured: float) -> None:
+def now() -> tuple[float, float]:
+    """Return the time and the CPU time of this process, in seconds."""
+    return time.monotonic(), time.process_time()
+
+
+def report(start: tuple[float, float], end: tuple[float, float], **measured: float) -> None:
     """Print the result."""
+    seconds, cpu = end[0] - start[0], end[1] - start[1]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(
-        json.dumps({"seconds": end - start, "cpu": time.process_time() - cpu, "peak": peak, **measured}),
-        flush=True,
-    )
+    print(json.dumps({"seconds": seconds, "cpu": cpu, "peak": peak, **measured}), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,29 +8,40 @@ import numpy as np
 import nedbus
 from nedbus_msgs.arrays import to_array
 
+from . import rows
+from .case import Case
 from .fields import FIELDS
+from .nedbus_ends import open_publishers, open_subscription
 
-BATCH = 1000  # messages that are sent at once
+BATCH = 1000  # messages that are sent at once, where they are not paced
+
+Send = Callable[[Sequence[int]], None]
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[Sequence[int]], None]]:
-    """Send arrays."""
+def publish(case: Case) -> Iterator[list[Send]] | Iterator[list[rows.Send]]:
+    """Send arrays, with which no field is missing; paced, a vehicle has one message at a time: send as rows do."""
+    if case.paced:
+        with rows.publish(case) as senders:
+            yield senders
+        return
     message = nedbus.VehicleLocalPosition.model_validate({**FIELDS, "timestamp": 1})
-    with nedbus.connect(endpoint) as bus:
-        publisher = bus.publisher("vehicle_local_position", vehicle="1", lossless=True)
 
+    def make_send(publisher: nedbus.Publisher) -> Send:
         def send(stamps: Sequence[int]) -> None:
             messages = np.repeat(to_array([message]), len(stamps))
             messages["timestamp"] = stamps
             publisher.publish_many(messages)
 
-        yield send
+        return send
+
+    with open_publishers(case) as publishers:
+        yield list(map(make_send, publishers))
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[Sequence[int]], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[Sequence[int]], bool]) -> None:
     """Take arrays."""
-    with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+    with open_subscription(case) as subscription:
         ready()
         for batch in subscription.batches():
             if not seen(batch.messages["timestamp"] if batch.messages["x"].any() else []):

@@ -12,6 +12,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from .case import Case
 from .fields import FIELDS
 
 PACKAGES = ["cyclonedds==11.0.1"]
@@ -41,14 +42,14 @@ Position = make_idl_struct(
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     _domain = Domain(DOMAIN, LOOPBACK)
     participant = DomainParticipant(DOMAIN)
     writer = DataWriter(participant, Topic(participant, "vehicle_local_position", Position), QOS)
-    yield lambda stamp: writer.write(Position(**{**FIELDS, "timestamp": stamp}))
+    yield [lambda stamp: writer.write(Position(**{**FIELDS, "timestamp": stamp}))]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     _domain = Domain(DOMAIN, LOOPBACK)
     participant = DomainParticipant(DOMAIN)
     reader = DataReader(participant, Topic(participant, "vehicle_local_position", Position), QOS)

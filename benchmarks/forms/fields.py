@@ -1,59 +1,46 @@
-"""The message that all forms send: an estimate of PX4's EKF2 in flight, as plain Python values."""
+"""The message that all forms send, as plain Python values: one of a real flight, of tests/data/flights.json.
 
+The environment variable BENCH_FLIGHT names the flight.
+The timestamp is the sender's, so `timestamp_sample` is 0, which is never later.
+"""
+
+import json
 import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
 
-FIELDS = {
-    "timestamp": 0,
-    "timestamp_sample": 0,
-    "xy_valid": True,
-    "z_valid": True,
-    "v_xy_valid": True,
-    "v_z_valid": True,
-    "x": -12.345678,
-    "y": 4.5678901,
-    "z": -20.123456,
-    "delta_xy": (0.25, -0.125),
-    "xy_reset_counter": 3,
-    "delta_z": -0.0625,
-    "z_reset_counter": 2,
-    "vx": 1.2345678,
-    "vy": -0.9876543,
-    "vz": 0.0123456,
-    "z_deriv": 0.0234567,
-    "delta_vxy": (0.5, 0.75),
-    "vxy_reset_counter": 4,
-    "delta_vz": 0.0,
-    "vz_reset_counter": 1,
-    "ax": 0.1234567,
-    "ay": -0.2345678,
-    "az": -0.0345678,
-    "heading": 1.5432109,
-    "heading_var": 0.0012345,
-    "unaided_heading": 1.5332109,
-    "delta_heading": 0.01,
-    "heading_reset_counter": 2,
-    "heading_good_for_control": True,
-    "tilt_var": 0.0004567,
-    "xy_global": True,
-    "z_global": True,
-    "ref_timestamp": 1_234_567,
-    "ref_lat": 47.397742123456,
-    "ref_lon": 8.545594123456,
-    "ref_alt": 488.12345,
-    "dist_bottom_valid": True,
-    "dist_bottom": 19.876543,
-    "dist_bottom_var": 0.0123456,
-    "delta_dist_bottom": 0.0,
-    "dist_bottom_reset_counter": 1,
-    "dist_bottom_sensor_bitfield": 1,
-    "eph": 0.6123456,
-    "epv": 0.8123456,
-    "evh": 0.1123456,
-    "evv": 0.1223456,
-    "dead_reckoning": False,
-    "vxy_max": math.inf,
-    "vz_max": math.inf,
-    "hagl_min": math.inf,
-    "hagl_max_z": math.inf,
-    "hagl_max_xy": math.inf,
-}
+VARIABLE: Final = "BENCH_FLIGHT"
+DEFAULT_FLIGHT: Final = "no origin"  # and its dist_bottom_valid is false as well: no terrain
+FLIGHTS: Final[dict[str, Any]] = json.loads((Path(__file__).parents[2] / "tests/data/flights.json").read_text())
+FLIGHT: Final = os.environ.get(VARIABLE, DEFAULT_FLIGHT)
+
+_ABSENT: Final = {bool: False, int: 0, float: math.nan, tuple: (math.nan, math.nan)}
+
+
+def _read(flight: str) -> dict[str, Any]:
+    """Return the fields of a flight; JSON has neither NaN nor tuples."""
+    fields = {name: _value(value) for name, value in FLIGHTS[flight]["fields"].items()}
+    return fields | {"timestamp_sample": 0} if "timestamp_sample" in fields else fields
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(map(float, value))
+    return float(value) if isinstance(value, str) else value
+
+
+def _complete(provided: Mapping[str, Any]) -> dict[str, Any]:
+    """Return all fields in PX4's order, with NaN, false or 0 for those that the source does not provide."""
+    return {name: provided.get(name, _ABSENT[type(value)]) for name, value in _read("everything set").items()}
+
+
+COMPLETE: Final = [flight for flight in FLIGHTS if len(_read(flight)) == len(_read("everything set"))]
+"""The flights whose source provides all fields."""
+
+PROVIDED: Final = _read(FLIGHT)
+"""What the source of this flight provides, which nedbus tells its readers."""
+
+FIELDS: Final = _complete(PROVIDED)
+"""All 53 fields."""

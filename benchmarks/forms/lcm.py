@@ -11,6 +11,7 @@ from typing import Any
 
 import lcm
 
+from .case import Case
 from .fields import FIELDS
 
 PACKAGES = ["lcm==1.5.3"]
@@ -47,7 +48,7 @@ Position = generate()
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     link = lcm.LCM(URL)
 
     def send(stamp: int) -> None:
@@ -57,10 +58,10 @@ def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
         message.timestamp = stamp
         link.publish(CHANNEL, message.encode())
 
-    yield send
+    yield [send]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     going = True
 
     def take(_channel: str, data: bytes) -> None:

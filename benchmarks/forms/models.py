@@ -5,18 +5,24 @@ from contextlib import contextmanager
 
 import nedbus
 
-from .fields import FIELDS
+from .case import Case
+from .fields import PROVIDED
+from .nedbus_ends import open_publishers, open_subscription
+
+Send = Callable[[int], None]
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    with nedbus.connect(endpoint) as bus:
-        publisher = bus.publisher("vehicle_local_position", vehicle="1", lossless=True)
-        yield lambda stamp: publisher.publish(nedbus.VehicleLocalPosition(**{**FIELDS, "timestamp": stamp}))
+def publish(case: Case) -> Iterator[list[Send]]:
+    def make_send(publisher: nedbus.Publisher) -> Send:
+        return lambda stamp: publisher.publish(nedbus.VehicleLocalPosition(**{**PROVIDED, "timestamp": stamp}))
+
+    with open_publishers(case) as publishers:
+        yield list(map(make_send, publishers))
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    with open_subscription(case) as subscription:
         ready()
         for sample in subscription:
             message = sample.message

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import msgspec
 import zenoh
 
+from .case import Case
 from .fields import FIELDS
 from .zenoh_session import KEY, open_session
 
@@ -20,16 +21,16 @@ Position = msgspec.defstruct(
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     encoder = msgspec.msgpack.Encoder()
-    with open_session(endpoint) as session:
+    with open_session(case.endpoint) as session:
         publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-        yield lambda stamp: publisher.put(encoder.encode(Position(**{**FIELDS, "timestamp": stamp})))
+        yield [lambda stamp: publisher.put(encoder.encode(Position(**{**FIELDS, "timestamp": stamp})))]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     decoder = msgspec.msgpack.Decoder(Position)
-    with open_session(endpoint) as session:
+    with open_session(case.endpoint) as session:
         subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1024))
         ready()
         for sample in subscriber:

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 import msgpack
 import zmq
 
+from .case import Case
 from .fields import FIELDS
 
 PACKAGES = ["pyzmq==27.3.0", "msgpack==1.2.4"]
@@ -18,20 +19,20 @@ def address(endpoint: str) -> str:
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     with zmq.Context() as context, context.socket(zmq.PUB) as socket:
         socket.set(zmq.SNDHWM, 1024)
         socket.set(zmq.XPUB_NODROP, 1)
         socket.set(zmq.LINGER, 0)
-        socket.bind(address(endpoint))
-        yield lambda stamp: socket.send(msgpack.packb({**FIELDS, "timestamp": stamp}))
+        socket.bind(address(case.endpoint))
+        yield [lambda stamp: socket.send(msgpack.packb({**FIELDS, "timestamp": stamp}))]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.set(zmq.RCVHWM, 1024)
         socket.set(zmq.SUBSCRIBE, b"")
-        socket.connect(address(endpoint))
+        socket.connect(address(case.endpoint))
         ready()
         while True:
             message = msgpack.unpackb(socket.recv())

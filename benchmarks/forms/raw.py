@@ -5,22 +5,28 @@ from contextlib import contextmanager
 
 import zenoh
 
-from .zenoh_session import KEY, open_session
+from .case import Case
+from .zenoh_session import declare_publishers, key, open_session
 
 SIZE = 244
 
+Send = Callable[[int], None]
+
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    with open_session(endpoint) as session:
-        publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-        rest = bytes(SIZE - 8)
-        yield lambda stamp: publisher.put(stamp.to_bytes(8, "big") + rest)
+def publish(case: Case) -> Iterator[list[Send]]:
+    rest = bytes(SIZE - 8)
+
+    def make_send(publisher: zenoh.Publisher) -> Send:
+        return lambda stamp: publisher.put(stamp.to_bytes(8, "big") + rest)
+
+    with open_session(case.endpoint) as session:
+        yield [make_send(publisher) for publisher in declare_publishers(session, case)]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    with open_session(endpoint) as session:
-        subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1024))
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    with open_session(case.endpoint) as session:
+        subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
         ready()
         for sample in subscriber:
             if not seen(int.from_bytes(sample.payload.to_bytes()[:8], "big")):

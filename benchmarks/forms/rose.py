@@ -8,6 +8,7 @@ import msgspec
 from rose import Message
 from rose.node import Publisher, Subscriber
 
+from .case import Case
 from .fields import FIELDS
 from .zenoh_session import KEY, open_session
 
@@ -22,14 +23,14 @@ Position = msgspec.defstruct(
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
     """Publish without a rose.Node, which would not dial a router."""
-    with open_session(endpoint) as session:
+    with open_session(case.endpoint) as session:
         publisher = Publisher(session, "publisher", KEY, Position)
-        yield lambda stamp: publisher.publish(Position(**{**FIELDS, "timestamp": stamp}))
+        yield [lambda stamp: publisher.publish(Position(**{**FIELDS, "timestamp": stamp}))]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     """Take messages by callback, because its recv() keeps only the newest."""
     done = threading.Event()
 
@@ -37,7 +38,7 @@ def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool
         if not seen(message.timestamp if message.x else 0):
             done.set()
 
-    with open_session(endpoint) as session:
+    with open_session(case.endpoint) as session:
         _subscriber = Subscriber(session, "receiver", KEY, Position, take)
         ready()
         done.wait()

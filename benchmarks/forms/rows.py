@@ -5,21 +5,33 @@ from contextlib import contextmanager
 
 import nedbus
 
-from .fields import FIELDS
+from . import fields_in
+from .case import Case
+from .fields import FIELDS, PROVIDED
+from .nedbus_ends import open_publishers, open_subscription
+
+Send = Callable[[int], None]
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    """Send tuples."""
+def publish(case: Case) -> Iterator[list[Send]]:
+    """Send tuples; where the source does not provide all fields, which a tuple cannot say, send fields by name."""
+    if len(PROVIDED) < len(FIELDS):
+        with fields_in.publish(case) as senders:
+            yield senders
+        return
     _, *rest = FIELDS.values()
-    with nedbus.connect(endpoint) as bus:
-        publisher = bus.publisher("vehicle_local_position", vehicle="1", lossless=True)
-        yield lambda stamp: publisher.publish_row((stamp, *rest))
+
+    def make_send(publisher: nedbus.Publisher) -> Send:
+        return lambda stamp: publisher.publish_row((stamp, *rest))
+
+    with open_publishers(case) as publishers:
+        yield list(map(make_send, publishers))
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     """Take named tuples."""
-    with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+    with open_subscription(case) as subscription:
         ready()
         for sample in subscription.rows():
             row = sample.message

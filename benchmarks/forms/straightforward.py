@@ -7,8 +7,9 @@ import msgpack
 import zenoh
 from pydantic import BaseModel, ConfigDict, create_model
 
+from .case import Case
 from .fields import FIELDS
-from .zenoh_session import KEY, open_session
+from .zenoh_session import declare_publishers, key, open_session
 
 Position = create_model(
     "Position",
@@ -16,22 +17,25 @@ Position = create_model(
     **{name: (tuple[float, float] if type(value) is tuple else type(value), ...) for name, value in FIELDS.items()},
 )
 
+Send = Callable[[int], None]
+
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    with open_session(endpoint) as session:
-        publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
-
+def publish(case: Case) -> Iterator[list[Send]]:
+    def make_send(publisher: zenoh.Publisher) -> Send:
         def send(stamp: int) -> None:
             message = Position(**{**FIELDS, "timestamp": stamp})
             publisher.put(msgpack.packb(message.model_dump()))
 
-        yield send
+        return send
+
+    with open_session(case.endpoint) as session:
+        yield [make_send(publisher) for publisher in declare_publishers(session, case)]
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    with open_session(endpoint) as session:
-        subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1024))
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+    with open_session(case.endpoint) as session:
+        subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
         ready()
         for sample in subscriber:
             message: BaseModel = Position.model_validate(msgpack.unpackb(sample.payload.to_bytes(), use_list=False))

@@ -10,6 +10,7 @@ import numpy as np
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosHistoryKind, QosProfile
 
+from .case import Case
 from .fields import FIELDS
 
 PACKAGES = ["zenoh-ros2-sdk==0.1.8"]
@@ -60,21 +61,21 @@ def compile_codec(end: ROS2Publisher | ROS2Subscriber) -> None:
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    publisher = ROS2Publisher(**options(endpoint))
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
+    publisher = ROS2Publisher(**options(case.endpoint))
     compile_codec(publisher)
-    yield lambda stamp: publisher.publish(**{**VALUES, "timestamp": stamp})
+    yield [lambda stamp: publisher.publish(**{**VALUES, "timestamp": stamp})]
     publisher.close()
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     done = threading.Event()
 
     def take(message: Any) -> None:
         if not seen(message.timestamp if message.x else 0):
             done.set()
 
-    subscriber = ROS2Subscriber(callback=take, **options(endpoint))
+    subscriber = ROS2Subscriber(callback=take, **options(case.endpoint))
     compile_codec(subscriber)
     ready()
     done.wait()

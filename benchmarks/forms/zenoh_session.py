@@ -4,7 +4,9 @@ import json
 
 import zenoh
 
-KEY = "bench/vehicle_local_position"
+from .case import Case
+
+KEY = "bench/1/vehicle_local_position"  # of forms that know one vehicle only
 
 
 def open_session(endpoint: str) -> zenoh.Session:
@@ -18,3 +20,14 @@ def open_session(endpoint: str) -> zenoh.Session:
     }.items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
+
+
+def key(vehicle: str) -> str:
+    """Return the key of a vehicle, or the key expression of all."""
+    return f"bench/{vehicle}/vehicle_local_position"
+
+
+def declare_publishers(session: zenoh.Session, case: Case) -> list[zenoh.Publisher]:
+    """Declare a publisher for each vehicle."""
+    control = zenoh.CongestionControl.BLOCK if case.lossless else zenoh.CongestionControl.DROP
+    return [session.declare_publisher(key(vehicle), congestion_control=control) for vehicle in case.vehicles]

@@ -10,6 +10,7 @@ import zrm
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
+from .case import Case
 from .fields import FIELDS
 from .zenoh_session import KEY
 
@@ -56,21 +57,21 @@ def open_session(endpoint: str) -> zrm.Session:
 
 
 @contextmanager
-def publish(endpoint: str) -> Iterator[Callable[[int], None]]:
-    with open_session(endpoint) as session:
+def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
+    with open_session(case.endpoint) as session:
         publisher = zrm.Publisher(session, KEY, Position)
-        yield lambda stamp: publisher.publish(Position(**{**FIELDS, "timestamp": stamp}))
+        yield [lambda stamp: publisher.publish(Position(**{**FIELDS, "timestamp": stamp}))]
         publisher.close()
 
 
-def receive(endpoint: str, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
+def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     done = threading.Event()
 
     def take(message: Message) -> None:
         if not seen(message.timestamp if message.x else 0):
             done.set()
 
-    with open_session(endpoint) as session:
+    with open_session(case.endpoint) as session:
         subscriber = zrm.Subscriber(session, KEY, Position, take)
         ready()
         done.wait()

@@ -14,7 +14,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
 from .float32 import round_to_float32
-from .px4_types import TYPES
+from .px4_types import NAN, TYPES, TypeName
 from .rows import FIELD_TYPES, NAMES, Values
 from .rules import make_fast_check
 
@@ -23,7 +23,13 @@ _VALIDATE: Final = SchemaValidator(
     core_schema.tuple_positional_schema([_SCHEMAS[kind] for kind in FIELD_TYPES.values()]), CoreConfig(strict=True)
 ).validate_python
 
-_passes_rules = make_fast_check({name: index for index, name in enumerate(NAMES)})
+_ABSENT: Final[Mapping[TypeName, object]] = {
+    "uint64": 0, "uint8": 0, "bool": False, "float32": NAN, "float32[2]": (NAN, NAN), "float64": NAN,
+}  # fmt: skip
+_DEFAULTS: Final = {name: _ABSENT[kind] for name, kind in FIELD_TYPES.items() if name != "timestamp"}
+passes_rules: Final = make_fast_check({name: index for index, name in enumerate(NAMES)})
+"""Return whether the values of all fields, which have the right types, pass the rules between fields."""
+
 _get_all = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
 
 
@@ -33,16 +39,21 @@ def check_row(values: Values) -> Values | None:
         row: Values = _VALIDATE(values)
     except ValidationError:
         return None
-    return row if _passes_rules(row) else None
+    return row if passes_rules(row) else None
 
 
 def row_of(fields: Mapping[str, object]) -> Values | None:
-    """Return the values of all fields in their order, validated but not rounded; None if the model has to decide."""
+    """Return the values of all fields in their order, validated but not rounded; None if the model has to decide.
+
+    Fields that are not given, but for `timestamp`, have their defaults.
+    """
+    if len(fields) < len(NAMES):
+        fields = {**_DEFAULTS, **fields}
     if len(fields) != len(NAMES):
         return None
     try:
         return check_row(_get_all(fields))
-    except KeyError:  # another name among as many
+    except KeyError:  # no timestamp, and another name among as many
         return None
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
 from typing import Final, cast
 
 from .errors import LayoutError
@@ -106,11 +108,16 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleL
 
 def upgraded_names(names: Iterable[str]) -> Mapping[str, str]:
     """Return which of these names, of any PX4 release, provides each field of a message."""
+    return _upgraded_names(tuple(names))
+
+
+@lru_cache(64)  # all messages of a stream have the same names
+def _upgraded_names(names: tuple[str, ...]) -> Mapping[str, str]:
     known = {_RENAMED.get(name, name): name for name in names}
     if "hagl_max" in known:
         known.setdefault("hagl_max_z", known["hagl_max"])
         known.setdefault("hagl_max_xy", known["hagl_max"])
-    return {name: known[name] for name in FIELD_TYPES if name in known}
+    return MappingProxyType({name: known[name] for name in FIELD_TYPES if name in known})
 
 
 def downgrade(message: VehicleLocalPosition, layout: str) -> dict[str, object]:

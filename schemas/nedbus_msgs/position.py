@@ -5,7 +5,7 @@ Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import TYPE_CHECKING, ClassVar, Final, Self, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
@@ -116,7 +116,7 @@ class VehicleLocalPosition(BaseModel):
             if values is None:
                 super().__init__(**fields)
             else:
-                _fill(self, values)
+                _fill(self, values, _ALL if len(fields) == len(NAMES) else frozenset(fields))
 
         # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
         __init__.__pydantic_base_init__ = True
@@ -188,13 +188,13 @@ def _validation_error(values: Mapping[str, object], broken: Iterable[tuple[str, 
 def message_of(row: Values) -> VehicleLocalPosition:
     """Return the message of a row that is valid and rounded to float32, without validating it again."""
     message = VehicleLocalPosition.__new__(VehicleLocalPosition)
-    _fill(message, dict(zip(NAMES, row, strict=True)))
+    _fill(message, dict(zip(NAMES, row, strict=True)), _ALL)
     return message
 
 
-def _fill(message: VehicleLocalPosition, values: dict[str, object]) -> None:
+def _fill(message: VehicleLocalPosition, values: dict[str, object], given: Set[str]) -> None:
     _set_dict(message, values)
-    _set_fields_set(message, _ALL)
+    _set_fields_set(message, given)
     _set_extra(message, None)
     _set_private(message, None)
 

@@ -23,6 +23,11 @@ NOT_NEGATIVE: Final = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv
 WITHIN: Final[Mapping[str, float]] = {"heading": FLOAT32_PI, "ref_lat": 90.0, "ref_lon": 180.0}
 """Rule: the magnitude of these is at most this (NaN passes)."""
 
+RULED_FIELDS: Final = {"timestamp", "timestamp_sample", *NOT_NEGATIVE, *WITHIN}.union(
+    *((flag.name, *flag.fields) for flag in FLAGS.values() if flag.fields)
+)
+"""The fields that any rule looks at."""
+
 
 def violations(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
     """Yield the field and the reason for every rule between fields that the values of all fields violate."""
@@ -43,11 +48,13 @@ def violations(values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
 
 
 def make_fast_check(indexes: Mapping[str, Any]) -> Callable[[Any], bool]:
-    """Return a function that returns whether values pass the rules; each field is at its index of the values.
+    """Return a function that returns whether values pass the rules; each of RULED_FIELDS is at its index of the values.
 
     `violations` has the reasons.
     """
-    flagged = tuple((indexes[flag.name], tuple(indexes[name] for name in flag.fields)) for flag in FLAGS.values())
+    flagged = tuple(
+        (indexes[flag.name], tuple(indexes[name] for name in flag.fields)) for flag in FLAGS.values() if flag.fields
+    )
     get_flagged = _getter(indexes, [name for flag in FLAGS.values() for name in flag.fields])
     get_not_negative = _getter(indexes, NOT_NEGATIVE)
     bounds = tuple((indexes[name], bound) for name, bound in WITHIN.items())

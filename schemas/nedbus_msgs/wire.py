@@ -7,14 +7,15 @@ Any other valid msgpack encoding of the array is decoded as well.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Final, cast
 
 import msgpack
 from pydantic import ValidationError
 
 from .errors import DecodeError, EncodeError, UnknownLayoutError
-from .fast_path import check_row, row_of
+from .fast_path import check_row, passes_rules, row_of
 from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
 from .position import VehicleLocalPosition, message_of
 from .px4_types import TypeName
@@ -43,6 +44,7 @@ _VALUE_MASK = int.from_bytes(bytes(len(_HEAD)) + b"".join(values for _, _, value
 TAG_MASK = ((1 << 8 * PAYLOAD_SIZE) - 1) ^ _VALUE_MASK
 _FIXED = struct.Struct(f">{len(_HEAD)}x" + "".join(form for _, form, _ in _TYPES))
 
+_make_row = cast("Callable[[Values], Row]", partial(tuple.__new__, Row))  # as _make, without a look at the length
 _FIRST, _SECOND = (NAMES.index(name) for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
 
 
@@ -105,7 +107,7 @@ def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) 
 def decode_row(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> Row:
     """Return the message of a payload as a named tuple, validated by the same types and rules as in `decode`."""
     row = _decode_full_width(payload)
-    return Row._make(tuple(_decode_any(payload, newer).__dict__.values()) if row is None else row)
+    return _make_row(tuple(_decode_any(payload, newer).__dict__.values()) if row is None else row)
 
 
 def describe(error: ValidationError) -> str:
@@ -142,7 +144,9 @@ def _decode_full_width(payload: bytes) -> Values | None:
     number = int.from_bytes(payload, "big")
     if number & TAG_MASK != TAGS:
         return None
-    return check_row(msgpack.unpackb(payload, use_list=False)[1:])
+    # With these tags each value has its type and range: there is nothing left to validate but the rules.
+    row: Values = msgpack.unpackb(payload, use_list=False)[1:]
+    return row if passes_rules(row) else None
 
 
 def _decode_any(payload: bytes, newer: Mapping[int, Sequence[str]] | None) -> VehicleLocalPosition:

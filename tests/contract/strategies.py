@@ -32,6 +32,18 @@ TYPES: Mapping[str, st.SearchStrategy[object]] = {
     "float32[2]": st.tuples(float32s, float32s),
     "float64": st.floats(),
 }
+# Values that the field's own type allows, but perhaps not the rules.
+SAME_TYPE = {
+    "uint64": st.integers(0, 2**64 - 1),
+    "uint8": st.integers(0, 255),
+    "bool": st.booleans(),
+    "float32": st.floats(width=32) | st.sampled_from([-1.0, 3.2, math.nan]),
+    "float32[2]": st.tuples(st.floats(width=32), st.floats(width=32)),
+    "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
+}
+FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
+RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
+BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:
@@ -68,3 +80,20 @@ def messages() -> st.SearchStrategy[VehicleLocalPosition]:
 def bits(message: VehicleLocalPosition) -> dict[str, str]:
     """Return the values of a message as text: NaN equals NaN, and -0.0 does not equal 0.0."""
     return {name: repr(value) for name, value in message.model_dump().items()}
+
+
+def pack_full_width(values: Mapping[str, object]) -> bytes:
+    """Return the payload of values of the right types, whether they pass the rules or not."""
+    forms = {"uint64": ">BQ", "uint8": ">BB", "float32": ">Bf", "float64": ">Bd"}
+    tags = {"uint64": 0xCF, "uint8": 0xCC, "float32": 0xCA, "float64": 0xCB}
+    parts = [b"\xdc\x00\x36\x01"]
+    for name, kind in FIELD_TYPES.items():
+        value = values[name]
+        if kind == "bool":
+            parts.append(b"\xc3" if value else b"\xc2")
+        elif kind == "float32[2]":
+            assert isinstance(value, tuple)
+            parts.append(b"\x92" + b"".join(struct.pack(">Bf", 0xCA, each) for each in value))
+        else:
+            parts.append(struct.pack(forms[kind], tags[kind], value))
+    return b"".join(parts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -38,7 +37,7 @@ from nedbus_msgs.arrays import (
     valid_mask,
 )
 
-from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, messages
+from .strategies import BROKEN, bits, messages, pack_full_width
 
 GOOD = encode(VehicleLocalPosition.model_validate({"timestamp": 5, **dict.fromkeys(["vxy_max", "eph"], math.inf)}))
 # Values for any field, valid or not, whatever its type.
@@ -54,18 +53,6 @@ ODD = st.one_of(
     st.lists(st.floats(), max_size=3),
 )
 CHANGES = st.dictionaries(st.sampled_from(list(FIELD_TYPES)), ODD, max_size=3)
-# Values that the field's own type allows, but perhaps not the rules.
-SAME_TYPE = {
-    "uint64": st.integers(0, 2**64 - 1),
-    "uint8": st.integers(0, 255),
-    "bool": st.booleans(),
-    "float32": st.floats(width=32) | st.sampled_from([-1.0, 3.2, math.nan]),
-    "float32[2]": st.tuples(st.floats(width=32), st.floats(width=32)),
-    "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
-}
-FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
-RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
-BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
 
 
 def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
@@ -112,23 +99,6 @@ def test_model_decides_what_the_fast_path_does_not_accept(changes: dict[str, obj
     )
     if "hagl" not in changes:
         assert reasons(encode_row, list(fields.values())) == expected
-
-
-def pack_full_width(values: Mapping[str, object]) -> bytes:
-    """Return the payload of values of the right types, whether they pass the rules or not."""
-    forms = {"uint64": ">BQ", "uint8": ">BB", "float32": ">Bf", "float64": ">Bd"}
-    tags = {"uint64": 0xCF, "uint8": 0xCC, "float32": 0xCA, "float64": 0xCB}
-    parts = [b"\xdc\x00\x36\x01"]
-    for name, kind in FIELD_TYPES.items():
-        value = values[name]
-        if kind == "bool":
-            parts.append(b"\xc3" if value else b"\xc2")
-        elif kind == "float32[2]":
-            assert isinstance(value, tuple)
-            parts.append(b"\x92" + b"".join(struct.pack(">Bf", 0xCA, each) for each in value))
-        else:
-            parts.append(struct.pack(forms[kind], tags[kind], value))
-    return b"".join(parts)
 
 
 @given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))

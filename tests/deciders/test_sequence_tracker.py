@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import cast
 
 import hypothesis.strategies as st
+import zenoh
 from hypothesis import given
 
 from nedbus.client.sequence_tracker import SETTLED, SequenceTracker
 
+from .raw_samples import follow, name_of
+
 WRAP = 2**32
 
 
-def never() -> str:
-    raise AssertionError("the publisher's id is not needed for a number that was expected")
+class Unnamed:
+    """The source of a message whose publisher must not be asked for."""
 
+    def __init__(self, number: int) -> None:
+        self.source_sn = number
 
-def by(publisher: str) -> Callable[[], str]:
-    return lambda: publisher
-
-
-def follow(tracker: SequenceTracker, *numbers: int, stream: str = "key", publisher: str = "a") -> list[int]:
-    """Return what was lost just before each of these numbers."""
-    return [tracker.arrived(stream, number, by(publisher)) for number in numbers]
+    @property
+    def source_id(self) -> object:
+        raise AssertionError("the publisher's id is not needed for a number that was expected")
 
 
 def test_first_message_tells_no_loss() -> None:
@@ -43,7 +44,8 @@ def test_settled_stream_needs_no_publisher() -> None:
     """The id of a publisher is costly: a stream of one publisher is soon followed by number alone."""
     tracker = SequenceTracker()
     follow(tracker, *range(SETTLED + 1))
-    assert [tracker.arrived("key", SETTLED + 1 + number, never) for number in range(3)] == [0, 0, 0]
+    unnamed = [cast("zenoh.SourceInfo", Unnamed(SETTLED + 1 + number)) for number in range(3)]
+    assert [tracker.arrived("key", each) for each in unnamed] == [0, 0, 0]
     assert follow(tracker, SETTLED + 10) == [6]
 
 
@@ -96,10 +98,10 @@ def test_two_publishers_of_one_stream_are_followed_apart() -> None:
     """Their numbers interleave, and even coincide, without a loss; a gap of either counts."""
     tracker = SequenceTracker()
     for number in range(2 * SETTLED):
-        assert tracker.arrived("key", number, by("a")) == 0
-        assert tracker.arrived("key", number + 1, by("b")) == 0
-    assert tracker.arrived("key", 2 * SETTLED + 2, by("a")) == 2
-    assert tracker.arrived("key", 2 * SETTLED + 2, by("b")) == 1
+        assert follow(tracker, number, publisher="a") == [0]
+        assert follow(tracker, number + 1, publisher="b") == [0]
+    assert follow(tracker, 2 * SETTLED + 2, publisher="a") == [2]
+    assert follow(tracker, 2 * SETTLED + 2, publisher="b") == [1]
     assert tracker.lost == 3
 
 
@@ -120,7 +122,7 @@ def test_announced_loss_is_counted_once() -> None:
     """Zenoh announces what recovery gave up; the gap that follows is the same loss."""
     tracker = SequenceTracker()
     follow(tracker, 0)
-    tracker.announce("a", 3)
+    tracker.announce(name_of("a"), 3)
     assert tracker.lost == 3
     assert follow(tracker, 4) == [3]
     assert tracker.lost == 3
@@ -130,8 +132,8 @@ def test_announced_loss_at_the_end_of_a_stream_counts() -> None:
     """No message follows, and it is lost all the same; so is one of a publisher that was never heard."""
     tracker = SequenceTracker()
     follow(tracker, 0)
-    tracker.announce("a", 2)
-    tracker.announce("never heard", 5)
+    tracker.announce(name_of("a"), 2)
+    tracker.announce(name_of("never heard"), 5)
     assert tracker.lost == 7
 
 
@@ -139,26 +141,16 @@ def test_queue_that_drops_tells_loss_and_drop_apart() -> None:
     """Of a gap only what was announced was lost in transit; the reader's own queue dropped the rest."""
     tracker = SequenceTracker(queue_drops=True)
     follow(tracker, 0)
-    tracker.announce("a", 2)
+    tracker.announce(name_of("a"), 2)
     assert follow(tracker, 10) == [2]
     assert (tracker.lost, tracker.dropped) == (2, 7)
-
-
-def test_skip_forgets_positions_but_no_loss() -> None:
-    """Between messages that were taken without their numbers nothing counts as lost but what is announced."""
-    tracker = SequenceTracker()
-    follow(tracker, 0, 2)
-    tracker.announce("a", 4)
-    tracker.skip()
-    assert follow(tracker, 500, 502) == [0, 1]
-    assert tracker.lost == 1 + 4 + 1
 
 
 def test_memory_is_bounded_by_least_recent_use() -> None:
     """Many lifetimes of publishers: a stream that is heard all the time is never forgotten, its losses are exact."""
     tracker = SequenceTracker(max_publishers=10)
     for life in range(1000):
-        assert tracker.arrived("steady", 2 * life, by("steady")) == (1 if life else 0)
+        assert follow(tracker, 2 * life, stream="steady", publisher="steady") == [1 if life else 0]
         follow(tracker, 0, 1, 2, stream=f"key {life}", publisher=f"publisher {life}")
     assert tracker.lost == 999
     assert len(tracker._publishers) <= 10
@@ -169,7 +161,7 @@ def test_forgotten_publisher_keeps_what_was_announced() -> None:
     """Forgetting one bounds memory, and takes nothing back."""
     tracker = SequenceTracker(max_publishers=1)
     follow(tracker, 0)
-    tracker.announce("a", 3)
+    tracker.announce(name_of("a"), 3)
     follow(tracker, 0, stream="other", publisher="b")
     assert tracker.lost == 3
 
@@ -189,9 +181,31 @@ def test_every_absent_number_is_counted_once(
     for number in numbers:
         gap = 0 if last is None else number - last - 1
         if announced and gap:
-            tracker.announce("a", gap)
-        reported += tracker.arrived("key", (start + number) % WRAP, by("a"))
+            tracker.announce(name_of("a"), gap)
+        reported += sum(follow(tracker, (start + number) % WRAP))
         last = number
     absent = numbers[-1] - numbers[0] + 1 - len(numbers)
     assert tracker.lost + tracker.dropped == absent
     assert tracker.lost == reported == (absent if announced or not queue_drops else 0)
+
+
+def test_has_knows_what_arrived_and_what_is_lost() -> None:
+    """A publisher is told of all up to a number: it arrived, or recovery gave it up; None where it was never heard."""
+    tracker = SequenceTracker()
+    assert tracker.has(name_of("a"), 0) is None
+    follow(tracker, 10, 11, 15)
+    assert [tracker.has(name_of("a"), number) for number in (9, 15, 16, 18)] == [True, True, False, False]
+    tracker.announce(name_of("a"), 3)
+    assert [tracker.has(name_of("a"), number) for number in (16, 18, 19)] == [True, True, False]
+    follow(tracker, 19)
+    assert [tracker.has(name_of("a"), number) for number in (19, 20)] == [True, False]
+    assert tracker.has(name_of("b"), 0) is None
+
+
+def test_has_is_right_around_the_wrap() -> None:
+    """After 2^32 - 1 comes 0, for whoever asks as well."""
+    tracker = SequenceTracker()
+    follow(tracker, WRAP - 2, WRAP - 1)
+    assert [tracker.has(name_of("a"), number) for number in (WRAP - 1, 0)] == [True, False]
+    follow(tracker, 0)
+    assert [tracker.has(name_of("a"), number) for number in (WRAP - 1, 0, 1)] == [True, True, False]

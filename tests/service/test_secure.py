@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 import stat
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 import nedbus
+from nedbus.client.acknowledgement import WINDOW
 from nedbus.transport import make_authority, make_certificate, open_router
+from nedbus_msgs.arrays import to_array
 from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -76,17 +79,20 @@ def test_vehicle_is_read_whole(join: Join) -> None:
 
 
 def test_vehicle_learns_what_was_read(join: Join) -> None:
-    """A reader may say that it has everything, and the vehicle may ask."""
-    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    """A vehicle may ask readers how far they are, and they may answer: it waits for one that reads nothing."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1", lossless=True)
     publisher.publish(message(1))
     with join("reader").subscribe("*", mode="every") as subscription:
         assert subscription.receive(DEADLINE).message.timestamp == 1
-        count = 12_000  # more than a reader's process holds
-        for timestamp in range(2, count):
-            publisher.publish(message(timestamp))
-        assert not publisher.flush(0.2)
-        while subscription.receive(DEADLINE).message.timestamp < count - 1:
-            pass
+        count = 3 * WINDOW
+        sending = threading.Thread(
+            target=publisher.publish_many, args=[to_array([message(number) for number in range(2, count + 1)])]
+        )
+        sending.start()
+        wait_for(lambda: publisher.published > WINDOW, what="the first window")
+        assert publisher.published < count
+        assert [subscription.receive(DEADLINE).message.timestamp for _ in range(2, count + 1)][-1] == count
+        sending.join(DEADLINE)
         assert publisher.flush()
 
 

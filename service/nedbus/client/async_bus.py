@@ -55,8 +55,8 @@ class AsyncBus:
     def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> AsyncSubscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
         bus = self._opened()
-        receive_queue = bus._make_queue(mode)
         key_expr = selection.key_expr(prefix=bus.prefix)
+        receive_queue = bus._make_queue(mode, name=key_expr)
         return AsyncSubscription(lambda: bus._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr)
 
     async def latest(

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
-from nedbus.transport import RawSample
-from nedbus_msgs import PAYLOAD_SIZE, Address, Provenance, Row, provenance_of
-from nedbus_msgs.arrays import DTYPE, FEW, MessageArray, decode_array
+from nedbus_msgs import PAYLOAD_SIZE, Address, Provenance, decode_row
+from nedbus_msgs.arrays import MessageArray, decode_array
+
+from .decoder import Arrival, Decoder
 
 
 @dataclass(eq=False)
@@ -31,7 +33,8 @@ class Batch:
     address_index: npt.NDArray[np.intp]
     received: int
     lost: int
-    _raw: Sequence[RawSample] = field(repr=False)
+    _arrivals: Sequence[Arrival] = field(repr=False)
+    _decoder: Decoder = field(repr=False)
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -46,66 +49,38 @@ class Batch:
     @cached_property
     def sent(self) -> npt.NDArray[np.int64]:
         """When each was sent, ns since the epoch by its publisher's clock; 0 without a timestamp."""
-        stamps = (raw.timestamp for raw in self._raw)
+        stamps = (raw.timestamp for _, _, raw, _ in self._arrivals)
         return np.array([stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64)
 
     @cached_property
     def sequence(self) -> npt.NDArray[np.int64]:
         """The sequence number of each, as its publisher counts; -1 without one."""
-        infos = (raw.source_info for raw in self._raw)
+        infos = (raw.source_info for _, _, raw, _ in self._arrivals)
         return np.array([info.source_sn if info else -1 for info in infos], np.int64)
 
     @cached_property
     def provenances(self) -> list[Provenance]:
         """The source of each, and the fields that it did not provide."""
-        return [provenance_of(str(raw.encoding)) for raw in self._raw]
+        return list(map(self._decoder.provenance, self._arrivals))
 
 
-def make_batch(
-    raw: Sequence[RawSample],
-    keys: Sequence[str],
-    addresses: Mapping[str, Address],
-    *,
-    received: int,
-    lost: int,
-    decode: Callable[[RawSample, str], Row | None],
-) -> Batch:
-    """Return the batch of what arrived on these keys, of which some may have no address.
-
-    `decode` returns the row of one sample, None if it is invalid; it is for what `decode_array` cannot read.
-    """
-    if len(raw) < FEW:
-        rows = list(map(decode, raw, keys))
-        messages = np.array([row for row in rows if row is not None], DTYPE)
-        valid = np.array([row is not None for row in rows])
-    else:
-        messages, valid = _decode(raw, keys, addresses, decode)
-    if not valid.all():
-        kept = np.flatnonzero(valid).tolist()
-        raw, keys = [raw[index] for index in kept], [keys[index] for index in kept]
-    indices = {key: index for index, key in enumerate(dict.fromkeys(keys))}
-    address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return Batch(messages, tuple(addresses[key] for key in indices), address_index, received, lost, raw)
-
-
-def _decode(
-    raw: Sequence[RawSample],
-    keys: Sequence[str],
-    addresses: Mapping[str, Address],
-    decode: Callable[[RawSample, str], Row | None],
-) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-    """Return the valid messages, and which of all were valid."""
-    payloads = [sample.payload.to_bytes() for sample in raw]
+def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
+    """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
+    received = time.time_ns()
+    payloads = [payload for _, payload, _, _ in arrivals]
     if set(map(len, payloads)) != {PAYLOAD_SIZE}:
         payloads = [payload if len(payload) == PAYLOAD_SIZE else bytes(PAYLOAD_SIZE) for payload in payloads]
     messages, valid = decode_array(b"".join(payloads))
-    if len(addresses) < len(set(keys)):
-        valid &= [key in addresses for key in keys]
-    if valid.all():
-        return messages, valid
-    for index in np.flatnonzero(~valid).tolist():
-        row = decode(raw[index], keys[index])
-        if row is not None:
-            messages[index] = row
-            valid[index] = True
-    return messages[valid], valid
+    if not valid.all():
+        for index in np.flatnonzero(~valid).tolist():
+            sample = decoder.decode(arrivals[index], decode_row)
+            if sample is not None:
+                messages[index] = sample.message
+                valid[index] = True
+        messages = messages[valid]
+        arrivals = [arrivals[index] for index in np.flatnonzero(valid).tolist()]
+    keys = [stream.key for stream, _, _, _ in arrivals]
+    addresses = {stream.key: stream.address for stream, _, _, _ in arrivals}
+    indices = {key: index for index, key in enumerate(addresses)}
+    address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
+    return Batch(messages, tuple(addresses.values()), address_index, received, lost, arrivals, decoder)

@@ -62,18 +62,17 @@ class Bus:
 
         Without a topic it is vehicle_local_position; "*" is all four topics.
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
-        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s.
-        Either way `counts` has what was lost, dropped or invalid.
-
-        Raises ConnectError when mode "every" cannot open its session, because the router is away at this moment.
+        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
+        65,536 samples wait for a slow reader, which loses the oldest beyond.
+        Either way `counts` has what was lost, dropped or invalid, and nobody else has to wait.
         """
         self._require_open()
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode)
 
     def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> Subscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
-        receive_queue = self._make_queue(mode)
         key_expr = selection.key_expr(prefix=self.prefix)
+        receive_queue = self._make_queue(mode, name=key_expr)
         return Subscription(self._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr, owner=self)
 
     def latest(
@@ -89,14 +88,15 @@ class Bus:
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = self._make_decoder()
         newest: dict[Address, Sample] = {}
-        for raw in decoder.admit(query(self._session, key_expr, timeout=timeout, newest=False)):
-            sample = decoder.decode(raw, str(raw.key_expr), decode)
-            if sample is None:
-                continue
-            sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
-            other = newest.get(sample.address)
-            if other is None or _rank(sample) > _rank(other):
-                newest[sample.address] = sample
+        for raw in query(self._session, key_expr, timeout=timeout, newest=False):
+            for arrival in decoder.admit([raw]):
+                sample = decoder.decode(arrival, decode)
+                if sample is None:
+                    continue
+                sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
+                other = newest.get(sample.address)
+                if other is None or _rank(sample) > _rank(other):
+                    newest[sample.address] = sample
         return sorted(newest.values(), key=lambda sample: sample.address)
 
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
@@ -123,8 +123,8 @@ class Bus:
     ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
-        `lossless` is for replays as fast as readers take them: `publish` then waits for slow readers, `close` until
-        they have all of it, and a stuck one holds up all others for 5 s, until it is disconnected.
+        `lossless` is for replays as fast as readers take them: while a reader of mode "every" has more than 2,000
+        messages to read, `publish` waits for it, and sends 10 a second meanwhile; `close` waits until they have all.
         `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
         """
         self._require_open()
@@ -160,23 +160,15 @@ class Bus:
         if not self._finalizer.alive:
             raise ClosedError
 
-    def _make_queue(self, mode: Mode) -> ReceiveQueue:
+    def _make_queue(self, mode: Mode, *, name: str) -> ReceiveQueue:
         """Return the queue of a new subscription; AsyncBus uses it too."""
         self._require_open()
-        return ReceiveQueue(mode, self._make_decoder())
+        return ReceiveQueue(mode, self._make_decoder(), name=name)
 
     def _open_subscriber(self, key_expr: str, receive_queue: ReceiveQueue) -> ZenohSubscriber:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
         self._require_open()
-        if receive_queue.newest_only:
-            subscriber = ZenohSubscriber(self._session, key_expr, receive_queue)
-        else:
-            own = self.open_session()
-            try:
-                subscriber = ZenohSubscriber(own, key_expr, receive_queue)
-            except NedbusError:
-                own.close()
-                raise
+        subscriber = ZenohSubscriber(self._session, key_expr, receive_queue)
         self._subscribers.add(subscriber)
         if not self._finalizer.alive:  # closed meanwhile, by another thread
             subscriber.close()

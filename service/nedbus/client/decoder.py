@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import zenoh
 
@@ -37,12 +37,24 @@ _UNKNOWN: Final = Provenance()
 
 
 @dataclass(slots=True, eq=False)
-class _Key:
+class Stream:
     """What is derived from a key once, and the provenance of its last encoding."""
 
+    key: str
     address: Address
-    encoding: zenoh.Encoding | None = None
-    provenance: Provenance = _UNKNOWN
+    last: tuple[zenoh.Encoding | None, Provenance] = None, _UNKNOWN  # in one piece: two threads look and change it
+
+
+class Kept(NamedTuple):
+    """What is kept of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
+
+    timestamp: zenoh.Timestamp | None
+    source_info: zenoh.SourceInfo | None
+    provenance: Provenance
+
+
+Arrival = tuple[Stream, bytes, RawSample | Kept, int]
+"""A stream, a payload, the sample that it came with, and how many messages were lost before it."""
 
 
 class Decoder:
@@ -52,60 +64,59 @@ class Decoder:
         self.invalid = 0
         self._layouts = layouts
         self._prefix = prefix
-        self._keys: dict[str, _Key] = {}
+        self._streams: dict[str, Stream] = {}
         self._warned: set[str] = set()
-        self._counting = threading.Lock()  # the pump and the reader both reject
+        self._counting = threading.Lock()  # whoever receives and whoever reads both reject
 
-    def decode(self, raw: RawSample, key: str, decode: Decode[M_co], *, lost: int = 0) -> Sample[M_co] | None:
-        """Return the sample of what arrived on a key, None if it is invalid."""
-        known = self._keys.get(key)
-        try:
-            if known is None:
-                known = self._remember(key)
-            payload = raw.payload.to_bytes()
-            if not payload and raw.kind == zenoh.SampleKind.DELETE:
-                raise DecodeError("a delete, which no publisher of nedbus sends")
-            message = decode(payload, newer=self._layouts.newer)
-        except (AddressError, DecodeError) as exc:
-            self.reject(key, exc)
-            return None
-        encoding = raw.encoding
-        if encoding != known.encoding:  # almost always it is the same: comparing is all that it costs
-            known.encoding, known.provenance = encoding, provenance_of(str(encoding))
-        return Sample(message, known.address, time.time_ns(), raw.timestamp, lost, known.provenance)
-
-    def admit(self, batch: Iterable[RawSample]) -> list[RawSample]:
-        """Return what is worth queueing; look up the layouts that are not known here, waiting for publishers' answers.
+    def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
+        """Return what is worth queueing, with no losses so far.
 
         A payload of the size that `encode` writes is admitted, and decoded when it is read.
-        Any other is decoded here: it must neither displace a valid sample nor take up much memory.
+        Any other is decoded here: it must neither displace a valid sample nor take up much memory. For a layout that is
+        not known here publishers are asked, and waited for.
         """
-        admitted = []
+        admitted: list[Arrival] = []
+        known = self._streams.get
         for raw in batch:
-            size = len(raw.payload)
-            if size == PAYLOAD_SIZE:
-                admitted.append(raw)
-                continue
-            try:
-                if size > PAYLOAD_LIMIT:
-                    raise DecodeError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
-                if raw.kind == zenoh.SampleKind.PUT:
-                    self._layouts.check(raw.payload.to_bytes())
-            except DecodeError as exc:
-                self.reject(str(raw.key_expr), exc)
-            else:
-                admitted.append(raw)
+            key = str(raw.key_expr)
+            stream = known(key)
+            payload = raw.payload.to_bytes()
+            if stream is None or len(payload) != PAYLOAD_SIZE:
+                try:
+                    stream = stream or self._remember(key)
+                    self._inspect(payload, raw.kind)
+                except (AddressError, DecodeError) as exc:
+                    self.reject(key, exc)
+                    continue
+            admitted.append((stream, payload, raw, 0))
         return admitted
 
-    def addresses(self, keys: Iterable[str]) -> Mapping[str, Address]:
-        """Return the addresses of keys, without those that have none."""
-        found: dict[str, Address] = {}
-        for key in set(keys):
-            try:
-                found[key] = (self._keys.get(key) or self._remember(key)).address
-            except AddressError:
-                continue  # `decode` rejects it
-        return found
+    def keep(self, arrival: Arrival) -> Arrival:
+        """Return an arrival that takes up no more memory than it needs."""
+        stream, payload, raw, lost = arrival
+        return stream, payload, Kept(raw.timestamp, raw.source_info, self.provenance(arrival)), lost
+
+    def provenance(self, arrival: Arrival) -> Provenance:
+        """Return the provenance of an arrival."""
+        stream, _, raw, _ = arrival
+        if isinstance(raw, Kept):
+            return raw.provenance
+        encoding = raw.encoding
+        known, provenance = stream.last
+        if encoding != known:  # almost always it is the same: comparing is all that it costs
+            provenance = provenance_of(str(encoding))
+            stream.last = encoding, provenance
+        return provenance
+
+    def decode(self, arrival: Arrival, decode: Decode[M_co], *, lost: int = 0) -> Sample[M_co] | None:
+        """Return the sample of what arrived, None if it is invalid."""
+        stream, payload, raw, _ = arrival
+        try:
+            message = decode(payload, newer=self._layouts.newer)
+        except DecodeError as exc:
+            self.reject(stream.key, exc)
+            return None
+        return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
 
     def count_invalid(self, count: int) -> None:
         """Count invalid samples."""
@@ -121,8 +132,17 @@ class Decoder:
             self._warned.add(key)
         _log.warning("%r: %s", key, error)
 
-    def _remember(self, key: str) -> _Key:
-        known = _Key(Address.from_key(key, prefix=self._prefix))
-        if len(self._keys) < MAX_KEYS:
-            self._keys[key] = known
-        return known
+    def _inspect(self, payload: bytes, kind: zenoh.SampleKind) -> None:
+        if len(payload) == PAYLOAD_SIZE:
+            return
+        if len(payload) > PAYLOAD_LIMIT:
+            raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+        if kind == zenoh.SampleKind.DELETE:
+            raise DecodeError("a delete, which no publisher of nedbus sends")
+        self._layouts.check(payload)
+
+    def _remember(self, key: str) -> Stream:
+        stream = Stream(key, Address.from_key(key, prefix=self._prefix))
+        if len(self._streams) < MAX_KEYS:
+            self._streams[key] = stream
+        return stream

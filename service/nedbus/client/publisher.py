@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Self
 
@@ -23,7 +23,7 @@ from nedbus_msgs import (
     encoding_of,
 )
 
-from .acknowledgement import Acknowledgement
+from .acknowledgement import KEPT, Acknowledgement
 from .qos import TOPIC_QOS
 
 if TYPE_CHECKING:
@@ -31,14 +31,15 @@ if TYPE_CHECKING:
 
 HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
 FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
-_FIELDS: Final = len(FIELD_TYPES)
+_ALL: Final = frozenset(FIELD_TYPES)
 
 
 class Publisher:
     """Publish the messages of one address; get one from `bus.publisher(...)`.
 
     Messages are kept for about 20 s for readers that missed some, and the last one for readers that ask.
-    `publish` never waits for a slow reader, unless the publisher is lossless.
+    `publish` never waits for a slow reader, unless the publisher is lossless: it then waits while a reader of mode
+    "every" has more than 2,000 messages to read, but sends 10 a second to all others.
     Usable from one thread at a time; as a context manager it closes itself.
     """
 
@@ -63,20 +64,20 @@ class Publisher:
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as somebody may publish
         self._closed = False
+        self._provided: Set[str] = frozenset()
+        self._partial_encoding = ""
         self._encoding = encoding_of(source)
         qos = TOPIC_QOS[address.topic]
-        control = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
-        # A heartbeat together with BLOCK and recovering readers can stall a saturated link for 5 s.
-        misses = zenoh.ext.MissDetectionConfig(heartbeat=None if lossless else HEARTBEAT, sporadic_heartbeat=None)
+        misses = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT, sporadic_heartbeat=None)
         with while_open(session):
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
                 self.key,
                 encoding=self._encoding,
-                congestion_control=control,
+                congestion_control=zenoh.CongestionControl.DROP,
                 priority=qos.priority,
-                cache=zenoh.ext.CacheConfig(qos.cache),
+                cache=zenoh.ext.CacheConfig(KEPT if lossless else qos.cache),
                 sample_miss_detection=misses,
                 publisher_detection=True,
             )
@@ -101,21 +102,17 @@ class Publisher:
 
         The same as `publish` with these fields, and faster: no message is made of them.
         """
-        self._put(encode_row(values), FIELD_TYPES)
+        self._put(encode_row(values), _ALL)
 
     def publish_many(self, messages: MessageArray) -> None:
         """Validate messages in a structured array of shape (n,) and dtype DTYPE, and publish them; all or none.
 
         Raises TypeError for another dtype, pydantic.ValidationError for the first message that is invalid.
         """
-        from nedbus_msgs.arrays import DTYPE, FEW, encode_array, to_message, to_row, valid_mask
+        from nedbus_msgs.arrays import DTYPE, encode_array, to_message, valid_mask
 
         if messages.dtype != DTYPE:
             raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
-        if len(messages) < FEW:
-            for payload in [encode_row(to_row(element)) for element in messages]:
-                self._put(payload, FIELD_TYPES)
-            return
         for element in messages[~valid_mask(messages)]:
             to_message(element)  # raises, with the reason
         if self._closed:
@@ -123,12 +120,19 @@ class Publisher:
         require_unforked()
         payloads = encode_array(messages)
         put, new_timestamp = self._publisher.put, self._session.new_timestamp
+        lossless, pace = self.lossless, self._acknowledgement.pace
         with while_open(self._session):
             for start in range(0, len(payloads), PAYLOAD_SIZE):
                 payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
                 put(payload, timestamp=stamp)
                 self.last = payload, stamp, self._encoding
                 self.published += 1
+                if lossless:
+                    pace(self.published)
+
+    def set_window(self, window: int) -> None:
+        """Set how many messages a lossless publisher sends without an acknowledgement."""
+        self._acknowledgement.window = window
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have what was published; return False if one has not in time.
@@ -162,19 +166,24 @@ class Publisher:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _put(self, payload: bytes, provided: Collection[str]) -> None:
+    def _put(self, payload: bytes, provided: Set[str]) -> None:
         if self._closed:
             raise ClosedError
         require_unforked()
         encoding = self._encoding
         try:
             stamp = self._session.new_timestamp()
-            if len(provided) == _FIELDS:
+            if len(provided) == len(_ALL):
                 self._publisher.put(payload, timestamp=stamp)
             else:
-                encoding = encoding_of(self.source, frozenset(provided))
+                if provided != self._provided:  # almost always the same fields are missing
+                    self._provided = frozenset(provided)
+                    self._partial_encoding = encoding_of(self.source, self._provided)
+                encoding = self._partial_encoding
                 self._publisher.put(payload, timestamp=stamp, encoding=encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc, self._session) from exc
         self.last = payload, stamp, encoding
         self.published += 1
+        if self.lossless:
+            self._acknowledgement.pace(self.published)

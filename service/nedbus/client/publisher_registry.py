@@ -16,11 +16,13 @@ from nedbus.errors import AddressInUseError
 from nedbus.transport import Session, alive_keys, while_open
 from nedbus_msgs import Address, json_schema, layout_table, schema_key
 
+from .acknowledgement import WINDOW
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
 
 _log = logging.getLogger(__name__)
 
+_MIN_WINDOW: Final = 100  # messages
 _ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 
 
@@ -57,10 +59,11 @@ class PublisherRegistry:
                 prefix=self.prefix,
                 lossless=lossless,
                 source=source,
-                on_close=lambda: self._publishers.pop(address, None),
+                on_close=lambda: self._forget(address),
                 owner=owner,
             )
             self._publishers[address] = publisher
+            self._share_window()
             if not self._vehicles:
                 self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
             if address.vehicle not in self._vehicles:
@@ -105,6 +108,16 @@ class PublisherRegistry:
                 if not logged:
                     _log.info("%s: waiting for a slow reader", publisher.address)
                 logged = True
+
+    def _forget(self, address: Address) -> None:
+        self._publishers.pop(address, None)
+        self._share_window()
+
+    def _share_window(self) -> None:
+        """Share a window among the lossless publishers, as one reader may have to hold what all of them send."""
+        lossless = [publisher for publisher in self.publishers if publisher.lossless]
+        for publisher in lossless:
+            publisher.set_window(max(_MIN_WINDOW, WINDOW // len(lossless)))
 
     def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:

@@ -1,11 +1,12 @@
 """The queue between Zenoh and a reader: every sample in order, or the newest of each key. No I/O.
 
-The thread of a ZenohSubscriber puts, the reader's thread takes. Here is decided that a reader is too slow:
-`latest` supersedes what was not read yet, and counts it as dropped; `every` lets `wait_for_capacity` hold back.
+Whoever receives puts, the reader's thread takes. Here is decided that a reader is too slow: `latest` supersedes what
+was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond. Both are counted, and hold back nobody.
 """
 
 from __future__ import annotations
 
+import logging
 import queue
 import threading
 import time
@@ -13,10 +14,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
-from nedbus.transport import RawSample
-from nedbus_msgs import AddressError, Row, decode_row
+from nedbus.transport import RawSample, entity_name
+from nedbus_msgs import AddressError
 
-from .decoder import MAX_KEYS, Decode, Decoder
+from .decoder import MAX_KEYS, Arrival, Decode, Decoder
+from .questions import Question, Questions
 from .sample import Counts, M_co, Mode, Sample
 from .sequence_tracker import SequenceTracker
 
@@ -25,37 +27,47 @@ if TYPE_CHECKING:
 
     from .batch import Batch
 
-CAPACITY: Final = 1024  # samples that are queued for an `every` reader before its pump waits
+_log = logging.getLogger(__name__)
+
+CAPACITY: Final = 65_536
+"""Samples that are kept for a reader of mode `every`, some 45 MB; beyond, the oldest are dropped."""
+
 _MAX_BATCH: Final = 4096  # messages of a batch
+_FRESH: Final = 1024  # samples that are queued as they are; further ones are going to wait
+_MANY: Final = 8  # samples of one key for which a look at all of them together pays
 
 
 class ReceiveQueue:
-    """Queue what arrived until it is read, decode it then, and count what became of it."""
+    """Queue what arrived until it is read, decode it then, and count what became of it; `name` is for the log."""
 
-    def __init__(self, mode: Mode, decoder: Decoder) -> None:
+    def __init__(self, mode: Mode, decoder: Decoder, *, name: str = "") -> None:
         if mode not in get_args(Mode):
             raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         self.newest_only = mode == "latest"
         self.ended = False
-        self.wake: Callable[[], object] = lambda: None
+        self.idle = False
+        """Set by whoever receives, while it waits and nothing is left to receive."""
+        self.wake: Callable[[], object] | None = None
+        self._name = name
+        self._warned = False
         self._decoder = decoder
-        self._lock = threading.Lock()  # for the tracker, the newest samples, and the capacity
-        self._capacity = threading.Condition(self._lock)
+        self._lock = threading.Lock()
         self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
-        self._every: deque[RawSample] = deque()
-        self._newest: dict[str, tuple[RawSample, int]] = {}  # with what was lost before it
+        self._every: deque[Arrival] = deque()
+        self._newest: dict[str, Arrival] = {}
         self._unreported: dict[str, int] = {}  # losses before a sample that was invalid, by key
-        self._tracker = SequenceTracker(queue_drops=self.newest_only)
+        self._tracker = SequenceTracker()
         self._announcements: deque[Miss] = deque()
-        self._received = self._superseded = self._lost_in_batches = 0
-        self._full = False  # the pump waits for capacity
+        self._questions = Questions(self._tracker)
+        self._arrived = self._taken = self._dropped = 0
+        self._received = 0
 
     @property
     def counts(self) -> Counts:
         """What became of the messages so far."""
         with self._lock:
             self._apply_announcements()
-            dropped = self._superseded + self._tracker.dropped
+            dropped = self._dropped + self._tracker.dropped
             return Counts(self._received, self._tracker.lost, dropped, self._decoder.invalid)
 
     def announce_loss(self, miss: Miss) -> None:
@@ -66,56 +78,68 @@ class ReceiveQueue:
         """Count samples that could not be queued."""
         self._decoder.count_invalid(count)
 
-    def put(self, batch: Sequence[RawSample]) -> None:
-        """Queue what arrived, in its order; what is not worth queueing is rejected."""
-        admitted = self._decoder.admit(batch)
+    def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
+        """Queue all that has arrived, in its order, and reject what is not worth queueing.
+
+        `overflowed`: it comes from a channel that was full, and perhaps dropped something.
+        """
+        arrivals = self._decoder.admit(batch)
         with self._lock:
-            if self.newest_only:
+            if self._announcements:
                 self._apply_announcements()
-                for raw in admitted:
-                    self._supersede(raw)
+            self._tracker.queue_drops = overflowed
+            self._follow(arrivals)
+            self._arrived += len(arrivals)
+            if self.newest_only:
+                for arrival in arrivals:
+                    self._supersede(arrival)
             else:
-                self._every.extend(admitted)
-        self._wake_reader()
+                self._append(arrivals)
+        if overflowed:
+            self._warn_once()
+        if self._questions:
+            self._answer(drained=True)
+
+    def ask(self, question: Question) -> None:
+        """Answer a publisher's question as soon as it can be answered; called on Zenoh's thread."""
+        with self._lock:
+            self._apply_announcements()  # of a stream that has ended nothing else does
+            self._questions.add(question)
+        self._answer(drained=self.idle)
 
     def end(self) -> None:
-        """Let readers know that nothing more comes."""
-        with self._lock:
-            self.ended = True
-            self._capacity.notify_all()
-        self._wake_reader()
+        """Let readers know that nothing more comes, and publishers that nobody reads any more."""
+        self.ended = True
+        self._answer(drained=True)
+        self.wake_reader()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until there is something to read, or the queue has ended; return False after `timeout` seconds."""
+        """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
         end = None if timeout is None else time.monotonic() + timeout
         while not (self._every or self._newest or self.ended):
             try:
                 self._wakeups.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
             except queue.Empty:
                 return False
+            if timeout is None:
+                break
         if self.ended:
-            self._wake_reader()  # for other threads that wait
+            self.wake_reader()  # for other threads that wait
         return True
-
-    def wait_for_capacity(self) -> None:
-        """Wait until fewer than 1,024 samples are queued, or the queue has ended."""
-        with self._lock:
-            self._full = True
-            self._capacity.wait_for(lambda: len(self._every) < CAPACITY or self.ended)
-            self._full = False
 
     def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
-        while (taken := self._take()) is not None:
-            raw, key, lost = taken
+        while (arrival := self._take()) is not None:
+            lost = arrival[3]
             if self._unreported:
-                lost += self._unreported.pop(key, 0)
-            sample = self._decoder.decode(raw, key, decode, lost=lost)
+                with self._lock:
+                    lost += self._unreported.pop(arrival[0].key, 0)
+            sample = self._decoder.decode(arrival, decode, lost=lost)
             if sample is not None:
                 self._received += 1
                 return sample
-            if lost and len(self._unreported) < MAX_KEYS:
-                self._unreported[key] = lost
+            with self._lock:
+                self._report_later(arrival[0].key, lost)
         return None
 
     def pop_batch(self) -> Batch | None:
@@ -123,75 +147,101 @@ class ReceiveQueue:
         from .batch import make_batch
 
         with self._lock:
-            self._apply_announcements()
-            raw = [raw for raw, _ in self._newest.values()]
-            raw += [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
-            self._newest.clear()
-            self._capacity.notify_all()
-            if not self.newest_only:
-                self._tracker.skip()  # announced losses are enough here: no single sample reports them
-            lost = self._tracker.lost - self._lost_in_batches
-        if not raw:
+            if self.newest_only:
+                taken = list(self._newest.values())
+                self._newest.clear()
+            else:
+                taken = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
+            self._taken += len(taken)
+            lost = sum(lost for _, _, _, lost in taken)
+            if self._unreported:
+                lost += sum(self._unreported.pop(key, 0) for key in {stream.key for stream, _, _, _ in taken})
+        if self._questions:
+            self._answer(drained=False)
+        if not taken:
             return None
-        keys = [str(each.key_expr) for each in raw]
-        batch = make_batch(
-            raw,
-            keys,
-            self._decoder.addresses(keys),
-            received=time.time_ns(),
-            lost=lost,
-            decode=self._decode_row,
-        )
+        batch = make_batch(taken, self._decoder, lost=lost)
         if not len(batch):
+            with self._lock:
+                self._report_later(taken[0][0].key, lost)
             return None
         self._received += len(batch)
-        self._lost_in_batches += lost
         return batch
 
-    def _take(self) -> tuple[RawSample, str, int] | None:
-        """Take the next sample, its key, and how many were lost before it; several threads may take."""
+    def wake_reader(self) -> None:
+        """Let a reader that waits look again."""
+        if self._wakeups.empty():
+            self._wakeups.put(None)
+        if self.wake is not None:
+            self.wake()
+
+    def _take(self) -> Arrival | None:
+        """Take the next sample; several threads may take."""
         with self._lock:
             if self._every:
-                raw = self._every.popleft()
-                if self._full and len(self._every) <= CAPACITY // 2:
-                    self._full = False
-                    self._capacity.notify_all()
-                self._apply_announcements()
-                key = str(raw.key_expr)
-                return raw, key, self._follow(key, raw)
-            if self._newest:
-                key = next(iter(self._newest))
-                raw, lost = self._newest.pop(key)
-                return raw, key, lost
-        return None
+                taken = self._every.popleft()
+            elif self._newest:
+                taken = self._newest.pop(next(iter(self._newest)))
+            else:
+                return None
+            self._taken += 1
+        if self._questions:
+            self._answer(drained=False)
+        return taken
 
-    def _decode_row(self, raw: RawSample, key: str) -> Row | None:
-        sample = self._decoder.decode(raw, key, decode_row)
-        return None if sample is None else sample.message
+    def _follow(self, arrivals: list[Arrival]) -> None:
+        """Note in each arrival how many messages were lost just before it."""
+        tracker = self._tracker
+        if len(arrivals) >= _MANY and len({stream for stream, _, _, _ in arrivals}) == 1:
+            infos = [raw.source_info for _, _, raw, _ in arrivals]
+            numbers = [info.source_sn for info in infos if info is not None]
+            if len(numbers) == len(arrivals) and tracker.arrived_in_order(arrivals[0][0].key, numbers):
+                return
+        for index, (stream, payload, raw, _) in enumerate(arrivals):
+            info = raw.source_info
+            if info is not None and (lost := tracker.arrived(stream.key, info)):
+                arrivals[index] = stream, payload, raw, lost
 
-    def _supersede(self, raw: RawSample) -> None:
-        key = str(raw.key_expr)
-        lost = self._follow(key, raw)
+    def _append(self, arrivals: list[Arrival]) -> None:
+        every = self._every
+        every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
+        while len(every) > CAPACITY:
+            stream, _, _, lost = every.popleft()
+            self._taken += 1
+            self._dropped += 1
+            self._report_later(stream.key, lost)
+            self._warn_once()
+
+    def _supersede(self, arrival: Arrival) -> None:
+        key = arrival[0].key
         waiting = self._newest.get(key)
-        if waiting is None and len(self._newest) >= MAX_KEYS:
-            self._superseded += 1
-            return
         if waiting is not None:
-            self._superseded += 1
-            lost += waiting[1]
-        self._newest[key] = raw, lost
+            self._dropped += 1
+            arrival = (*arrival[:3], arrival[3] + waiting[3])
+        elif len(self._newest) >= MAX_KEYS:
+            self._dropped += 1
+            return
+        self._newest[key] = arrival
 
-    def _follow(self, key: str, raw: RawSample) -> int:
-        """Return how many messages were lost just before this one."""
-        info = raw.source_info
-        return 0 if info is None else self._tracker.arrived(key, info.source_sn, lambda: str(info.source_id))
+    def _warn_once(self) -> None:
+        if not self._warned:
+            self._warned = True
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name)
+
+    def _report_later(self, key: str, lost: int) -> None:
+        if lost and len(self._unreported) < MAX_KEYS:
+            self._unreported[key] = self._unreported.get(key, 0) + lost
+
+    def _answer(self, *, drained: bool) -> None:
+        with self._lock:
+            if self.ended:
+                ready = self._questions.take_all()
+            else:
+                ready = self._questions.settle(arrived=self._arrived, taken=self._taken, drained=drained)
+        for question in ready:
+            question.reply()
 
     def _apply_announcements(self) -> None:
         while self._announcements:
             miss = self._announcements.popleft()
-            self._tracker.announce(str(miss.source), miss.nb)
-
-    def _wake_reader(self) -> None:
-        if self._wakeups.empty():
-            self._wakeups.put(None)
-        self.wake()
+            self._tracker.announce(entity_name(miss.source), miss.nb)

@@ -102,7 +102,7 @@ class Counts:
 
     `received`: handed to the reader.
     `lost`: lost in transit, and not recovered.
-    `dropped`: arrived, but superseded because this reader was slower (mode "latest" only).
+    `dropped`: arrived, but not read in time: superseded in mode "latest", beyond 65,536 that wait in mode "every".
     `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
     """
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
+
+from nedbus.transport import SourceInfo, entity_name
 
 _NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
 _LARGEST_GAP: Final = 2**30  # a step of more is not a gap: the publisher started again
@@ -39,8 +41,8 @@ class SequenceTracker:
     losses that recovery gave up on, which come before the gap, or without one at the end of a stream.
     Each message is counted once.
 
-    With `queue_drops` a queue before this tracker drops what its reader is too slow for: then only announced losses
-    are lost in transit, and the rest of a gap was dropped.
+    While `queue_drops` is set, a queue before this tracker has perhaps dropped what its reader was too slow for: then
+    only announced losses are lost in transit, and the rest of a gap was dropped.
 
     Memory is bounded: the least recently heard of more than `max_publishers` is forgotten, with what was announced for
     it counted as lost.
@@ -49,7 +51,7 @@ class SequenceTracker:
 
     def __init__(self, *, queue_drops: bool = False, max_publishers: int = _MAX_PUBLISHERS) -> None:
         self.dropped = 0
-        self._queue_drops = queue_drops
+        self.queue_drops = queue_drops
         self._max = max_publishers
         self._lost = 0
         self._announced = 0  # the sum of what is announced and not yet seen as a gap
@@ -70,27 +72,40 @@ class SequenceTracker:
             sequence.announced += count
             self._announced += count
 
-    def arrived(self, stream: str, number: int, publisher: Callable[[], str]) -> int:
-        """Note a message of a stream with its publisher's sequence number; return how many were lost just before it.
+    def arrived(self, stream: str, info: SourceInfo) -> int:
+        """Note a message of a stream with its publisher and number; return how many were lost just before it.
 
-        `publisher` returns the publisher's id, which costs more than all the rest; a stream of which 1,000 messages in
-        a row came from one publisher is followed without it, for as long as each number is the expected one.
+        The publisher's name costs more than all the rest: a stream of which 1,000 messages in a row came from one
+        publisher is followed without it, for as long as each number is the expected one.
         """
+        number = info.source_sn
         known = self._streams.get(stream)
         if known is None or known.run < SETTLED or number != known.sequence.expected:
-            return self._identify(stream, number, publisher())
+            return self._identify(stream, number, entity_name(info.source_id))
         sequence = known.sequence
         sequence.expected = (number + 1) % _NUMBERS
         if sequence.publisher in self._publishers:
             self._publishers.move_to_end(sequence.publisher)
         return 0
 
-    def skip(self) -> None:
-        """Forget all positions, as messages were taken without a look at their numbers; announced losses stay."""
-        self._lost += self._announced
-        self._announced = 0
-        self._publishers.clear()
-        self._streams.clear()
+    def arrived_in_order(self, stream: str, numbers: Sequence[int]) -> bool:
+        """Note many messages of a stream if nothing is absent among them; return False if each has to be looked at."""
+        known = self._streams.get(stream)
+        if known is None or known.run < SETTLED or known.sequence.publisher not in self._publishers:
+            return False
+        first = known.sequence.expected
+        if first + len(numbers) >= _NUMBERS or numbers != list(range(first, first + len(numbers))):
+            return False
+        known.sequence.expected = first + len(numbers)
+        self._publishers.move_to_end(known.sequence.publisher)
+        return True
+
+    def has(self, publisher: str, number: int) -> bool | None:
+        """Return whether this message arrived or is known to be lost; None if the publisher is not known."""
+        sequence = self._publishers.get(publisher)
+        if sequence is None:
+            return None
+        return (sequence.expected + sequence.announced - 1 - number) % _NUMBERS <= _LARGEST_GAP
 
     def _identify(self, stream: str, number: int, publisher: str) -> int:
         sequence = self._publishers.get(publisher)
@@ -116,7 +131,7 @@ class SequenceTracker:
 
     def _close_gap(self, sequence: _Sequence, gap: int) -> int:
         announced = min(gap, sequence.announced)
-        lost = announced if self._queue_drops else gap
+        lost = announced if self.queue_drops else gap
         sequence.announced -= announced
         self._announced -= announced
         self._lost += lost

@@ -33,6 +33,7 @@ class Subscription:
     def __init__(self, subscriber: ZenohSubscriber, receive_queue: ReceiveQueue, *, name: str, owner: object) -> None:
         self.name = name
         self._queue = receive_queue
+        self._subscriber = subscriber
         self._owner = owner  # the bus stays open for as long as somebody may read
         self._finalizer = Finalizer(self, subscriber.close)
 
@@ -82,19 +83,25 @@ class Subscription:
     def _next(self, pop: Callable[[], _T | None], timeout: float | None) -> _T:
         require_unforked()
         deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
+        if self._queue.newest_only:
+            self._subscriber.receive()  # what is queued may not be the newest any more
         while True:
             if self._queue.ended:
                 raise ClosedError
             item = pop()
             if item is not None:
                 return item
-            if not self._queue.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
+            if not self._subscriber.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
                 raise NoDataError(self.name, timeout or 0.0)
 
     def _each(self, pop: Callable[[], _T | None]) -> Iterator[_T]:
-        while not self._queue.ended:
+        receive_queue, subscriber = self._queue, self._subscriber
+        require_unforked()
+        while not receive_queue.ended:
+            if receive_queue.newest_only:
+                subscriber.receive()  # what is queued may not be the newest any more
             item = pop()
-            if item is not None:
-                yield item
+            if item is None:
+                subscriber.wait(None)
             else:
-                self._queue.wait(None)
+                yield item

@@ -1,4 +1,9 @@
-"""Zenoh's side of a subscription: the advanced subscriber, its channel, and the thread that empties it (the pump)."""
+"""Zenoh's side of a subscription: the advanced subscriber, its channel, and who empties it.
+
+The channel is a ring in Rust: Zenoh never waits for it, so that no reader holds up its session or anybody else.
+A reader that waits without a timeout empties it in its own thread. While it does something else, or waits with a
+timeout or in asyncio, the pump does: a thread that otherwise only looks ten times a second whether it is needed.
+"""
 
 from __future__ import annotations
 
@@ -13,36 +18,37 @@ import zenoh
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
+from .acknowledgement import CLOSED
+from .questions import Question
 from .receive_queue import ReceiveQueue
 
 _log = logging.getLogger(__name__)
 
-_RING: Final = 4096  # samples that wait for the pump of a `latest` reader
-_FIFO: Final = 4096  # samples that wait for the pump of an `every` reader; then Zenoh holds back, drops and recovers
-_MAX_RECEIVED: Final = 4096  # samples that the pump takes at once
-_BUSY: Final = 8  # samples at once from which on the pump pauses, to be woken once for many
-_PAUSE: Final = 0.002  # s
-# A query that is dropped without a reply is answered.
-_ACKNOWLEDGE: Final[zenoh.handlers.Callback[zenoh.Query]] = zenoh.handlers.Callback(lambda _: None, indirect=False)
+_CHANNEL: Final = 16_384  # samples that may arrive until somebody looks; more than 0.2 s of the largest fleet
+_LOOK: Final = 0.1  # s until the pump looks whether the reader has gone
+_BUSY: Final = 64  # samples at once after which a pause pays: whoever receives is woken once for many
+_PAUSE: Final = 0.001  # s
+
 _T = TypeVar("_T")
 
 
 class ZenohSubscriber:
     """Declare an advanced subscriber, and put what it receives into a ReceiveQueue until it is closed.
 
-    An `every` subscriber has a session of its own: its channel holds back when it is full, and so would everything
-    else on that session. It closes that session. It acknowledges to publishers that it has all they sent.
+    A subscriber of mode `every` answers publishers that ask whether it has what they sent.
     """
 
     def __init__(self, session: Session, key_expr: str, receive_queue: ReceiveQueue) -> None:
         every = not receive_queue.newest_only
         self._queue = receive_queue
         self._name = key_expr
-        self._session = session if every else None
         self._closing = threading.Lock()
         self._closed = False
-        channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
-        channel = zenoh.handlers.FifoChannel(_FIFO) if every else zenoh.handlers.RingChannel(_RING)
+        self._receiving = threading.Lock()  # whoever has it empties the channel
+        self._by_reader = False  # the reader has waited by itself since the pump looked
+        self._busy = False
+        self._needed = threading.Event()  # the pump is
+        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None) if every else None
         # No late-publisher detection: after a router's restart its history query would win over recovery.
         history = zenoh.ext.HistoryConfig(max_samples=1)
@@ -50,15 +56,42 @@ class ZenohSubscriber:
             self._subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, key_expr, channel, history=history, recovery=recovery
             )
-            # Zenoh answers a query in its turn: when all that came before it is in the channel.
-            self._ack = session.declare_queryable(ack_key(key_expr), _ACKNOWLEDGE) if every else None
             self._misses = self._subscriber.sample_miss_listener(
                 zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False)
             )
-        # The pump receives on the handler: a receive on the subscriber would keep it from being undeclared.
+            self._asked = session.declare_queryable(ack_key(key_expr), _questions()) if every else None
+        # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
         self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
         self._pump.start()
+        if self._asked is not None:
+            threading.Thread(target=self._listen, args=[self._asked.handler], name="nedbus-ack", daemon=True).start()
+
+    def receive(self) -> None:
+        """Queue what has arrived by now, unless the pump does so; it does not wait."""
+        self._by_reader = True
+        if self._receiving.acquire(blocking=False):
+            try:
+                if batch := _take(self._handler, []):
+                    self._put(batch)
+            finally:
+                self._receiving.release()
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until there may be something in the queue; return False after `timeout` seconds."""
+        if timeout is not None:
+            self._by_reader = False
+            self._needed.set()
+            return self._queue.wait(timeout)
+        self._by_reader = True
+        if not self._receiving.acquire(blocking=False):
+            return self._queue.wait(None)
+        try:
+            self._receive()
+        finally:
+            self._receiving.release()
+        self._queue.wake_reader()  # another thread, that could not receive
+        return True
 
     def close(self) -> None:
         """End the subscription; a second call does nothing."""
@@ -67,40 +100,93 @@ class ZenohSubscriber:
                 return
             self._closed = True
         self._queue.end()
-        # A full channel holds Zenoh's thread, which holds the lock that undeclaring needs: meanwhile the pump goes on.
         self._misses.undeclare()
+        if self._asked is not None:
+            self._asked.undeclare()
         self._subscriber.undeclare()
-        if self._session is not None:
-            self._session.close()
+        self._needed.set()
         self._pump.join(1.0)
 
     def _run(self) -> None:
         try:
-            while batch := _receive(self._handler):
-                if not self._queue.ended:
-                    self._put(batch)
-                    self._queue.wait_for_capacity()
-                    if len(batch) >= _BUSY:
-                        time.sleep(_PAUSE)
+            while not self._closed:
+                if self._by_reader or not self._receiving.acquire(blocking=False):
+                    self._by_reader = False
+                    self._needed.wait(_LOOK)
+                    self._needed.clear()
+                    continue
+                try:
+                    self._receive()
+                finally:
+                    self._receiving.release()
+                self._queue.wake_reader()
         except BaseException:
             _log.exception("%s: the subscription ends after an unexpected error", self._name)
             raise
         finally:
             self._queue.end()  # nobody waits for a pump that has ended
 
-    def _put(self, batch: list[zenoh.Sample]) -> None:
+    def _receive(self) -> None:
+        """Wait for something, and queue all that is there; the queue ends with Zenoh's side."""
+        receive_queue, handler = self._queue, self._handler
+        if self._busy:
+            time.sleep(_PAUSE)
+        receive_queue.idle = True
         try:
-            self._queue.put(batch)
+            batch = [handler.recv()]
+            item = handler.try_recv()
+            if item is not None:
+                batch.append(item)
+                _take(handler, batch)
+        except zenoh.ZError:
+            receive_queue.end()
+            return
+        finally:
+            receive_queue.idle = False
+        self._busy = len(batch) >= _BUSY
+        self._put(batch)
+
+    def _put(self, batch: list[zenoh.Sample]) -> None:
+        if self._queue.ended:
+            return
+        try:
+            self._queue.put(batch, overflowed=len(batch) >= _CHANNEL)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch))
             self._queue.count_invalid(len(batch))
 
+    def _listen(self, asked: zenoh.Handler[zenoh.Query]) -> None:
+        """Take the questions of publishers, in a thread of its own: Zenoh's would wait for the interpreter's lock."""
+        with suppress(zenoh.ZError):  # undeclared
+            while True:
+                self._ask(asked.recv())
 
-def _receive(handler: zenoh.Handler[_T]) -> list[_T]:
-    """Wait for something, and return all that is there, up to 4,096; empty once the subscriber is undeclared."""
-    batch: list[_T] = []
-    with suppress(zenoh.ZError):
-        batch.append(handler.recv())
-        while len(batch) < _MAX_RECEIVED and (item := handler.try_recv()) is not None:
+    def _ask(self, query: zenoh.Query) -> None:
+        parameters = query.parameters
+        publisher, number = parameters.get("publisher"), parameters.get("number") or ""
+        if publisher is None or not number.isdecimal() or len(number) > 10:
+            return  # dropped, and so answered: it is from a publisher that asks in another way
+        key = str(query.key_expr)
+
+        def reply() -> None:
+            try:
+                with query:
+                    query.reply(key, CLOSED if self._queue.ended else b"")
+            except zenoh.ZError as exc:  # it asked with a timeout, or is gone
+                _log.debug("%s: a question could not be answered: %s", key, exc)
+
+        self._queue.ask(Question(publisher, int(number), parameters.get("read") == "1", reply))
+
+
+def _questions() -> zenoh.handlers.RingChannel[zenoh.Query]:
+    return zenoh.handlers.RingChannel(1000)
+
+
+def _take(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+    """Add all that is there to a batch, up to a full channel, and return it."""
+    try:
+        while len(batch) < _CHANNEL and (item := handler.try_recv()) is not None:
             batch.append(item)
+    except zenoh.ZError:  # undeclared: the next wait notices
+        pass
     return batch

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
-from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, ask_all, follow_alive_keys, query
+from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -20,7 +20,18 @@ from .rmw_zenoh import (
     subscription_token,
 )
 from .router import open_router, router_endpoints
-from .session import RawSample, Session, is_forked, open_client, require_unforked, translate_error, while_open
+from .session import (
+    LEASE,
+    RawSample,
+    Session,
+    SourceInfo,
+    entity_name,
+    is_forked,
+    open_client,
+    require_unforked,
+    translate_error,
+    while_open,
+)
 from .tls import Tls
 from .uplink import UPLINK_POLL, Uplinks
 
@@ -36,6 +47,7 @@ __all__ = [
     "CA_DAYS",
     "DAYS",
     "DEFAULT_ENDPOINT",
+    "LEASE",
     "MAX_ANSWERS",
     "NO_HASH",
     "UPLINK_POLL",
@@ -43,14 +55,15 @@ __all__ = [
     "PublisherToken",
     "RawSample",
     "Session",
+    "SourceInfo",
     "Tls",
     "TopicKey",
     "Uplinks",
     "alive_keys",
     "ask_alive_keys",
-    "ask_all",
     "check_endpoints",
     "dial_endpoint",
+    "entity_name",
     "follow_alive_keys",
     "gid_of_token",
     "is_forked",

@@ -70,22 +70,6 @@ def follow_alive_keys(
     return subscriber.undeclare
 
 
-def ask_all(session: Session, key: str, *, timeout: float, priority: zenoh.Priority) -> bool:
-    """Return whether all queryables on a key answered within `timeout` seconds; also true when there is none."""
-    collector = _Collector()
-    with while_open(session):
-        session.get(
-            key,
-            collector.handler,
-            target=zenoh.QueryTarget.ALL,
-            timeout=_zenoh_timeout(timeout),
-            priority=priority,
-            congestion_control=zenoh.CongestionControl.DROP,  # a query that waits for a full queue could cut a link
-        )
-    answers = collector.wait(timeout)
-    return collector.complete and all(reply.ok is not None for reply in answers)
-
-
 class _Collector:
     """Keep the replies to one query, in a bounded amount of memory."""
 

@@ -21,23 +21,26 @@ from .tls import Tls
 
 Session = zenoh.Session
 RawSample = zenoh.Sample
+SourceInfo = zenoh.SourceInfo
 
 RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
+LEASE: Final = 5.0
+"""Seconds without a sign of life after which a peer is closed: a frozen host, a cut cable."""
+
 # What holds for every session of ours. Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
 # Longer queues than Zenoh's own take up the bursts of a fleet, where two batches are full in a moment.
-# A peer that sends nothing for as long as its lease is closed: a frozen host, a cut cable.
 # Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a timestamp.
 COMMON_SETTINGS: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "timestamping/enabled": False,
     "transport/shared_memory/enabled": False,
-    "transport/link/tx/lease": 5000,
-    "transport/link/tx/queue/size/data_high": 4,
-    "transport/link/tx/queue/size/data": 4,
+    "transport/link/tx/lease": round(1000 * LEASE),
+    "transport/link/tx/queue/size/data_high": 16,
+    "transport/link/tx/queue/size/data": 16,
 }
 
 
@@ -120,6 +123,11 @@ def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, whe
         except zenoh.ZError as exc:
             raise ConfigError(where, f"Zenoh rejects {value!r} as {key}") from exc
     return config
+
+
+def entity_name(entity: zenoh.EntityGlobalId) -> str:
+    """Return the id of a publisher or reader as text: the id of its session, and its own in that."""
+    return f"{entity.zid}:{entity.eid}"
 
 
 @contextmanager

@@ -1,0 +1,122 @@
+"""A reader that computes in pure Python: python -m benchmarks.busy_reader FORM SCRIPT ENDPOINT.
+
+It prints "ready", and once it was told and nothing more comes, what it measured as JSON: ages of messages in ms, from
+their own timestamp until they are handed out.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import zenoh
+
+import nedbus
+
+from .forms.nedbus_ends import TOPIC
+from .forms.zenoh_session import KEY, open_session
+
+QUIET = 1.0  # s without a message after which nothing more comes
+PATIENCE = 5.0  # s after the last was sent, whatever is still to come
+PAUSE = 0.01  # s that a script computes between two reads
+
+Counts = Callable[[], dict[str, int]]
+
+
+@dataclass
+class Ages:
+    """How old messages were, in ns, and how much the script has computed meanwhile."""
+
+    ages: list[int] = field(default_factory=list)
+    steps: int = 0
+
+    def take(self, stamp: int) -> None:
+        """Note one message."""
+        self.ages.append(time.monotonic_ns() - stamp)
+
+    def compute(self, seconds: float) -> None:
+        """Compute in pure Python: the interpreter is busy all the time."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            value = 1
+            for number in range(200):
+                value = value * 31 + number & 0xFFFFFF
+            self.steps += 1
+
+    def report(self, counts: dict[str, int], seconds: float) -> None:
+        """Print what was measured."""
+        ages = sorted(self.ages) or [0]
+        found = {f"p{part}": ages[len(ages) * part // 100] / 1e6 for part in (50, 99)}
+        steps = self.steps / seconds
+        print(json.dumps({"received": len(self.ages), "max": ages[-1] / 1e6, "steps": steps} | found | counts))
+
+
+def main() -> None:
+    """Read as the arguments say."""
+    form, script, endpoint = sys.argv[1:4]
+    stamps, counts = open_nedbus(form, endpoint) if form in ("every", "latest") else open_raw(form, endpoint)
+    ages = Ages()
+    print("ready", flush=True)
+    threading.Thread(target=watch, args=(ages, counts), daemon=True).start()
+    if script == "computes beside":
+        threading.Thread(target=read, args=(stamps, ages), daemon=True).start()
+        ages.compute(float("inf"))
+    read(stamps, ages, PAUSE if script == "computes between" else 0.0)
+
+
+def read(stamps: Iterator[int], ages: Ages, pause: float = 0.0) -> None:
+    """Take messages, and compute between them."""
+    for stamp in stamps:
+        ages.take(stamp)
+        if pause:
+            ages.compute(pause)
+
+
+def watch(ages: Ages, counts: Counts) -> None:
+    """Report once nothing more comes, or soon after the last was sent."""
+    start = time.monotonic()
+    sys.stdin.readline()
+    before, changed = -1, time.monotonic()
+    end = changed + PATIENCE
+    while time.monotonic() < min(end, changed + QUIET):
+        if len(ages.ages) > before:
+            before, changed = len(ages.ages), time.monotonic()
+        time.sleep(0.05)
+    ages.report(counts(), time.monotonic() - start)
+    sys.stdout.flush()
+    os._exit(0)
+
+
+def open_nedbus(form: str, endpoint: str) -> tuple[Iterator[int], Counts]:
+    """Subscribe with nedbus, in the mode that the form is named after."""
+    bus = nedbus.connect(endpoint)
+    subscription = bus.subscribe(TOPIC, mode="every" if form == "every" else "latest")
+
+    def counts() -> dict[str, int]:
+        return {"lost": subscription.counts.lost, "dropped": subscription.counts.dropped}
+
+    return (sample.message.timestamp for sample in subscription.rows()), counts
+
+
+def open_raw(form: str, endpoint: str) -> tuple[Iterator[int], Counts]:
+    """Subscribe with plain Zenoh, which counts nothing."""
+    session = open_session(endpoint)
+    channel: zenoh.handlers.FifoChannel[zenoh.Sample] | zenoh.handlers.RingChannel[zenoh.Sample]
+    channel = zenoh.handlers.FifoChannel(1024) if form == "raw fifo" else zenoh.handlers.RingChannel(1)
+    subscriber = session.declare_subscriber(KEY, channel)
+
+    def stamps() -> Iterator[int]:
+        for sample in subscriber:
+            yield int.from_bytes(sample.payload.to_bytes()[:8], "big")
+        session.close()
+
+    return stamps(), dict
+
+
+if __name__ == "__main__":
+    main()

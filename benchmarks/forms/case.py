@@ -1,0 +1,27 @@
+"""What a form is told about one run."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Case:
+    """One publisher process and one reader process.
+
+    `endpoint`: the router.
+    `vehicles`: the ids that are published; forms of other projects know one only.
+    `paced`: messages come at a rate, from a live vehicle; else as fast as they can be sent without losing any.
+    """
+
+    endpoint: str
+    vehicles: tuple[str, ...] = ("1",)
+    paced: bool = False
+
+    @property
+    def lossless(self) -> bool:
+        """Whether a publisher waits for its readers: a live one never does."""
+        return not self.paced
+
+    @property
+    def vehicle(self) -> str:
+        """What a reader subscribes to: the only vehicle, or all of them."""
+        return self.vehicles[0] if len(self.vehicles) == 1 else "*"

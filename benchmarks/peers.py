@@ -1,0 +1,59 @@
+"""The forms that are compared, and the environments of those that belong to other projects, under build/bench."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+import venv
+from pathlib import Path
+from typing import Final
+
+from .processes import ROOT
+
+FORMS: Final = ROOT / "benchmarks" / "forms"
+CORE: Final = ("raw", "straightforward", "models", "fields_in", "rows", "batches")
+"""The forms that are measured in all cases: what others are compared with, and nedbus."""
+
+
+def find_forms() -> list[str]:
+    """Return the names of all forms, the core first."""
+    names = sorted(path.stem for path in FORMS.glob("*.py") if "PACKAGES = " in path.read_text())
+    return [*CORE, *(name for name in names if name not in CORE)]
+
+
+def prepare(name: str) -> str:
+    """Return the Python that has what a form needs, installed if it is a peer's.
+
+    Raises subprocess.CalledProcessError if it cannot be installed.
+    """
+    packages = _find_packages(name)
+    if not packages:
+        return sys.executable
+    folder = ROOT / "build" / "bench" / name
+    python = folder / "bin" / "python"
+    if not python.exists():
+        print(f"installing {' '.join(packages)}", flush=True)
+        venv.create(folder, with_pip=True)
+    subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True, capture_output=True)
+    return str(python)
+
+
+def title(name: str) -> str:
+    """Return the first sentence of a form's description."""
+    doc = ast.get_docstring(_parse(name)) or name
+    return re.split(r"[.;](?:\s|$)", doc.replace("\n", " "))[0]
+
+
+def _find_packages(name: str) -> list[str]:
+    """Return what a form's PACKAGES says, without importing it."""
+    for node in _parse(name).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "PACKAGES":
+            found: list[str] = ast.literal_eval(node.value)
+            return found
+    return []
+
+
+def _parse(name: str) -> ast.Module:
+    return ast.parse(Path(FORMS / f"{name}.py").read_text())

@@ -1,0 +1,89 @@
+"""The processes of a measurement, which are told and asked by lines."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[1]
+PATIENCE: Final = 120.0  # s that a process may take to say something
+
+Process = subprocess.Popen[str]
+
+
+def start(
+    *arguments: str, python: str = sys.executable, environment: Mapping[str, str] | None = None, quiet: bool = True
+) -> Process:
+    """Start a Python process; unless it is quiet, its errors are shown."""
+    return subprocess.Popen(
+        [python, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL if quiet else None,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, **(environment or {})},
+    )
+
+
+def expect(process: Process, patience: float = PATIENCE) -> str:
+    """Return the next line that a process prints; raise TimeoutError if there is none yet, RuntimeError if it ended."""
+    assert process.stdout is not None
+    if not select.select([process.stdout], [], [], patience)[0]:
+        raise TimeoutError(f"it says nothing within {patience:.0f} s")
+    line = process.stdout.readline().strip()
+    if not line:
+        raise RuntimeError("it ended")
+    return line
+
+
+def tell(process: Process) -> None:
+    """Let a process go on; one that has ended has said all."""
+    assert process.stdin is not None
+    with suppress(BrokenPipeError):
+        process.stdin.write("\n")
+        process.stdin.flush()
+
+
+def end(*processes: Process, patience: float = 0.0) -> None:
+    """Wait for processes to end by themselves, and kill those that do not."""
+    deadline = time.monotonic() + patience
+    for process in processes:
+        try:
+            process.wait(max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+@contextmanager
+def router() -> Iterator[tuple[Process, str]]:
+    """Run a router on a free port, and give its endpoint."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    process = start("-m", "nedbus", "router", "--listen", f"tcp/127.0.0.1:{port}")
+    try:
+        _wait_for(port, process)
+        yield process, f"tcp/127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        end(process, patience=5.0)
+
+
+def _wait_for(port: int, process: Process) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while process.poll() is None and time.monotonic() < deadline:
+        with suppress(OSError):
+            socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+            return
+        time.sleep(0.1)
+    raise RuntimeError(f"the router does not start on port {port}")

@@ -1,0 +1,118 @@
+"""The results as text: docs/performance.json, and two tables for the README."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+import os
+import platform
+import re
+from typing import Final
+
+from .bars import judge
+from .forms.fields import DEFAULT_FLIGHT, FLIGHTS
+from .peers import CORE, title
+from .processes import ROOT
+from .results import FULL, KHZ, LOADS, SLOW, TEN, Measured, Results
+
+RESULTS: Final = ROOT / "docs" / "performance.json"
+README: Final = ROOT / "README.md"
+HEAD: Final = (
+    "| what | bytes | messages/s | of raw | CPU µs/message at full speed, publisher / reader"
+    " | one-way p50 / p99 at 1 kHz, µs | at 100 Hz, µs | CPU µs/message at 1 kHz |"
+)
+
+BYTES: Final = {  # of a payload of the default flight, with a timestamp in ns, without what the transport adds
+    "raw": 244, "batches": 244, "rows": 244, "models": 244, "fields_in": 244, "straightforward": 916,
+    "msgspec_array": 356, "pyzmq": 916, "rose": 953, "zrm": 250, "zenoh_ros2": 220, "cyclonedds": 220, "lcm": 200,
+}  # fmt: skip
+
+
+def table(results: Results) -> str:
+    """Return the results with the default flight as Markdown, the fastest first."""
+    flight = DEFAULT_FLIGHT
+    medians = {form: results.median(flight, FULL, form) for form in results.forms(flight, FULL)}
+    lines = [HEAD, "|---" * HEAD.count(" |") + "|"]
+    for form, full in sorted(medians.items(), key=lambda item: -item[1]["rate"]):
+        khz, slow = results.median(flight, KHZ, form), results.median(flight, SLOW, form)
+        lost = "" if full["kept"] == 1.0 else f" ({1 - full['kept']:.1%} lost)"
+        lines.append(
+            f"| {title(form)} | {BYTES[form]} | {full['rate']:,.0f}{lost} |"
+            f" {results.ratio(flight, FULL, form, 'raw', 'rate'):.2f} |"
+            f" {full['publish_cpu']:.1f} / {full['receive_cpu']:.1f} |"
+            f" {khz['p50']:.0f} / {khz['p99']:.0f} | {slow['p50']:.0f} / {slow['p99']:.0f} |"
+            f" {khz['publish_cpu']:.0f} / {khz['receive_cpu']:.0f} |"
+        )
+    lines += [f"| {form} | | {reason} | | | | | |" for form, reason in results.failed.items()]
+    return "\n".join(lines)
+
+
+def flight_table(results: Results) -> str:
+    """Return the core forms with each flight, and with ten vehicles, as Markdown."""
+    flights = results.flights(FULL)
+    head = ["form", *flights, "ten vehicles"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for form in CORE:
+        if form in results.failed:
+            continue
+        cells = [
+            f"{results.median(flight, FULL, form)['rate']:,.0f}"
+            f" · {results.ratio(flight, KHZ, form, 'raw', 'receive_cpu'):.2f}"
+            for flight in flights
+        ]
+        ten = [results.ratio(DEFAULT_FLIGHT, TEN, form, "raw", key) for key in ("publish_cpu", "receive_cpu", "p50")]
+        lines.append(
+            f"| {form.replace('_', ' ')} | {' | '.join(cells)} | {' / '.join(f'{each:.2f}' for each in ten)} |"
+        )
+    return "\n".join(lines)
+
+
+def as_json(results: Results, rounds: int) -> dict[str, object]:
+    """Return all that is known: medians and ratios by flight, load and form."""
+    measured: dict[str, dict[str, dict[str, object]]] = {}
+    for flight, name, form in results.runs:
+        load = LOADS[name]
+        entry: dict[str, object] = _rounded(results.median(flight, load, form))
+        for other in ("raw", "straightforward"):
+            if results.has(flight, load, other):
+                entry[f"of_{other}"] = _rounded(dict(results.ratios(flight, load, form, other)))
+        measured.setdefault(flight, {}).setdefault(name, {})[form] = entry
+    return {
+        "date": dt.datetime.now(dt.UTC).date().isoformat(),
+        "machine": f"{os.cpu_count()} shared cores, {platform.machine()}, Python {platform.python_version()}",
+        "rounds": rounds,
+        "flight": DEFAULT_FLIGHT,
+        "flights": {flight: content["from"] for flight, content in FLIGHTS.items()},
+        "loads": {load.name: {"rate": load.rate, "vehicles": load.vehicles} for load in LOADS.values()},
+        "bytes": BYTES,
+        "results": measured,
+        "bars": list(judge(results)),
+        "failed": results.failed,
+    }
+
+
+def _rounded(numbers: Measured) -> dict[str, object]:
+    return {key: round(value, 3) for key, value in numbers.items()}
+
+
+def as_markdown(results: Results, rounds: int) -> str:
+    """Return what stands in the README: a few sentences and two tables."""
+    about = as_json(results, rounds)
+    return (
+        f"Measured on {about['date']} on {about['machine']}, publisher, router and reader in processes of their own,"
+        f" TCP on loopback; medians of {rounds} interleaved rounds.\n"
+        f"The message is one of a real flight, {FLIGHTS[DEFAULT_FLIGHT]['from']}: valid, with no origin and no terrain"
+        " estimate.\n\n"
+        f"{table(results)}\n\n"
+        "With the messages of other flights: messages/s · the reader's CPU at 1 kHz, of raw; and with ten vehicles at"
+        " 100 Hz in one process: publisher's CPU / reader's CPU / p50, of raw:\n\n"
+        f"{flight_table(results)}"
+    )
+
+
+def write(results: Results, rounds: int) -> None:
+    """Write the results as JSON, and as tables into the README."""
+    RESULTS.write_text(json.dumps(as_json(results, rounds), indent=2) + "\n")
+    text = as_markdown(results, rounds)
+    marks = r"(<!-- performance -->\n).*?(\n<!-- /performance -->)"
+    README.write_text(re.sub(marks, lambda found: found[1] + text + found[2], README.read_text(), flags=re.DOTALL))

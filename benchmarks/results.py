@@ -1,0 +1,74 @@
+"""What was measured in all rounds, with medians and ratios; and the loads that are measured."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+Measured = dict[str, float]
+"""What one run measured: rate in messages/s, CPU times and delays in microseconds a message, peaks in MB."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """How messages are sent: `rate` of each vehicle in Hz, 0 for as fast as possible; `messages` of all together."""
+
+    name: str
+    rate: int
+    vehicles: int
+    messages: int
+
+
+FULL: Final = Load("full", 0, 1, 0)
+KHZ: Final = Load("1kHz", 1000, 1, 4000)
+SLOW: Final = Load("100Hz", 100, 1, 600)
+TEN: Final = Load("10x100Hz", 100, 10, 4000)
+LOADS: Final = {load.name: load for load in (FULL, KHZ, SLOW, TEN)}
+
+
+@dataclass
+class Results:
+    """The runs of all rounds, in their order, by flight, load and form; `failed` says why a form is not in it."""
+
+    runs: dict[tuple[str, str, str], list[Measured]] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def add(self, flight: str, load: Load, form: str, measured: Measured) -> None:
+        """Add one run."""
+        self.runs.setdefault((flight, load.name, form), []).append(measured)
+
+    def drop(self, form: str, reason: str) -> None:
+        """Forget a form that has failed."""
+        self.failed[form] = reason
+        self.runs = {key: runs for key, runs in self.runs.items() if key[2] != form}
+
+    def has(self, flight: str, load: Load, *forms: str) -> bool:
+        """Return whether all of these forms were measured."""
+        return all((flight, load.name, form) in self.runs for form in forms)
+
+    def forms(self, flight: str, load: Load) -> list[str]:
+        """Return the forms that were measured."""
+        return [form for other, name, form in self.runs if (other, name) == (flight, load.name)]
+
+    def flights(self, load: Load) -> list[str]:
+        """Return the flights that were measured."""
+        return list(dict.fromkeys(flight for flight, name, _ in self.runs if name == load.name))
+
+    def median(self, flight: str, load: Load, form: str) -> Measured:
+        """Return the medians of the rounds, and of `kept`, the share of messages that arrived, the least."""
+        runs = self.runs[flight, load.name, form]
+        medians = {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+        return medians | {"kept": min(run["kept"] for run in runs)}
+
+    def ratio(self, flight: str, load: Load, form: str, other: str, key: str) -> float:
+        """Return the median of the ratios of one form to another in the same round, which the machine's pace is in."""
+        pairs = zip(self.runs[flight, load.name, form], self.runs[flight, load.name, other], strict=True)
+        return statistics.median(one[key] / two[key] for one, two in pairs)
+
+    def ratios(self, flight: str, load: Load, form: str, other: str) -> Iterator[tuple[str, float]]:
+        """Yield the ratios of all that was measured and is not 0."""
+        for key in self.runs[flight, load.name, form][0]:
+            if all(run[key] for run in self.runs[flight, load.name, other]):
+                yield key, self.ratio(flight, load, form, other, key)

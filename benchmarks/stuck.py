@@ -1,0 +1,120 @@
+"""A reader of every message that is stuck, beside a healthy one at the same router: python -m benchmarks.stuck.
+
+It never reads, reads one message a second, or is stopped with SIGSTOP, for --seconds; then it reads on.
+Vehicle 1 is live at --rate Hz, and in all cases the healthy reader follows it; vehicle 2 is replayed by a lossless
+publisher as fast as its readers take it, --messages in all.
+
+    live    the stuck reader has vehicle 1; there is no other
+    beside  the stuck reader has vehicle 1, the healthy one both: the replay goes on
+    replay  the stuck reader has vehicle 2, the healthy one both: the replay waits, what is live goes on
+
+The bars: the healthy reader is never without a message of vehicle 1, nor of a replay that has no stuck reader, for
+more than 0.2 s; the stuck one gets a replay whole and in order, and of what is live an exact count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import time
+from typing import Any, Final
+
+from .processes import Process, end, expect, router, start, tell
+
+BEFORE: Final = 2.0  # s that all read
+AFTER: Final = 10  # s that live goes on when the stuck one reads on
+PATIENCE: Final = 120.0  # s that the replay may take then
+MAX_GAP: Final = 0.2  # s
+LIVE, REPLAYED = "1", "2"
+CASES: Final = {"live": (LIVE, [LIVE]), "beside": (LIVE, [LIVE, REPLAYED]), "replay": (REPLAYED, [LIVE, REPLAYED])}
+HABITS: Final = ("never", "slowly", "stopped")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=int, default=60)
+    parser.add_argument("--rate", type=int, default=1000)
+    parser.add_argument("--messages", type=int, default=200_000)
+    parser.add_argument("--case", choices=CASES, action="append")
+    parser.add_argument("--habit", choices=[*HABITS, "reads"], action="append")
+    arguments = parser.parse_args()
+    for case in arguments.case or CASES:
+        for habit in arguments.habit or HABITS:
+            try:
+                text = measure(case, habit, arguments.seconds, rate=arguments.rate, messages=arguments.messages)
+                print(text, flush=True)
+            except (RuntimeError, TimeoutError) as exc:
+                print(f"{case}, {habit}: MISSED: {exc}", flush=True)
+
+
+def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) -> str:
+    """Run one case, and return what became of both readers."""
+    stuck_reads, healthy_reads = CASES[case]
+    sent = {LIVE: round((BEFORE + seconds + AFTER) * rate), REPLAYED: messages}
+    with router() as (_, endpoint):
+        healthy = start("-m", "benchmarks.stuck_reader", "reads", endpoint, *healthy_reads)
+        behaves = "reads" if habit == "stopped" else habit
+        stuck = start("-m", "benchmarks.stuck_reader", behaves, endpoint, stuck_reads)
+        live = _publisher(endpoint, sent[LIVE], rate, LIVE)
+        replay = _publisher(endpoint, messages, 0, REPLAYED) if REPLAYED in healthy_reads else None
+        processes = [each for each in (healthy, stuck, live, replay) if each is not None]
+        try:
+            for process in processes:
+                expect(process)
+            tell(live)
+            time.sleep(BEFORE)
+            if replay is not None:
+                tell(replay)
+            if habit == "stopped":
+                stuck.send_signal(signal.SIGSTOP)
+            time.sleep(seconds)
+            stuck.send_signal(signal.SIGCONT)
+            tell(stuck)
+            tell(healthy)
+            expect(live, seconds + PATIENCE)
+            took = f", sent in {json.loads(expect(replay))['seconds']:.1f} s" if replay is not None else ""
+            for reader in (stuck, healthy):
+                tell(reader)
+            found = json.loads(expect(stuck)), json.loads(expect(healthy))
+        finally:
+            for process in processes[2:]:
+                tell(process)
+            end(*processes, patience=5.0)
+    return f"{case}, {habit} for {seconds} s{took}\n" + "\n".join(_describe(*found, sent, stuck_reads))
+
+
+def _publisher(endpoint: str, count: int, rate: int, vehicle: str) -> Process:
+    return start("-m", "benchmarks.role", "rows", "publish", endpoint, str(count), str(rate), vehicle)
+
+
+def _describe(stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, int], stuck_reads: str) -> list[str]:
+    lines = []
+    for vehicle, got in healthy.items():
+        waits = vehicle == REPLAYED and stuck_reads == REPLAYED
+        bar = "waits for the stuck one" if waits else _judge(got["gap"] <= MAX_GAP)
+        whole = _judge(got["received"] == sent[vehicle] and got["in order"])
+        kind = "live" if vehicle == LIVE else "replayed"
+        lines.append(
+            f"  healthy, {kind:8}: at most {got['gap']:.3f} s without a message ({bar});"
+            f" received {got['received']} of {sent[vehicle]} ({whole})"
+        )
+    for vehicle, got in stuck.items():
+        kind = "live" if vehicle == LIVE else "replayed"
+        counted = got["received"] + got["lost"] + got["dropped"]
+        fine = (counted if vehicle == LIVE else got["received"]) == sent[vehicle] and got["in order"]
+        lines.append(
+            f"  stuck,   {kind:8}: received {got['received']}, lost {got['lost']}, dropped {got['dropped']},"
+            f" together {counted} of {sent[vehicle]}, {'in order' if got['in order'] else 'NOT IN ORDER'}"
+            f" ({_judge(fine)})"
+        )
+    return lines
+
+
+def _judge(holds: bool) -> str:
+    return "holds" if holds else "MISSED"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""The readers that acknowledge, as a publisher knows them: who is there, and who may come back. Pure, without I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+RETURN: Final = 5.0
+"""Seconds that readers have to come back when the publisher's own link broke: their router restarts, perhaps."""
+
+THAW: Final = 90.0
+"""Seconds that a reader has to come back that stood still before, until Zenoh's lease ended: it may be stopped."""
+
+_UNKNOWN: Final = ""  # one that stood still before its first answer
+
+
+class Readers:
+    """Note who answers, and who has gone but may come back. Not thread-safe.
+
+    One that has gone from one question to the next, while all links are up, has ended.
+    """
+
+    def __init__(self) -> None:
+        self._there: set[str] = set()
+        self._away: dict[str, float] = {}  # and until when
+        self._stood_still = False
+
+    @property
+    def away(self) -> bool:
+        """Whether anybody may come back."""
+        return bool(self._away)
+
+    def note(self, answers: Mapping[str, bool], *, late: bool, stood_still: bool, broken: bool, now: float) -> None:
+        """Note the answers to one question, by reader: whether it is closed.
+
+        `late`: somebody has not answered in time, and is still there. `stood_still`: the question was open for long
+        after the last answer. `broken`: the publisher's own link broke meanwhile. `now` in seconds.
+        """
+        closed = {reader for reader, is_closed in answers.items() if is_closed}
+        if answers.keys() - self._there - self._away.keys():  # somebody answers for the first time
+            self._there.discard(_UNKNOWN)
+            self._away.pop(_UNKNOWN, None)
+        for reader in answers:
+            self._away.pop(reader, None)
+        self._there |= answers.keys()
+        self._stood_still |= stood_still or late
+        if (stood_still or late) and self._there <= answers.keys():
+            self._there.add(_UNKNOWN)
+        self._there -= closed
+        if late:
+            return
+        gone = self._there - answers.keys()
+        self._there -= gone
+        self._away = {reader: until for reader, until in self._away.items() if until > now}
+        if self._stood_still or broken:
+            self._away |= dict.fromkeys(gone, now + (THAW if self._stood_still else RETURN))
+        self._stood_still = False

@@ -1,0 +1,149 @@
+"""Arrays of any length: the same messages, and the same ones valid, as one by one."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nedbus_msgs import PAYLOAD_SIZE, DecodeError, Row, VehicleLocalPosition, decode_row, encode, encode_row
+from nedbus_msgs.arrays import DTYPE, decode_array, encode_array, to_array, to_row, valid_mask
+
+from .strategies import BROKEN, FLAG_FIELDS, NOT_NEGATIVE, WITHIN, messages, pack_full_width
+
+FLIGHTS = json.loads((Path(__file__).parents[1] / "data" / "flights.json").read_text())
+REAL = [encode(VehicleLocalPosition(**flight["fields"])) for flight in FLIGHTS.values()]
+FIELDS = VehicleLocalPosition(**FLIGHTS["everything set"]["fields"]).model_dump()
+# On both sides of each length at which arrays are decoded, encoded or validated in another way.
+SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
+# For each rule, values that break it.
+BREAKING: list[Mapping[str, object]] = [
+    *(
+        {flag: True, name: value}
+        for flag, names in FLAG_FIELDS.items()
+        for name in names
+        for value in (math.nan, math.inf)
+    ),
+    *({name: -1e-30} for name in NOT_NEGATIVE),
+    *({name: sign * bound * 1.0001} for name, bound in WITHIN.items() for sign in (-1, 1)),
+    {"timestamp": 2**63, "timestamp_sample": 2**63 + 1},
+]
+# Values that break no rule, though they are extremes.
+KEEPING: list[Mapping[str, object]] = [
+    *({flag: False, name: math.nan} for flag, names in FLAG_FIELDS.items() for name in names),
+    *({name: value} for name in NOT_NEGATIVE for value in (math.nan, math.inf, -0.0)),
+    *({name: sign * bound} for name, bound in WITHIN.items() for sign in (-1, 1)),
+    {"timestamp": 2**64 - 1, "timestamp_sample": 2**64 - 1},
+]
+
+
+def row_or_none(payload: bytes) -> Row | None:
+    try:
+        return decode_row(payload)
+    except DecodeError:
+        return None
+
+
+@given(
+    size=st.sampled_from(SIZES),
+    cases=st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4),
+    order=st.randoms(use_true_random=False),
+)
+def test_array_of_any_length_is_its_rows(
+    size: int, cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]], order: random.Random
+) -> None:
+    """Valid and invalid messages among each other: each is what it is alone, whatever the length of the array."""
+    choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
+    payloads = order.choices(choices, k=size)
+    rows = {payload: row_or_none(payload) for payload in choices}
+    array, valid = decode_array(b"".join(payloads))
+    assert array.dtype == DTYPE
+    assert valid.tolist() == [rows[payload] is not None for payload in payloads]
+    assert array[valid].tobytes() == np.array([row for payload in payloads if (row := rows[payload])], DTYPE).tobytes()
+    assert encode_array(array) == b"".join(payloads)
+    assert valid_mask(array).tolist() == valid.tolist()
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("changes", "expected"), [(BREAKING, False), (KEEPING, True)], ids=["breaking", "keeping"])
+def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
+    """A message that breaks any one rule is invalid, one that just keeps it is valid, and its neighbours always are."""
+    for change in changes:
+        payload = pack_full_width({**FIELDS, **change})
+        assert (row_or_none(payload) is not None) == expected, change
+        payloads = [REAL[index % len(REAL)] for index in range(size)]
+        payloads[size // 2] = payload
+        _, valid = decode_array(b"".join(payloads))
+        assert valid[size // 2] == expected, change
+        assert np.count_nonzero(~valid) == (not expected), change
+
+
+@given(
+    size=st.sampled_from(SIZES),
+    offset=st.integers(0, PAYLOAD_SIZE - 1),
+    byte=st.integers(0, 255),
+    flight=st.sampled_from(REAL),
+)
+def test_damage_of_one_payload_stays_in_it(size: int, offset: int, byte: int, flight: bytes) -> None:
+    """A payload of which one byte has become another is valid only if it decodes; all others are as they were."""
+    damaged = bytearray(flight)
+    damaged[offset] = byte
+    payloads = [flight] * size
+    payloads[size // 2] = bytes(damaged)
+    array, valid = decode_array(b"".join(payloads))
+    row = row_or_none(payloads[size // 2])
+    if valid[size // 2]:
+        assert row is not None
+        assert repr(to_row(array[size // 2])) == repr(tuple(row))  # as text, NaN equals NaN
+    elif row is not None:  # in another width than `encode` writes
+        assert encode_row(row) != payloads[size // 2]
+    others = np.arange(size) != size // 2
+    assert valid[others].all()
+    assert array[others].tobytes() == np.array([decode_row(flight)] * (size - 1), DTYPE).tobytes()
+    for name in DTYPE.names or ():
+        if DTYPE[name] == np.bool_:
+            assert array[name].view(np.uint8).max() <= 1, "a bool with another byte than 0 and 1 is undefined"
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_array_belongs_to_its_reader(size: int) -> None:
+    """The array can be written, and writing to it leaves the payloads as they are."""
+    payloads = REAL[0] * size
+    array, _ = decode_array(payloads)
+    array["x"] = 5.0
+    array["xy_valid"] = False
+    assert payloads == REAL[0] * size
+    assert decode_row(encode_array(array)[-PAYLOAD_SIZE:]).x == 5.0
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("step", [-1, 2])
+def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> None:
+    """All backwards, or every second message, need no copy first."""
+    payloads = [REAL[index % len(REAL)] for index in range(size * abs(step))]
+    part = decode_array(b"".join(payloads))[0][::step]
+    assert encode_array(part) == b"".join(payloads[::step])
+    part["eph"][size // 2] = -1.0
+    assert np.flatnonzero(~valid_mask(part)).tolist() == [size // 2]
+
+
+def test_array_without_messages_is_empty() -> None:
+    """No payloads are no messages."""
+    array, valid = decode_array(b"")
+    assert array.dtype == DTYPE
+    assert array.shape == valid.shape == (0,)
+    assert encode_array(array) == encode_array(to_array([])) == b""
+
+
+@pytest.mark.parametrize("excess", [-1, 1])
+def test_part_of_a_payload_is_an_error(excess: int) -> None:
+    """Bytes that are no whole number of payloads are not cut silently."""
+    with pytest.raises(ValueError, match="reshape"):
+        decode_array(bytes(2 * PAYLOAD_SIZE + excess))

@@ -1,0 +1,183 @@
+"""A lossless publisher's readers, and Zenoh between them, in a time that goes on only while somebody waits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Final, Self, cast
+
+import pytest
+import zenoh
+
+from nedbus.client import acknowledgement as module
+from nedbus.client.acknowledgement import CLOSED, Acknowledgement
+from nedbus.transport import LEASE, Session
+
+from .raw_samples import Payload
+
+KEY: Final = "nedbus/1/vehicle_local_position"
+_TICK: Final = 0.01  # s
+_END: Final = 3600.0  # s after which whoever still waits is stuck
+
+
+class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
+    """Raised when a wait does not end within an hour."""
+
+
+@dataclass(eq=False)
+class Reader:
+    """A reader that takes so many messages a second; its connection breaks `lease` seconds after it was stopped."""
+
+    name: str
+    rate: float = math.inf
+    read: float = 0.0
+    alive: bool = True
+    closed: bool = False
+    stopped: float | None = None  # since when
+
+    def is_linked(self, now: float) -> bool:
+        return self.alive and (self.stopped is None or now - self.stopped < LEASE)
+
+    def is_running(self) -> bool:
+        return self.alive and self.stopped is None
+
+
+@dataclass(eq=False)
+class Query:
+    """A query of the publisher, and the readers that still have to answer it."""
+
+    parameters: dict[str, str]
+    callback: zenoh.handlers.Callback[zenoh.Reply]
+    end: float
+    waiting: list[Reader]
+
+    @property
+    def number(self) -> int:
+        return int(self.parameters["number"])
+
+
+@dataclass(eq=False)
+class World:
+    """The session of the publisher, its clock and its condition; everything happens in the thread that waits."""
+
+    readers: list[Reader] = field(default_factory=list)
+    now: float = 0.0
+    published: int = 0
+    sent: list[float] = field(default_factory=list)  # when each message was sent
+    asked: list[dict[str, str]] = field(default_factory=list)  # the parameters of each query
+    pending: list[Query] = field(default_factory=list)
+    plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
+    routers: list[str] = field(default_factory=lambda: ["r1"])
+    notified: bool = False
+    closed: bool = False
+
+    def acknowledgement(self, monkeypatch: pytest.MonkeyPatch) -> Acknowledgement:
+        """Return an acknowledgement that lives here."""
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(module, "threading", SimpleNamespace(Condition=lambda: self))
+        publisher = cast("zenoh.ext.AdvancedPublisher", SimpleNamespace(id=SimpleNamespace(zid="p", eid=1)))
+        return Acknowledgement(cast("Session", self), KEY, publisher, priority=zenoh.Priority.DATA)
+
+    def publish(self, acknowledgement: Acknowledgement, count: int, *, rate: float = 10_000.0) -> None:
+        """Publish so many messages, so many a second where nothing holds it up."""
+        for _ in range(count):
+            self.advance(1 / rate)
+            self.published += 1
+            self.sent.append(self.now)
+            acknowledgement.pace(self.published)
+
+    def plan(self, seconds: float, action: Callable[[], object]) -> None:
+        """Let something happen in so many seconds."""
+        self.plans.append((self.now + seconds, action))
+
+    def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
+        """Let the link of the publisher break for a second, and that of a reader for longer."""
+        self.plan(at, lambda: setattr(reader, "alive", False))
+        self.plan(at, self.routers.clear)
+        self.plan(at + 1.0, lambda: self.routers.append("r2"))
+        self.plan(until, lambda: setattr(reader, "alive", True))
+
+    def advance(self, seconds: float) -> None:
+        """Let time go by."""
+        self.now += seconds
+        if self.now > _END:
+            raise Stuck
+        for plan in [plan for plan in self.plans if plan[0] <= self.now]:
+            self.plans.remove(plan)
+            plan[1]()
+        for reader in self.readers:
+            if reader.is_running():
+                reader.read = min(self.published, reader.read + reader.rate * seconds)
+        for query in list(self.pending):
+            self._answer(query)
+
+    def is_linked(self, reader: Reader) -> bool:
+        """Whether a query reaches this reader."""
+        return bool(self.routers) and reader.is_linked(self.now)
+
+    def longest_pause(self, since: float = 0.0) -> float:
+        """Return for how long at most no message was sent."""
+        times = [since, *(each for each in self.sent if each >= since)]
+        return max(later - earlier for earlier, later in pairwise(times))
+
+    # What an acknowledgement needs of a session.
+
+    @property
+    def info(self) -> SimpleNamespace:
+        return SimpleNamespace(routers_zid=self.routers.copy)
+
+    def is_closed(self) -> bool:
+        return self.closed
+
+    def get(
+        self, selector: str, callback: zenoh.handlers.Callback[zenoh.Reply], *, timeout: float, **options: object
+    ) -> None:
+        if self.closed:
+            raise zenoh.ZError("session closed")
+        key, _, parameters = selector.partition("?")
+        assert key == f"{KEY}/@ack"
+        parsed = dict(each.split("=") for each in parameters.split(";"))
+        self.asked.append(parsed)
+        linked = [reader for reader in self.readers if self.is_linked(reader) and not reader.closed]
+        self.pending.append(Query(parsed, callback, self.now + timeout, linked))
+
+    # What it needs of a condition.
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def wait(self, timeout: float) -> None:
+        end, self.notified = self.now + timeout, False
+        while not self.notified and self.now < end:
+            self.advance(min(_TICK, end - self.now) or _TICK)
+
+    def notify_all(self) -> None:
+        self.notified = True
+
+    def _answer(self, query: Query) -> None:
+        for reader in list(query.waiting):
+            if not self.is_linked(reader):
+                query.waiting.remove(reader)
+            elif reader.closed:
+                self._reply(query, reader, CLOSED)
+            elif reader.is_running() and (query.parameters["read"] == "0" or reader.read > query.number):
+                self._reply(query, reader, b"")
+        late = bool(query.waiting)
+        if late and self.now < query.end:
+            return
+        self.pending.remove(query)
+        if late:
+            query.callback.callback(cast("zenoh.Reply", SimpleNamespace(ok=None)))
+        assert query.callback.drop is not None
+        query.callback.drop()
+
+    def _reply(self, query: Query, reader: Reader, payload: bytes) -> None:
+        query.waiting.remove(reader)
+        answer = SimpleNamespace(ok=SimpleNamespace(payload=Payload(payload)), replier_id=reader.name)
+        query.callback.callback(cast("zenoh.Reply", answer))

@@ -1,0 +1,108 @@
+"""Samples and sequences made by hand: Python cannot make Zenoh's samples, these have the attributes that are read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import cast
+
+import zenoh
+
+import nedbus
+from nedbus import Mode
+from nedbus.client.decoder import Decoder
+from nedbus.client.layout_lookup import LayoutLookup
+from nedbus.client.receive_queue import ReceiveQueue
+from nedbus.client.sequence_tracker import SequenceTracker
+from nedbus.transport import RawSample
+from nedbus_msgs import decode, encode, encoding_of
+from tests.conftest import message
+
+KEY = "nedbus/1/vehicle_local_position"
+OTHER_KEY = "nedbus/2/vehicle_local_position"
+SOURCE = encoding_of("sim")
+
+
+class Payload(bytes):
+    """Zenoh's bytes."""
+
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+VALID = Payload(encode(message(1)))
+INVALID = Payload(bytes(len(VALID)))  # of the right size, so that only its reader notices
+
+
+@dataclass(slots=True)
+class Raw:
+    """What is read of a sample of Zenoh."""
+
+    payload: Payload
+    key_expr: str = KEY
+    source_info: object = None
+    kind: zenoh.SampleKind = field(default_factory=lambda: zenoh.SampleKind.PUT)
+    encoding: str = SOURCE
+    timestamp: object = None
+
+
+def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
+    """Return the sequence number of a message, and its publisher: the first of the session with this name."""
+    entity = SimpleNamespace(zid=publisher, eid=1)
+    return cast("zenoh.SourceInfo", SimpleNamespace(source_sn=number, source_id=entity))
+
+
+def name_of(publisher: str) -> str:
+    """Return what the sequence tracker calls a publisher."""
+    return f"{publisher}:1"
+
+
+def follow(tracker: SequenceTracker, *numbers: int, stream: str = "key", publisher: str = "a") -> list[int]:
+    """Return what was lost just before each of these numbers."""
+    return [tracker.arrived(stream, source_info(number, publisher)) for number in numbers]
+
+
+def raw(
+    number: int | None,
+    *,
+    timestamp: int = 1,
+    key: str = KEY,
+    publisher: str = "a",
+    payload: Payload | None = None,
+    encoding: str = SOURCE,
+    stamp: object = None,
+) -> RawSample:
+    """Return a sample with a publisher's sequence number, None for one without."""
+    info = None if number is None else source_info(number, publisher)
+    if payload is None:
+        payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))
+    return cast("RawSample", Raw(payload, key, info, encoding=encoding, timestamp=stamp))
+
+
+def junk(payload: bytes, key: str = KEY) -> RawSample:
+    """Return a sample with this payload, and without a sequence number."""
+    return cast("RawSample", Raw(Payload(payload), key))
+
+
+def miss(count: int, publisher: str = "a") -> zenoh.ext.Miss:
+    """Return Zenoh's announcement that messages of a publisher are lost."""
+    return cast("zenoh.ext.Miss", SimpleNamespace(source=SimpleNamespace(zid=publisher, eid=1), nb=count))
+
+
+def make_queue(mode: Mode, *, layouts: Mapping[int, Sequence[str]] | None = None) -> ReceiveQueue:
+    """Return an empty queue that knows these layouts besides PX4's."""
+    return ReceiveQueue(mode, Decoder(LayoutLookup((layouts or {}).get), prefix="nedbus"), name="queue")
+
+
+def drain(receive_queue: ReceiveQueue) -> list[nedbus.Sample]:
+    """Take all that is queued."""
+    taken = []
+    while (sample := receive_queue.pop(decode)) is not None:
+        taken.append(sample)
+    return taken
+
+
+def timestamps(receive_queue: ReceiveQueue) -> list[int]:
+    """Take all that is queued, and return the timestamp of each."""
+    return [sample.message.timestamp for sample in drain(receive_queue)]

@@ -1,0 +1,127 @@
+"""The readers that a publisher knows: who is away, and for how long; at times that the test gives."""
+
+from __future__ import annotations
+
+import pytest
+
+from nedbus.client.readers import RETURN, THAW, Readers
+
+
+def note(
+    readers: Readers,
+    now: float,
+    *answers: str,
+    late: bool = False,
+    stood_still: bool = False,
+    broken: bool = False,
+) -> bool:
+    """Note who answered a question, with a minus before one that is closed; return whether anybody is away."""
+    by_reader = {each.removeprefix("-"): each.startswith("-") for each in answers}
+    readers.note(by_reader, late=late, stood_still=stood_still, broken=broken, now=now)
+    return readers.away
+
+
+def away_for(readers: Readers, start: float, *answers: str) -> float:
+    """Return for how many seconds somebody is still away where these readers answer twice a second."""
+    now = start
+    while note(readers, now, *answers):
+        now += 0.5
+    return now - start
+
+
+def test_nobody_is_away_where_all_answer() -> None:
+    """Also when new ones come, and when nobody is there."""
+    readers = Readers()
+    assert not note(readers, 0.0)
+    assert not note(readers, 1.0, "a")
+    assert not note(readers, 2.0, "a", "b")
+
+
+def test_reader_that_has_gone_has_ended() -> None:
+    """It was closed between two questions, or killed: the publisher's own link is up, and nobody stood still."""
+    readers = Readers()
+    note(readers, 0.0, "a", "b")
+    assert not note(readers, 10.0, "b")
+    assert not note(readers, 20.0, "b", broken=True)  # forgotten
+
+
+def test_reader_may_return_for_5_seconds_where_the_link_of_the_publisher_broke() -> None:
+    """The router has restarted, perhaps, and the reader comes back to it too."""
+    readers = Readers()
+    note(readers, 0.0, "a", "b")
+    assert note(readers, 10.0, broken=True)
+    assert away_for(readers, 10.0, "b") == pytest.approx(RETURN, abs=0.6)
+    assert not note(readers, 100.0, "b", broken=True)  # forgotten
+
+
+def test_reader_that_returns_is_not_away_any_more() -> None:
+    """It answers, and may go again."""
+    readers = Readers()
+    note(readers, 0.0, "a")
+    assert note(readers, 10.0, broken=True)
+    assert not note(readers, 12.0, "a")
+    assert note(readers, 20.0, broken=True)
+    assert away_for(readers, 20.0) == pytest.approx(RETURN, abs=0.6)
+
+
+def test_reader_that_is_closed_is_not_waited_for() -> None:
+    """It says so, with its last answer."""
+    readers = Readers()
+    note(readers, 0.0, "a", "b")
+    assert not note(readers, 1.0, "-a", "b")
+    assert not note(readers, 2.0, "b")
+
+
+def test_closed_reader_that_was_never_seen_is_not_waited_for() -> None:
+    """Its first answer may be its last."""
+    readers = Readers()
+    assert not note(readers, 0.0, "-a")
+    assert not note(readers, 1.0)
+
+
+def test_reader_that_stood_still_may_return_for_90_seconds() -> None:
+    """The question was open until Zenoh's lease ended: it may have been stopped."""
+    readers = Readers()
+    note(readers, 0.0, "a", "b")
+    assert note(readers, 10.0, "b", stood_still=True)
+    assert away_for(readers, 10.0, "b") == pytest.approx(THAW, abs=0.6)
+
+
+def test_reader_that_stood_still_before_its_first_answer_may_return_for_90_seconds() -> None:
+    """Nobody knows its name, and somebody was there; the first one with a new name is it."""
+    readers = Readers()
+    assert note(readers, 0.0, stood_still=True)
+    assert note(readers, 80.0)
+    assert not note(readers, 81.0, "a")
+    forgotten = Readers()
+    note(forgotten, 0.0, stood_still=True)
+    assert away_for(forgotten, 0.0) == pytest.approx(THAW, abs=0.6)
+
+
+def test_late_reader_is_there() -> None:
+    """It was asked, is connected, and has not answered in time: there is nothing to wait for but its answer."""
+    readers = Readers()
+    note(readers, 0.0, "a", "b")
+    assert not note(readers, 10.0, "b", late=True)
+    assert not note(readers, 20.0, late=True)
+    assert not note(readers, 21.0, "a", "b")
+
+
+def test_late_reader_that_answers_leaves_nobody_away() -> None:
+    """Known before or not, beside others or alone."""
+    for before in ([], ["a"], ["b"], ["a", "b"]):
+        readers = Readers()
+        note(readers, 0.0, *before)
+        note(readers, 10.0, "b", late=True)
+        assert not note(readers, 11.0, "a", "b")
+        assert not note(readers, 12.0, "a", "b")
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_late_reader_that_has_gone_may_return_for_90_seconds(known: bool) -> None:
+    """A question that was late and one that ended with the lease are one and the same standstill."""
+    readers = Readers()
+    note(readers, 0.0, *(["a", "b"] if known else ["b"]))
+    note(readers, 10.0, "b", late=True)
+    assert note(readers, 11.0, "b")
+    assert away_for(readers, 11.0, "b") == pytest.approx(THAW, abs=0.6)

@@ -1,0 +1,131 @@
+"""Readers that stand still, are stopped, die or are slow: nobody else waits for them, and nothing is lost unseen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+
+import pytest
+
+import nedbus
+from nedbus.client.acknowledgement import WINDOW
+from nedbus_msgs.arrays import to_array
+from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
+
+VLP = "vehicle_local_position"
+COUNT = 3 * WINDOW
+
+READER = """
+import sys, nedbus
+with nedbus.connect(sys.argv[1]) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+    print("ready", flush=True)
+    for number, sample in enumerate(subscription, 1):
+        if sample.message.timestamp != number or sample.lost:
+            sys.exit(f"{sample.message.timestamp} in place of {number}, {sample.lost} lost")
+        if number == 10 and len(sys.argv) > 2:
+            print("ten", flush=True)
+        if number == int(sys.argv[-1]):
+            break
+    counts = subscription.counts
+print("whole" if counts == nedbus.Counts(received=number) else counts, flush=True)
+"""
+
+
+def publish_all(bus: nedbus.Bus, *, count: int = COUNT) -> tuple[nedbus.Publisher, threading.Thread]:
+    """Start to publish messages without losing any, once there is a reader."""
+    publisher = bus.publisher(VLP, vehicle="1", lossless=True)
+    wait_for_reader(bus._session, publisher.key)
+    messages = to_array([message(number) for number in range(1, count + 1)])
+    thread = threading.Thread(target=publisher.publish_many, args=[messages], daemon=True)
+    thread.start()
+    return publisher, thread
+
+
+def test_subscription_that_is_never_read_harms_nobody(endpoint: str, bus: nedbus.Bus) -> None:
+    """Neither another subscription of its own bus, nor another process's, nor closing: all get all that is live."""
+    with nedbus.connect(endpoint) as own, nedbus.connect(endpoint) as other:
+        unread = [own.subscribe(VLP, mode="every") for _ in range(3)]
+        read = [own.subscribe(VLP, mode="every"), other.subscribe(VLP, mode="every")]
+        publisher = bus.publisher(VLP, vehicle="1")
+        wait_for_reader(bus._session, publisher.key)
+        publisher.publish(message(1))
+        assert [each.receive(DEADLINE).message.timestamp for each in read] == [1, 1]
+        for start in range(2, 20_002, 200):
+            for number in range(start, start + 200):
+                publisher.publish(message(number))
+            for each in read:
+                got = [each.receive(DEADLINE).message.timestamp for _ in range(200)]
+                assert got == list(range(start, start + 200))
+        assert [each.receive(DEADLINE).message.timestamp for each in unread] == [1, 1, 1]
+
+
+def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(endpoint: str, bus: nedbus.Bus) -> None:
+    """More than a window is not sent at once while one reader reads nothing, but others see more; both get all."""
+    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as two:
+        stuck, healthy = one.subscribe(VLP, mode="every"), two.subscribe(VLP, mode="every")
+        publisher, sending = publish_all(bus)
+        got = [healthy.receive(DEADLINE).message.timestamp for _ in range(WINDOW + 5)]
+        assert got == list(range(1, WINDOW + 6))
+        assert publisher.published < COUNT
+        late: list[int] = []
+        reading = threading.Thread(
+            target=lambda: late.extend(stuck.receive(DEADLINE).message.timestamp for _ in range(COUNT)), daemon=True
+        )
+        reading.start()
+        got += [healthy.receive(DEADLINE).message.timestamp for _ in range(COUNT - WINDOW - 5)]
+        reading.join(DEADLINE)
+        assert late == got == list(range(1, COUNT + 1))
+        sending.join(DEADLINE)
+        assert not sending.is_alive()
+        assert stuck.counts == healthy.counts == nedbus.Counts(received=COUNT)
+
+
+@pytest.mark.parametrize("when", ["before", "amid"])
+def test_stopped_reader_gets_everything(start: Start, endpoint: str, bus: nedbus.Bus, when: str) -> None:
+    """One that is stopped (SIGSTOP) until Zenoh's lease has ended comes back, and has lost nothing."""
+    reader = start("-c", READER, endpoint, str(COUNT))
+    wait_for(lambda: "ready" in reader.out, what="the reader")
+    routers = bus.routers
+    assert routers == (endpoint,)
+    if when == "before":
+        reader.popen.send_signal(signal.SIGSTOP)
+    publisher, sending = publish_all(bus)
+    if when == "amid":
+        wait_for(lambda: publisher.published >= 300, what="the first messages")
+        reader.popen.send_signal(signal.SIGSTOP)
+    if sending.is_alive():
+        gone = publisher._acknowledgement._readers
+        wait_for(lambda: gone.away or not sending.is_alive(), what="the end of the lease")
+    reader.popen.send_signal(signal.SIGCONT)
+    assert reader.wait(60.0) == 0, reader.err
+    assert reader.out.split()[-1] == "whole"
+    sending.join(DEADLINE)
+    assert not sending.is_alive()
+
+
+def kill(reader: Process) -> None:
+    os.kill(reader.popen.pid, signal.SIGKILL)
+
+
+def interrupt(reader: Process) -> None:
+    reader.popen.send_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("end", [kill, interrupt])
+def test_reader_that_dies_is_given_up(
+    start: Start, endpoint: str, bus: nedbus.Bus, end: Callable[[Process], None]
+) -> None:
+    """A replay goes on without one that is killed, or ends, and others miss nothing."""
+    slow = READER.replace("if number ==", "import time; time.sleep(0.05)\n        if number ==", 1)
+    reader = start("-c", slow, endpoint, "slow", str(COUNT))
+    wait_for(lambda: "ready" in reader.out, what="the reader")
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        _, sending = publish_all(bus)
+        wait_for(lambda: "ten" in reader.out, what="the first messages")
+        end(reader)
+        got = [subscription.receive(DEADLINE).message.timestamp for _ in range(COUNT)]
+        assert got == list(range(1, COUNT + 1))
+        sending.join(DEADLINE)
+        assert not sending.is_alive()
