@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, describe, json_schema
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, describe, encode, encode_fields, json_schema
 from nedbus_msgs.arrays import to_array
 
-from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, messages
+from .strategies import FLAG_FIELDS, NOT_NEGATIVE, WITHIN, bits, fields, messages
 
 FLOATS = [name for name, kind in FIELD_TYPES.items() if kind == "float32"]
 
@@ -248,3 +249,21 @@ def test_element_of_an_array_makes_a_message() -> None:
     [element] = to_array([VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))])
     fields = {name: element[name] for name in FIELD_TYPES}
     assert VehicleLocalPosition(**fields) == VehicleLocalPosition(timestamp=3, x=1.0, delta_vxy=(1.0, 2.0))
+
+
+@given(fields=fields(), names=st.sets(st.sampled_from(sorted(FIELD_TYPES))))
+def test_fields_that_are_not_given_are_the_same_on_the_fast_path(fields: dict[str, object], names: set[str]) -> None:
+    """A message of some fields is made, and encoded, without the model's validator: as the model would do it."""
+    given_fields: dict[str, Any] = {"timestamp": fields["timestamp"], **{name: fields[name] for name in sorted(names)}}
+    try:
+        slow = VehicleLocalPosition.model_validate(given_fields)
+    except ValidationError:
+        with pytest.raises(ValidationError):
+            VehicleLocalPosition(**given_fields)
+        with pytest.raises(ValidationError):
+            encode_fields(given_fields)
+        return
+    fast = VehicleLocalPosition(**given_fields)
+    assert fast == slow
+    assert fast.model_fields_set == slow.model_fields_set == given_fields.keys()
+    assert encode_fields(given_fields) == encode(slow)
