@@ -13,7 +13,7 @@ from typing import Final, cast
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
-from .float32 import round_to_float32
+from .float32 import name_rounded
 from .px4_types import NAN, TYPES, TypeName
 from .rows import FIELD_TYPES, NAMES, Values
 from .rules import make_fast_check
@@ -62,9 +62,7 @@ def validate_fields(fields: Mapping[str, object]) -> dict[str, object] | None:
     row = row_of(fields)
     if row is None:
         return None
-    values = dict(zip(NAMES, row, strict=True))
     try:
-        round_to_float32(values)
+        return name_rounded(row)
     except OverflowError:
         return None
-    return values

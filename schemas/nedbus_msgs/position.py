@@ -15,7 +15,7 @@ from .equivalents import to_python
 from .fast_path import validate_fields
 from .float32 import float32_overflows, round_to_float32
 from .px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
-from .rows import NAMES, Row, Values
+from .rows import NAMES, TEMPLATE, Row, Values
 from .rules import make_fast_check, violations
 
 _passes_rules = make_fast_check({name: name for name in NAMES})
@@ -188,7 +188,9 @@ def _validation_error(values: Mapping[str, object], broken: Iterable[tuple[str, 
 def message_of(row: Values) -> VehicleLocalPosition:
     """Return the message of a row that is valid and rounded to float32, without validating it again."""
     message = VehicleLocalPosition.__new__(VehicleLocalPosition)
-    _fill(message, dict(zip(NAMES, row, strict=True)), _ALL)
+    values = TEMPLATE.copy()
+    values.update(zip(NAMES, row, strict=True))
+    _fill(message, values, _ALL)
     return message
 
 

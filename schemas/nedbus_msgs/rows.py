@@ -88,3 +88,6 @@ FIELD_TYPES: Final[Mapping[str, TypeName]] = {
 """PX4's type of every field, in PX4's order."""
 
 NAMES: Final = Row._fields
+
+TEMPLATE: Final[dict[str, object]] = dict.fromkeys(NAMES)
+"""All names in PX4's order: a copy that is filled takes less time than a dict that grows."""
