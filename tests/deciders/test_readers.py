@@ -125,3 +125,13 @@ def test_late_reader_that_has_gone_may_return_for_90_seconds(known: bool) -> Non
     note(readers, 10.0, "b", late=True)
     assert note(readers, 11.0, "b")
     assert away_for(readers, 11.0, "b") == pytest.approx(THAW, abs=0.6)
+
+
+def test_reader_that_answered_and_ended_is_not_waited_for_beside_a_silent_one() -> None:
+    """Who is suspected of standing still is the one that did not answer, not one that did and was closed."""
+    readers = Readers()
+    assert not note(readers, 10.0, "a", late=True)
+    assert not note(readers, 10.1, "b")
+    assert not note(readers, 20.0, "b", late=True)
+    assert note(readers, 20.1), "the silent one may have been stopped"
+    assert not note(readers, 20.1 + THAW)

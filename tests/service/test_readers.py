@@ -129,3 +129,15 @@ def test_reader_that_dies_is_given_up(
         assert got == list(range(1, COUNT + 1))
         sending.join(DEADLINE)
         assert not sending.is_alive()
+
+
+def test_flush_waits_for_arrival_and_not_for_scripts(endpoint: str, bus: nedbus.Bus) -> None:
+    """What has arrived at a script that reads nothing is safe: the end of a replay does not wait until it is read."""
+    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as two:
+        unread, read = one.subscribe(VLP, mode="every"), two.subscribe(VLP, mode="every")
+        publisher, sending = publish_all(bus, count=WINDOW // 2)
+        assert [read.receive(DEADLINE).message.timestamp for _ in range(WINDOW // 2)][-1] == WINDOW // 2
+        read.close()
+        sending.join(DEADLINE)
+        assert publisher.flush(DEADLINE)
+        assert [unread.receive(DEADLINE).message.timestamp for _ in range(WINDOW // 2)][-1] == WINDOW // 2

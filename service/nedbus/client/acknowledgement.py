@@ -112,6 +112,8 @@ class Acknowledgement:
         end = time.monotonic() + timeout
         with self._changed:
             self._settle()
+            if self._question is not None and self._question.read:
+                self._question = None  # what has arrived is known sooner than what is read
             arrived, self._arrived = self._arrived, min(self._arrived, published - 1)  # who reads may have changed
             while self._arrived < published:
                 left = end - time.monotonic()

@@ -23,7 +23,7 @@ class Readers:
     def __init__(self) -> None:
         self._there: set[str] = set()
         self._away: dict[str, float] = {}  # and until when
-        self._stood_still = False
+        self._silent: set[str] = set()  # who has not answered for long
 
     @property
     def away(self) -> bool:
@@ -43,15 +43,17 @@ class Readers:
         for reader in answers:
             self._away.pop(reader, None)
         self._there |= answers.keys()
-        self._stood_still |= stood_still or late
-        if (stood_still or late) and self._there <= answers.keys():
-            self._there.add(_UNKNOWN)
+        if stood_still or late:
+            silent = self._there - answers.keys()
+            self._there |= silent or {_UNKNOWN}
+            self._silent |= silent or {_UNKNOWN}
         self._there -= closed
         if late:
             return
         gone = self._there - answers.keys()
         self._there -= gone
         self._away = {reader: until for reader, until in self._away.items() if until > now}
-        if self._stood_still or broken:
-            self._away |= dict.fromkeys(gone, now + (THAW if self._stood_still else RETURN))
-        self._stood_still = False
+        self._away |= dict.fromkeys(gone & self._silent, now + THAW)
+        if broken:
+            self._away |= dict.fromkeys(gone - self._silent, now + RETURN)
+        self._silent.clear()
