@@ -101,7 +101,7 @@ class ReceiveQueue:
             self._answer(drained=True)
 
     def ask(self, question: Question) -> None:
-        """Answer a publisher's question as soon as it can be answered; called on Zenoh's thread."""
+        """Answer a publisher's question as soon as it can be answered; called in a thread of its own."""
         with self._lock:
             self._apply_announcements()  # of a stream that has ended nothing else does
             self._questions.add(question)
