@@ -753,6 +753,13 @@ def test_vehicle_may_be_a_number(client: Client, bus: nedbus.Bus) -> None:
     assert client.latest(vehicle=8) == []
 
 
+def test_single_message_reaches_whoever_subscribes_next(client: Client, bus: nedbus.Bus) -> None:
+    """The router knows a publisher before it can publish: else one of 300 was never seen, beside three busy loops."""
+    for vehicle in range(100):
+        bus.publisher(VLP, vehicle=vehicle).publish(message(1))
+        assert client.subscribe(vehicle=vehicle).receive(DEADLINE).message.timestamp == 1
+
+
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
 def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
     """A script may queue samples for another process, or keep them in a set; the time when it was sent stays exact."""

@@ -123,14 +123,16 @@ class Bus:
     ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
+        The router knows it then: whoever subscribes from now on gets the last message, be there only one.
         `lossless` is for replays as fast as readers take them: while a reader of mode "every" has more than 2,000
         messages to read, `publish` waits for it, and sends 10 a second meanwhile; `close` waits until they have all.
         `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
         """
         self._require_open()
-        return self._publishers.publisher(
-            Address(vehicle_name(vehicle), topic, instance), lossless=lossless, source=source, owner=self
-        )
+        address = Address(vehicle_name(vehicle), topic, instance)
+        publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
+        self._publishers.is_alive(address)  # what was declared before an answer came is known to whoever gave it
+        return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float = 3.0) -> Session:
         """Open another Zenoh session at the same routers, or at another one; the caller closes it."""
