@@ -20,7 +20,17 @@ from .frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from .layouts import CURRENT, LAYOUTS, WIRE_LAYOUTS, Layout, downgrade, find_layout, upgrade, upgraded_names
+from .layouts import (
+    CURRENT,
+    LAYOUTS,
+    WIRE_LAYOUTS,
+    Layout,
+    downgrade,
+    find_layout,
+    upgrade,
+    upgrade_fields,
+    upgraded_names,
+)
 from .position import Message, VehicleLocalPosition
 from .provenance import Provenance, encoding_of, provenance_of
 from .resets import Continuous, Quantity, ResetTracker
@@ -124,6 +134,7 @@ __all__ = [
     "to_local",
     "type_hash",
     "upgrade",
+    "upgrade_fields",
     "upgraded_names",
     "variances_enu_to_ned",
     "variances_ned_to_enu",

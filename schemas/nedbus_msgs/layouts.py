@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from .errors import LayoutError
 from .position import VehicleLocalPosition
@@ -103,7 +103,12 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None) -> VehicleL
     """
     if layout is not None:
         require_fields(fields, get_layout(layout))
-    return VehicleLocalPosition.model_validate({name: fields[old] for name, old in upgraded_names(fields).items()})
+    return VehicleLocalPosition(**upgrade_fields(fields))
+
+
+def upgrade_fields(fields: Mapping[str, object]) -> dict[str, Any]:
+    """Return the fields of a message by the names of the current layout, as `upgrade` does, not validated yet."""
+    return {name: fields[old] for name, old in upgraded_names(fields).items()}
 
 
 def upgraded_names(names: Iterable[str]) -> Mapping[str, str]:

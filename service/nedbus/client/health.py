@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from functools import partial
+from typing import Final, cast
 
 from nedbus_msgs import DOUBT_FLAGS, TOPICS, Address, Message
 
@@ -99,8 +100,11 @@ class StreamHealth:
         self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
         self._window = self._last_window = _Window(0)
 
-    def add(self, message: Message, *, received: int, latency: float | None = None, lost: int = 0) -> None:
-        """Add a message that was received at this time [ns]."""
+    def add(
+        self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
+    ) -> None:
+        """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
+        get = message.get if isinstance(message, Mapping) else partial(getattr, message)
         window = self._window
         if received - window.start >= _WINDOW:
             if window.messages:
@@ -113,11 +117,11 @@ class StreamHealth:
         if self._received is not None:
             window.add_interval((received - self._received) / 1e9)
         self._received = received
-        self._add_time(message.timestamp)
+        self._add_time(int(cast("int", get("timestamp"))))
         if latency is not None:
             window.latencies.append(latency)
         for flag in DOUBT_FLAGS:
-            if getattr(message, flag):
+            if get(flag):
                 window.flags[flag] += 1
                 self._ever[flag] += 1
 

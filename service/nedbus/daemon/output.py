@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from nedbus.client import Publisher, PublisherRegistry, StreamHealth
 from nedbus.errors import AddressInUseError
 from nedbus.sources import Rejection, SourceMessage
-from nedbus_msgs import Address, describe, upgrade
+from nedbus_msgs import Address, describe, upgrade_fields
 
 from .clock import Clock
 from .status import StreamStatus
@@ -112,13 +112,13 @@ class SourceOutput:
             self._reject_invalid(message, message.error)
             return
         try:
-            valid = upgrade(message.fields)
+            fields = upgrade_fields(message.fields)
+            stream.publisher.publish(fields)
         except ValidationError as exc:
             self._reject_invalid(message, describe(exc))
             return
-        stream.publisher.publish(valid)
         self.published += 1
-        stream.health.add(valid, received=self._now(), lost=message.lost)
+        stream.health.add(fields, received=self._now(), lost=message.lost)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source, and claim its address if need be."""
