@@ -6,16 +6,15 @@ What it does not accept goes to the model, which decides and gives the reasons.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from operator import itemgetter
-from typing import Final, cast
+from collections.abc import Mapping
+from typing import Final
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
 from .float32 import name_rounded
 from .px4_types import NAN, TYPES, TypeName
-from .rows import FIELD_TYPES, NAMES, Values
+from .rows import FIELD_TYPES, NAMES, Values, values_of
 from .rules import make_fast_check
 
 _SCHEMAS: Final = {name: TypeAdapter(annotation).core_schema for name, annotation in TYPES.items()}
@@ -29,8 +28,6 @@ _ABSENT: Final[Mapping[TypeName, object]] = {
 _DEFAULTS: Final = {name: _ABSENT[kind] for name, kind in FIELD_TYPES.items() if name != "timestamp"}
 passes_rules: Final = make_fast_check({name: index for index, name in enumerate(NAMES)})
 """Return whether the values of all fields, which have the right types, pass the rules between fields."""
-
-_get_all = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
 
 
 def check_row(values: Values) -> Values | None:
@@ -52,7 +49,7 @@ def row_of(fields: Mapping[str, object]) -> Values | None:
     if len(fields) != len(NAMES):
         return None
     try:
-        return check_row(_get_all(fields))
+        return check_row(values_of(fields))
     except KeyError:  # no timestamp, and another name among as many
         return None
 

@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from operator import itemgetter
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from .rows import FIELD_TYPES, NAMES, TEMPLATE, Values
 
@@ -14,30 +14,22 @@ FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 _SCALARS = tuple(name for name, kind in FIELD_TYPES.items() if kind == "float32")
 _PAIR, _OTHER_PAIR = (name for name, kind in FIELD_TYPES.items() if kind == "float32[2]")
-_get_scalars = cast("Callable[[Mapping[str, object]], tuple[object, ...]]", itemgetter(*_SCALARS))
 _OTHERS = tuple(name for name, kind in FIELD_TYPES.items() if not kind.startswith("float32"))
 _FIRST, _SECOND = NAMES.index(_PAIR), NAMES.index(_OTHER_PAIR)
-_get_scalars_of_row, _get_others_of_row = (
+_get_scalars, _get_others = (
     cast("Callable[[Values], tuple[object, ...]]", itemgetter(*map(NAMES.index, names)))
     for names in (_SCALARS, _OTHERS)
 )
 _FLOATS = struct.Struct(f"<{len(_SCALARS) + 4}f")
 
 
-def round_to_float32(values: dict[str, Any]) -> None:
-    """Put the nearest float32 into every float32 field; raise OverflowError for what is beyond its range."""
-    floats = _FLOATS.unpack(_FLOATS.pack(*_get_scalars(values), *values[_PAIR], *values[_OTHER_PAIR]))
-    values.update(zip(_SCALARS, floats, strict=False))  # the last four are the pairs'
-    values[_PAIR], values[_OTHER_PAIR] = floats[-4:-2], floats[-2:]
-
-
 def name_rounded(row: Values) -> dict[str, object]:
     """Return the values of all fields by name, float32 fields rounded; raise OverflowError beyond their range."""
     pairs = cast("tuple[tuple[float, float], ...]", (row[_FIRST], row[_SECOND]))
-    floats = _FLOATS.unpack(_FLOATS.pack(*_get_scalars_of_row(row), *pairs[0], *pairs[1]))
+    floats = _FLOATS.unpack(_FLOATS.pack(*_get_scalars(row), *pairs[0], *pairs[1]))
     values = TEMPLATE.copy()
     values.update(zip(_SCALARS, floats, strict=False))  # the last four are the pairs'
-    values.update(zip(_OTHERS, _get_others_of_row(row), strict=True))
+    values.update(zip(_OTHERS, _get_others(row), strict=True))
     values[_PAIR], values[_OTHER_PAIR] = floats[-4:-2], floats[-2:]
     return values
 

@@ -12,13 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, Va
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from .equivalents import to_python
-from .fast_path import validate_fields
-from .float32 import float32_overflows, round_to_float32
+from .fast_path import passes_rules, validate_fields
+from .float32 import float32_overflows, name_rounded
 from .px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
-from .rows import NAMES, TEMPLATE, Row, Values
-from .rules import make_fast_check, violations
-
-_passes_rules = make_fast_check({name: name for name in NAMES})
+from .rows import NAMES, TEMPLATE, Row, Values, values_of
+from .rules import violations
 
 
 class VehicleLocalPosition(BaseModel):
@@ -139,11 +137,12 @@ class VehicleLocalPosition(BaseModel):
     def _round_and_check(self) -> Self:
         """Round float32 fields to float32, then check the rules between fields."""
         values = self.__dict__
+        row = values_of(values)
         try:
-            round_to_float32(values)
+            values.update(name_rounded(row))
         except OverflowError:
             raise _validation_error(values, float32_overflows(values)) from None
-        if not _passes_rules(values):
+        if not passes_rules(row):
             broken = list(violations(values))
             if broken:
                 raise _validation_error(values, broken)

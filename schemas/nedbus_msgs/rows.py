@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final, NamedTuple, get_type_hints
+from collections.abc import Callable, Mapping
+from operator import itemgetter
+from typing import Final, NamedTuple, cast, get_type_hints
 
 from .px4_types import Bool, Float32, Float32x2, Float64, TypeName, Uint8, Uint64, type_name
 
@@ -88,6 +89,9 @@ FIELD_TYPES: Final[Mapping[str, TypeName]] = {
 """PX4's type of every field, in PX4's order."""
 
 NAMES: Final = Row._fields
+
+values_of: Final = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
+"""Return the values of all fields in PX4's order from a mapping that has them; raise KeyError if it lacks one."""
 
 TEMPLATE: Final[dict[str, object]] = dict.fromkeys(NAMES)
 """All names in PX4's order: a copy that is filled takes less time than a dict that grows."""

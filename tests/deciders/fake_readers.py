@@ -13,7 +13,8 @@ import pytest
 import zenoh
 
 from nedbus.client import acknowledgement as module
-from nedbus.client.acknowledgement import CLOSED, Acknowledgement
+from nedbus.client.acknowledgement import Acknowledgement
+from nedbus.client.questions import CLOSED
 from nedbus.transport import LEASE, Session
 
 from .raw_samples import Payload

@@ -112,7 +112,7 @@ def test_questions_of_several_publishers_are_answered_apart(asked: Asked) -> Non
 
 def test_of_too_many_questions_the_oldest_is_forgotten(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     """No peer can make a reader remember more: an honest one asks again."""
-    monkeypatch.setattr(module, "_MAX_PENDING", 3)
+    monkeypatch.setattr(module, "MAX_PENDING", 3)
     questions = Questions(SequenceTracker())
     for number in range(5):
         questions.add(asked.question(number))

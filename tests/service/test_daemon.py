@@ -446,6 +446,8 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
     [
         ([], "source: nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"),
         (["-s", "foo:x"], "source 'foo:x': there is no kind 'foo': choose from sim, ulog"),
+        (["-s", "a/b.ulg"], "write ulog:a/b.ulg"),
+        (["-s", "ulg:a/b.ulg"], "there is no kind 'ulg': write ulog:a/b.ulg"),
         (["-s", "ulog:"], "source 'ulog:': write it as ulog:FILE"),
         (["-s", "sim:x"], "source 'sim:x': write it as sim:?OPTION=VALUE"),
         (["-s", "sim:?sed=1"], "source 'sim:?sed=1': there is no option 'sed'"),

@@ -1,7 +1,7 @@
 """Acknowledgements: a publisher asks the readers of mode `every` whether they have, or have read, what it published.
 
-It queries `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`. A reader answers when the message with
-that number has arrived, with `read=1` when its script has taken it, and in any case when it is closed.
+It queries `<key>/@ack`. A reader answers when the message with the number of the question has arrived or, with `read`,
+when its script has taken it, and in any case when it is closed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import zenoh
 from nedbus.transport import LEASE, Session, entity_name, while_open
 from nedbus_msgs import ack_key
 
+from .questions import CLOSED, write_parameters
 from .readers import Readers
 
 _log = logging.getLogger(__name__)
@@ -28,9 +29,6 @@ queues of a link, or of a reader."""
 
 KEPT: Final = 8192
 """Messages that a lossless publisher keeps for readers that missed some."""
-
-CLOSED: Final = b"closed"
-"""The answer of a reader that is closed; that of any other is empty."""
 
 _LIMIT: Final = KEPT - WINDOW  # messages that are sent at all without an acknowledgement
 _STEPS: Final = 8  # questions for each window
@@ -146,11 +144,11 @@ class Acknowledgement:
                 question.ended = time.monotonic()
                 self._changed.notify_all()
 
-        number = (published - 1) % 2**32
+        parameters = write_parameters(entity_name(self._publisher.id), (published - 1) % 2**32, read=read)
         self._asked = published
         with while_open(self._session):
             self._session.get(
-                f"{self._key}?publisher={entity_name(self._publisher.id)};number={number};read={read:d}",
+                f"{self._key}?{parameters}",
                 zenoh.handlers.Callback(on_reply, on_end, indirect=False),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,

@@ -1,4 +1,7 @@
-"""What publishers ask a reader of mode `every`: whether it has, or has read, what they sent. Pure, without I/O."""
+"""What publishers ask a reader of mode `every`: whether it has, or has read, what they sent. Pure, without I/O.
+
+The query is `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,13 @@ from typing import Final
 
 from .sequence_tracker import SequenceTracker
 
-_MAX_PENDING: Final = 1000  # questions; an honest publisher has one for each key at a time
+MAX_PENDING: Final = 1000
+"""Questions that wait for an answer; an honest publisher has one for each key at a time."""
+
+CLOSED: Final = b"closed"
+"""The answer of a reader that is closed; that of any other is empty."""
+
+_MAX_DIGITS: Final = 10  # of a sequence number
 
 
 @dataclass(slots=True, eq=False)
@@ -27,6 +36,19 @@ class Question:
     until: int | None = None
 
 
+def write_parameters(publisher: str, number: int, *, read: bool) -> str:
+    """Return the parameters of the query that asks a question."""
+    return f"publisher={publisher};number={number};read={read:d}"
+
+
+def read_parameters(get: Callable[[str], str | None]) -> tuple[str, int, bool] | None:
+    """Return publisher, number and `read` of a query; `get` returns its parameters by name. None for others."""
+    publisher, number = get("publisher"), get("number") or ""
+    if publisher is None or not number.isdecimal() or len(number) > _MAX_DIGITS:
+        return None
+    return publisher, int(number), get("read") == "1"
+
+
 class Questions:
     """Keep questions until they can be answered. Not thread-safe."""
 
@@ -39,7 +61,7 @@ class Questions:
 
     def add(self, question: Question) -> None:
         """Keep a question; of too many the oldest is not answered."""
-        if len(self._pending) >= _MAX_PENDING:
+        if len(self._pending) >= MAX_PENDING:
             self._pending.popleft()
         self._pending.append(question)
 

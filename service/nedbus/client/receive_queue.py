@@ -59,8 +59,7 @@ class ReceiveQueue:
         self._tracker = SequenceTracker()
         self._announcements: deque[Miss] = deque()
         self._questions = Questions(self._tracker)
-        self._arrived = self._taken = self._dropped = 0
-        self._received = 0
+        self._arrived = self._dropped = self._received = 0
 
     @property
     def counts(self) -> Counts:
@@ -94,9 +93,10 @@ class ReceiveQueue:
                 for arrival in arrivals:
                     self._supersede(arrival)
             else:
-                self._append(arrivals)
-        if overflowed:
-            self._warn_once()
+                overflowed |= self._append(arrivals)
+        if overflowed and not self.newest_only and not self._warned:
+            self._warned = True
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name)
         if self._questions:
             self._answer(drained=True)
 
@@ -152,7 +152,6 @@ class ReceiveQueue:
                 self._newest.clear()
             else:
                 taken = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
-            self._taken += len(taken)
             lost = sum(lost for _, _, _, lost in taken)
             if self._unreported:
                 lost += sum(self._unreported.pop(key, 0) for key in {stream.key for stream, _, _, _ in taken})
@@ -184,7 +183,6 @@ class ReceiveQueue:
                 taken = self._newest.pop(next(iter(self._newest)))
             else:
                 return None
-            self._taken += 1
         if self._questions:
             self._answer(drained=False)
         return taken
@@ -202,15 +200,16 @@ class ReceiveQueue:
             if info is not None and (lost := tracker.arrived(stream.key, info)):
                 arrivals[index] = stream, payload, raw, lost
 
-    def _append(self, arrivals: list[Arrival]) -> None:
+    def _append(self, arrivals: list[Arrival]) -> bool:
+        """Queue all, and return whether older ones had to be dropped."""
         every = self._every
         every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
-        while len(every) > CAPACITY:
+        drops = len(every) - CAPACITY
+        for _ in range(drops):
             stream, _, _, lost = every.popleft()
-            self._taken += 1
             self._dropped += 1
             self._report_later(stream.key, lost)
-            self._warn_once()
+        return drops > 0
 
     def _supersede(self, arrival: Arrival) -> None:
         key = arrival[0].key
@@ -223,11 +222,6 @@ class ReceiveQueue:
             return
         self._newest[key] = arrival
 
-    def _warn_once(self) -> None:
-        if not self._warned:
-            self._warned = True
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name)
-
     def _report_later(self, key: str, lost: int) -> None:
         if lost and len(self._unreported) < MAX_KEYS:
             self._unreported[key] = self._unreported.get(key, 0) + lost
@@ -237,7 +231,8 @@ class ReceiveQueue:
             if self.ended:
                 ready = self._questions.take_all()
             else:
-                ready = self._questions.settle(arrived=self._arrived, taken=self._taken, drained=drained)
+                taken = self._arrived - len(self._every)
+                ready = self._questions.settle(arrived=self._arrived, taken=taken, drained=drained)
         for question in ready:
             question.reply()
 

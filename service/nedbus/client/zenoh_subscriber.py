@@ -18,8 +18,7 @@ import zenoh
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
-from .acknowledgement import CLOSED
-from .questions import Question
+from .questions import CLOSED, MAX_PENDING, Question, read_parameters
 from .receive_queue import ReceiveQueue
 
 _log = logging.getLogger(__name__)
@@ -59,7 +58,8 @@ class ZenohSubscriber:
             self._misses = self._subscriber.sample_miss_listener(
                 zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False)
             )
-            self._asked = session.declare_queryable(ack_key(key_expr), _questions()) if every else None
+            asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
+            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every else None
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
         self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
@@ -162,9 +162,8 @@ class ZenohSubscriber:
                 self._ask(asked.recv())
 
     def _ask(self, query: zenoh.Query) -> None:
-        parameters = query.parameters
-        publisher, number = parameters.get("publisher"), parameters.get("number") or ""
-        if publisher is None or not number.isdecimal() or len(number) > 10:
+        parameters = read_parameters(query.parameters.get)
+        if parameters is None:
             return  # dropped, and so answered: it is from a publisher that asks in another way
         key = str(query.key_expr)
 
@@ -175,11 +174,7 @@ class ZenohSubscriber:
             except zenoh.ZError as exc:  # it asked with a timeout, or is gone
                 _log.debug("%s: a question could not be answered: %s", key, exc)
 
-        self._queue.ask(Question(publisher, int(number), parameters.get("read") == "1", reply))
-
-
-def _questions() -> zenoh.handlers.RingChannel[zenoh.Query]:
-    return zenoh.handlers.RingChannel(1000)
+        self._queue.ask(Question(*parameters, reply))
 
 
 def _take(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:

@@ -79,8 +79,9 @@ def parse_source(text: str) -> SourceSpec:
     kind_name, _, rest = text.partition(":")
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
-        kind_of_file = SUFFIXES.get(PurePath(text.partition("?")[0]).suffix)
-        hint = f"write {kind_of_file}:{text}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
+        path = rest if rest and "/" not in kind_name else text
+        kind_of_file = SUFFIXES.get(PurePath(path.partition("?")[0]).suffix)
+        hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
         raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")
     if not kind.accepts(target):
