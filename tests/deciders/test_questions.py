@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from nedbus.client import questions as module
@@ -172,6 +174,22 @@ def test_queue_answers_unknown_publishers_while_nothing_is_left_to_receive(asked
     receive_queue.idle = True
     receive_queue.ask(asked.question(7, name="while idle"))
     assert asked.answered == ["while receiving", "while idle"]
+
+
+def test_unknown_publisher_is_not_answered_while_its_messages_may_still_come(asked: Asked) -> None:
+    """After a break of the link a publisher that is not known has sent something that heartbeats bring soon."""
+    receive_queue = make_queue("every")
+    receive_queue.idle = True
+    receive_queue.unsettled_until = math.inf
+    receive_queue.ask(asked.question(1))
+    receive_queue.put([raw(0, publisher="b")])
+    assert asked.answered == []
+    receive_queue.put([raw(0), raw(1)])
+    assert asked.answered == ["1"]
+    receive_queue.ask(asked.question(7, publisher="c"))
+    receive_queue.unsettled_until = 0.0
+    receive_queue.put([raw(1, publisher="b")])
+    assert asked.answered == ["1", "7"]
 
 
 def test_announced_loss_at_the_end_of_a_stream_is_answered(asked: Asked) -> None:

@@ -6,13 +6,15 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 
 import nedbus
 from nedbus.client.acknowledgement import WINDOW
+from nedbus.transport import open_router
 from nedbus_msgs.arrays import to_array
-from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
+from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
 
 VLP = "vehicle_local_position"
 COUNT = 3 * WINDOW
@@ -98,6 +100,44 @@ def test_stopped_reader_gets_everything(start: Start, endpoint: str, bus: nedbus
     assert reader.out.split()[-1] == "whole"
     sending.join(DEADLINE)
     assert not sending.is_alive()
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: nedbus.Bus, lossless: bool) -> None:
+    """A reader that was away when they began gets all that they still keep, in order: it has subscribed before."""
+    near = free_endpoint()
+    router = open_router(listen=(near,), connect=(endpoint,))
+    vehicles = [str(number) for number in range(10)]
+    with nedbus.connect(near) as other, other.subscribe(VLP, mode="every") as subscription:
+        router.close()
+        wait_for(lambda: not other.connected, what="the end of the link")
+        publishers = [bus.publisher(VLP, vehicle=vehicle, lossless=lossless) for vehicle in vehicles]
+        last = 0
+
+        def publish() -> None:
+            nonlocal last
+            last += 1
+            for publisher in publishers:
+                publisher.publish(message(last))
+
+        for _ in range(100):
+            publish()
+        router = open_router(listen=(near,), connect=(endpoint,))
+        got: dict[str, list[int]] = {vehicle: [] for vehicle in vehicles}
+
+        def take() -> bool:
+            publish()
+            with suppress(nedbus.NoDataError):
+                while True:
+                    sample = subscription.receive(0.005)
+                    got[sample.vehicle].append(sample.message.timestamp)
+            return all(len(each) > 100 for each in got.values())
+
+        wait_for(take, what="messages of all")
+        for each in got.values():
+            assert each == list(range(1, len(each) + 1))
+        assert subscription.counts.lost == 0
+    router.close()
 
 
 def kill(reader: Process) -> None:

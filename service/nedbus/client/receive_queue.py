@@ -47,6 +47,8 @@ class ReceiveQueue:
         self.ended = False
         self.idle = False
         """Set by whoever receives, while it waits and nothing is left to receive."""
+        self.unsettled_until = 0.0
+        """Monotonic seconds: until then there may be publishers that sent something, and are not known yet."""
         self.wake: Callable[[], object] | None = None
         self._name = name
         self._warned = False
@@ -76,6 +78,11 @@ class ReceiveQueue:
     def count_invalid(self, count: int) -> None:
         """Count samples that could not be queued."""
         self._decoder.count_invalid(count)
+
+    def knows(self, publisher: str) -> bool:
+        """Return whether anything of this publisher has arrived."""
+        with self._lock:
+            return self._tracker.has(publisher, 0) is not None
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue all that has arrived, in its order, and reject what is not worth queueing.
@@ -227,6 +234,7 @@ class ReceiveQueue:
             self._unreported[key] = self._unreported.get(key, 0) + lost
 
     def _answer(self, *, drained: bool) -> None:
+        drained = drained and time.monotonic() >= self.unsettled_until
         with self._lock:
             if self.ended:
                 ready = self._questions.take_all()

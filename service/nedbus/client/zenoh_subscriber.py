@@ -18,6 +18,7 @@ import zenoh
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
+from .catch_up import CatchUp
 from .questions import CLOSED, MAX_PENDING, Question, read_parameters
 from .receive_queue import ReceiveQueue
 
@@ -59,6 +60,7 @@ class ZenohSubscriber:
                 zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False)
             )
             asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
+            self._catch_up = CatchUp(session, receive_queue) if every else None
             self._asked = session.declare_queryable(ack_key(key_expr), asked) if every else None
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
@@ -103,6 +105,8 @@ class ZenohSubscriber:
         self._misses.undeclare()
         if self._asked is not None:
             self._asked.undeclare()
+        if self._catch_up is not None:
+            self._catch_up.close()
         self._subscriber.undeclare()
         self._needed.set()
         self._pump.join(1.0)
@@ -150,7 +154,8 @@ class ZenohSubscriber:
         if self._queue.ended:
             return
         try:
-            self._queue.put(batch, overflowed=len(batch) >= _CHANNEL)
+            overflowed = len(batch) >= _CHANNEL
+            self._queue.put(self._catch_up.complete(batch) if self._catch_up else batch, overflowed=overflowed)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch))
             self._queue.count_invalid(len(batch))

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
-from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query
+from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query, query_kept
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -76,6 +76,7 @@ __all__ = [
     "publishers_key_expr",
     "publishers_of_type_key_expr",
     "query",
+    "query_kept",
     "require_unforked",
     "router_endpoints",
     "subscription_token",

@@ -12,7 +12,7 @@ from typing import Final
 
 import zenoh
 
-from .session import RawSample, Session, while_open
+from .session import RawSample, Session, entity_name, while_open
 
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
@@ -33,6 +33,31 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
             timeout=_zenoh_timeout(timeout),
         )
     return [reply.ok for reply in collector.wait(timeout) if reply.ok is not None]
+
+
+def query_kept(session: Session, key: str, publisher: str, *, end: int, timeout: float) -> list[RawSample]:
+    """Return what an advanced publisher still keeps of its messages before number `end`, in order; at most 10,000.
+
+    `publisher` is its name as `entity_name` returns it.
+    """
+    collector = _Collector()
+    with while_open(session):
+        session.get(
+            f"{key}/@adv/*/{publisher.replace(':', '/')}/**?_sn=..{end - 1}",
+            collector.handler,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=_zenoh_timeout(timeout),
+        )
+    kept: dict[int, RawSample] = {}
+    for reply in collector.wait(timeout):
+        sample, info = reply.ok, reply.ok and reply.ok.source_info
+        if sample is None or info is None or str(sample.key_expr) != key or entity_name(info.source_id) != publisher:
+            continue  # an error, or another's answer
+        if info.source_sn < end:
+            kept[info.source_sn] = sample
+    return [kept[number] for number in sorted(kept)]
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
