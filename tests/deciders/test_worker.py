@@ -45,14 +45,14 @@ class StandingClock:
 
 @dataclass
 class FakePublisher:
-    """Keeps what is published, and when."""
+    """Validates fields as the real one does, and keeps what is published, and when."""
 
     clock: StandingClock
     close: Callable[[], object]
     published: list[tuple[float, VehicleLocalPosition]] = field(default_factory=list)
 
-    def publish(self, message: VehicleLocalPosition) -> None:
-        self.published.append((self.clock.seconds, message))
+    def publish(self, fields: Mapping[str, object]) -> None:
+        self.published.append((self.clock.seconds, VehicleLocalPosition.model_validate(fields)))
 
 
 class FakeRegistry:
