@@ -9,7 +9,7 @@ DEV := $(VENV)/.dev
 .PHONY: run check quick test compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight; it prints what to type in a second terminal
-	$(BIN)/nedbus serve --source sim:
+	$(BIN)/nedbus serve --source sim: --http 127.0.0.1:9464
 
 check: $(DEV)  ## lint and types
 	$(BIN)/ruff check .
@@ -51,7 +51,7 @@ $(READY): pyproject.toml  # what running needs
 	@echo "making a virtual environment in $(VENV) ..."
 	@$(PYTHON) -m venv $(VENV)
 	@echo "installing nedbus and the packages that it needs, about 200 MB ..."
-	@$(BIN)/pip install --disable-pip-version-check --editable .
+	@$(BIN)/pip install --disable-pip-version-check --editable ".[metrics]"
 	@touch $(READY)
 
 $(DEV): $(READY) pyproject.toml  # what tests, checks and measurements need besides

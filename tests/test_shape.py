@@ -19,8 +19,8 @@ from tests.conftest import Start
 ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
-    "errors", "extras", "whole_file", "transport", "settings", "client", "recording", "sources", "daemon", "bridges",
-    "cli",
+    "errors", "extras", "whole_file", "transport", "settings", "client", "recording", "sources", "daemon", "monitoring",
+    "bridges",    "cli",
 ]  # fmt: skip
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {
@@ -57,11 +57,16 @@ ONLY: dict[str, set[str]] = {
     "pymavlink": {"nedbus/sources/mavlink"},
     "serial": {"nedbus/sources/mavlink_link"},
     "foxglove": {"nedbus/bridges/foxglove", "nedbus/bridges/foxglove_messages"},
+    "prometheus_client": {
+        "nedbus/monitoring/families", "nedbus/monitoring/exposition", "nedbus/monitoring/service_metrics",
+        "nedbus/monitoring/exporter",
+    },
     "cryptography": {"nedbus/transport/pki"},
     "rich": {"nedbus/cli/progress", "nedbus/cli/files", "nedbus/cli/live_table", "nedbus/cli/logs"},
     "typer": {
         "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
         "nedbus/cli/query", "nedbus/cli/echo", "nedbus/cli/health", "nedbus/cli/serve", "nedbus/cli/run",
+        "nedbus/cli/http",
     },
 }  # fmt: skip
 MAX_LINES = 250

@@ -33,7 +33,7 @@ from .layouts import (
 )
 from .position import Message, VehicleLocalPosition
 from .provenance import Provenance, encoding_of, provenance_of
-from .resets import Continuous, Quantity, ResetTracker
+from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2_topics import ros2_topic_of, split_ros2_topic
 from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, message_definition, type_hash
 from .rows import FIELD_TYPES, Row
@@ -71,6 +71,7 @@ __all__ = [
     "LAYOUTS",
     "PAYLOAD_LIMIT",
     "PAYLOAD_SIZE",
+    "RESET_COUNTERS",
     "ROS2_TYPE",
     "ROS2_TYPES",
     "TOPICS",

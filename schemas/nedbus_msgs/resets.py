@@ -37,6 +37,9 @@ _QUANTITIES: Final[Mapping[Quantity, _Fields]] = {
     "heading": _Fields(("heading",), "delta_heading", "heading_reset_counter"),
     "dist_bottom": _Fields(("dist_bottom",), "delta_dist_bottom", "dist_bottom_reset_counter"),
 }
+RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: fields.counter for name, fields in _QUANTITIES.items()}
+"""The field that counts the resets of each quantity, modulo 256."""
+
 _TOLERANCE: Final = 2.0  # m between a jump at a new origin and the candidate that explains it
 
 Point = tuple[float, ...]

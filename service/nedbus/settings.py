@@ -53,6 +53,20 @@ def _prefix(value: str) -> str:
     return value
 
 
+def split_http(where: str) -> tuple[str, int]:
+    """Return host and port of HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
+    host, _, port = where.rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
+        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
+    return bare, int(port)
+
+
+def _http(value: str) -> str:
+    split_http(value)
+    return value
+
+
 def _text(value: object) -> object:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
@@ -86,6 +100,9 @@ class Settings(BaseSettings):
     )
     source: Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split_sources)] = Field(
         (), description="What is published"
+    )
+    http: Annotated[str, AfterValidator(_http)] | None = Field(
+        None, description="HOST:PORT of /metrics, /healthz, /readyz and /status"
     )
     until_done: bool = Field(False, description="End when every finite source has ended")
 

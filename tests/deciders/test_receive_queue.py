@@ -146,8 +146,8 @@ def test_wait_ends_when_it_is_woken() -> None:
     """Whoever received in another thread lets the reader look again, whether there is something or not."""
     receive_queue = make_queue("every")
     woken = []
-    receive_queue.wake = lambda: woken.append(True)
-    receive_queue.wake_reader()
+    receive_queue.wakeups.callback = lambda: woken.append(True)
+    receive_queue.wakeups.wake()
     assert receive_queue.wait(None)
     assert woken
 

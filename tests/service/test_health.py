@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 
 import pytest
@@ -49,7 +50,10 @@ def test_silence_has_no_rate() -> None:
 def test_stream_without_messages_has_no_measures() -> None:
     """Before the first message there is nothing to measure."""
     health = StreamHealth("estimator_local_position").snapshot(SECOND)
-    assert health == Health(None, 2.0, None, None, None, None, 0, 0, 0, 0, 0, None, None)
+    assert dataclasses.replace(health, resets={}) == Health(
+        None, 2.0, None, None, None, None, 0, 0, 0, 0, 0, None, None
+    )
+    assert set(health.resets.values()) == {0}
 
 
 def test_gaps_are_of_px4s_own_time() -> None:

@@ -13,6 +13,7 @@ from .bridges import foxglove, ros2
 from .echo import echo
 from .files import convert, plot, record
 from .health import health
+from .http import export
 from .hz import hz
 from .logs import log_to_stderr
 from .options import command, write
@@ -36,6 +37,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "get": get,
     "info": info,
     "health": health,
+    "export": export,
     "schema": schema,
     "ros2": ros2,
     "foxglove": foxglove,

@@ -19,6 +19,10 @@ _log = logging.getLogger("nedbus")
 _LIMIT: Final = 1.6  # s after a signal by which the process has ended
 
 
+def _ignore_hangup() -> None:
+    _log.info("SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process")
+
+
 def run_until_stopped(body: Callable[[threading.Event], object]) -> None:
     """Run a body that ends when its event is set, by Ctrl-C or SIGTERM; raise typer.Exit with 130 after Ctrl-C."""
     stop = threading.Event()
@@ -33,11 +37,16 @@ def run_until_stopped(body: Callable[[threading.Event], object]) -> None:
 
 
 def run_until_signal(
-    run: Callable[[], bool], stop: Callable[[], object], *, on_tick: Callable[[], object] = lambda: None
+    run: Callable[[], bool],
+    stop: Callable[[], object],
+    *,
+    on_tick: Callable[[], object] = lambda: None,
+    on_hangup: Callable[[], object] = _ignore_hangup,
 ) -> int | None:
     """Run something in a thread until it ends or a signal comes; return the exit code, None for success.
 
-    `run` returns whether it succeeded, `stop` makes it end, `on_tick` is called ten times a second meanwhile.
+    `run` returns whether it succeeded, `stop` makes it end, `on_tick` is called ten times a second meanwhile, and
+    `on_hangup` after SIGHUP, both in the main thread.
     The main thread only waits: a signal is then handled at once, even while Zenoh blocks.
     """
     outcome: list[bool | BaseException] = []
@@ -64,7 +73,7 @@ def run_until_signal(
     while thread.is_alive() and not signals:
         if hangups:
             hangups.clear()
-            _log.info("SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process")
+            on_hangup()
         on_tick()
         thread.join(0.1)
     if signals:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
@@ -11,10 +12,12 @@ import typer
 
 from nedbus import __version__
 from nedbus.daemon import Daemon
+from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, open_router, router_endpoints
 
+from .http import serve_pages
 from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
 from .progress import Display
 from .run import run_until_signal, run_until_stopped
@@ -51,6 +54,9 @@ def serve(
     tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
+    http: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve /metrics, /healthz, /readyz and /status there")
+    ] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,
 ) -> None:
@@ -66,10 +72,14 @@ def serve(
         tls_key=tls_key,
         prefix=prefix,
         vehicle=vehicle,
+        http=http,
         until_done=until_done,
     )
     daemon = Daemon(settings, version=__version__)
-    with Display(daemon) as display:
+    with ExitStack() as closing:
+        if settings.http is not None:
+            closing.enter_context(serve_pages(settings.http, service_pages(daemon)))
+        display = closing.enter_context(Display(daemon))
         exit_code = run_until_signal(daemon.run, daemon.stop, on_tick=display.update)
     if exit_code is not None:
         raise typer.Exit(exit_code)

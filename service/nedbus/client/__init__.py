@@ -9,7 +9,9 @@ from .async_publisher import AsyncPublisher
 from .async_subscription import AsyncSubscription
 from .bus import Bus
 from .connect import connect, connect_async, connect_with
-from .health import Health, Monitor, StreamHealth
+from .health import Health, StreamHealth
+from .histogram import Histogram
+from .monitor import Monitor
 from .publisher import HEARTBEAT, Publisher
 from .publisher_registry import PublisherRegistry
 from .query_server import QueryServer
@@ -30,6 +32,7 @@ __all__ = [
     "Bus",
     "Counts",
     "Health",
+    "Histogram",
     "Mode",
     "Monitor",
     "Publisher",

@@ -48,6 +48,11 @@ class AsyncSubscription:
         """What became of the messages so far."""
         return self._queue.counts
 
+    @property
+    def waiting(self) -> int:
+        """How many messages have arrived and wait to be read."""
+        return self._queue.waiting
+
     async def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
         """Wait for the next sample and return it.
 
@@ -130,7 +135,7 @@ class AsyncSubscription:
         await asyncio.shield(self._opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._queue.wake = _waker(loop, self._arrival)
+        self._queue.wakeups.callback = _waker(loop, self._arrival)
         subscriber = await asyncio.to_thread(self._open_subscriber)
         self._finalizer = Finalizer(self, subscriber.close)
 

@@ -1,4 +1,4 @@
-"""The health of a stream: rate, jitter, age, gaps, order, reboots, and the share of its flags; no I/O.
+"""The health of a stream: rate, jitter, age, gaps, order, reboots, resets, and the share of its flags; no I/O.
 
 The same object serves `nedbus hz`, the status of a service, and scripts.
 Rates and ages are of a monotonic clock: the wall clock may be set at any time.
@@ -11,12 +11,12 @@ import time
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from operator import attrgetter, itemgetter
 from typing import Final, cast
 
-from nedbus_msgs import DOUBT_FLAGS, TOPICS, Address, Message
+from nedbus_msgs import DOUBT_FLAGS, RESET_COUNTERS, TOPICS, Message, Quantity
 
-from .sample import Sample
+from .histogram import Histogram
 
 _REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
 _GAP: Final = 3.0  # times the usual step of PX4's time
@@ -26,7 +26,14 @@ _MAX_LATENCIES: Final = 1000  # that are kept of a window
 _WINDOW: Final = 1_000_000_000  # ns
 _STALE: Final = 3.0  # s without a message after which a stream has no rate
 _SLOW_WEIGHT: Final = 0.05  # of a new second in the usual rate: a stream that became slow differs from it for a minute
-_MAX_STREAMS: Final = 4096  # that a monitor follows
+_COUNTER: Final = 256  # where reset counters wrap
+
+LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
+"""Limits of the histogram of latencies [s]."""
+
+_NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # what is looked at
+_of_message = attrgetter(*_NAMES)
+_of_fields = itemgetter(*_NAMES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +43,7 @@ class Health:
     Of the last full second: `rate` [Hz], `jitter` (standard deviation of the intervals of arrival) [s], `latency`
     (median) and `latency_max` [s], and `flags`, the share of the messages with each flag set, 0 to 1.
     Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's own time of more than three usual ones),
-    `out_of_order`, `reboots` (that time went back by more than 1 s), and `flags_ever`.
+    `out_of_order`, `reboots` (that time went back by more than 1 s), `resets` of each quantity, and `flags_ever`.
     `nominal`: the rate that PX4 has for this topic [Hz]; logs and links have less.
     `age`: seconds since the last message.
     `usual_rate`: the rate that this stream has had so far [Hz]; `rate` is far below it when a stream becomes slow.
@@ -56,6 +63,7 @@ class Health:
     flags: dict[str, float] | None
     flags_ever: dict[str, float] | None
     usual_rate: float | None = None
+    resets: dict[Quantity, int] = field(default_factory=dict)
 
     @property
     def stale_after(self) -> float:
@@ -98,13 +106,16 @@ class StreamHealth:
         self._usual_rate: float | None = None
         self._steps = 0
         self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
+        self._counters: tuple[int, ...] = ()
+        self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS, 0)
+        self.latencies = Histogram(LATENCIES)
         self._window = self._last_window = _Window(0)
 
     def add(
         self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
     ) -> None:
         """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
-        get = message.get if isinstance(message, Mapping) else partial(getattr, message)
+        timestamp, *seen = _look(message)
         window = self._window
         if received - window.start >= _WINDOW:
             if window.messages:
@@ -117,11 +128,12 @@ class StreamHealth:
         if self._received is not None:
             window.add_interval((received - self._received) / 1e9)
         self._received = received
-        self._add_time(int(cast("int", get("timestamp"))))
+        self._add_counters(tuple(seen[len(DOUBT_FLAGS) :]), rebooted=self._add_time(int(timestamp)))
         if latency is not None:
             window.latencies.append(latency)
-        for flag in DOUBT_FLAGS:
-            if get(flag):
+            self.latencies.add(latency)
+        for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
+            if is_set:
                 window.flags[flag] += 1
                 self._ever[flag] += 1
 
@@ -146,6 +158,7 @@ class StreamHealth:
             flags=_shares(window.flags, window.messages),
             flags_ever=_shares(self._ever, self._messages),
             usual_rate=self._usual_rate,
+            resets=dict(self._resets),
         )
 
     def _add_rate(self, window: _Window) -> None:
@@ -155,53 +168,44 @@ class StreamHealth:
             usual = rate if self._usual_rate is None else self._usual_rate
             self._usual_rate = usual + _SLOW_WEIGHT * (min(rate, 2 * usual) - usual)
 
-    def _add_time(self, timestamp: int) -> None:
+    def _add_counters(self, counters: tuple[int, ...], *, rebooted: bool) -> None:
+        """Count resets; after a reboot the counters begin anew."""
+        if counters == self._counters:
+            return
+        if self._counters and not rebooted:
+            for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
+                self._resets[quantity] += (after - before) % _COUNTER
+        self._counters = counters
+
+    def _add_time(self, timestamp: int) -> bool:
+        """Follow PX4's time; return whether it went back, as after a reboot."""
         last = self._time
         if last is None or timestamp < last - _REBOOT:
             self._reboots += last is not None
             self._time, self._steps = timestamp, 0
-        elif timestamp < last:
+            return True
+        if timestamp < last:
             self._disorders += 1
         else:
             step = timestamp - last
             self._time = timestamp
             if self._steps >= _SETTLED and step > _GAP * self._usual:
                 self._gaps += 1
-                return
+                return False
             self._steps += 1
             weight = max(_WEIGHT, 1 / self._steps)
             self._usual += weight * (step - self._usual)
+        return False
 
 
-class Monitor:
-    """Follow all streams of a subscription, at most 4096: then the one that was silent for longest is forgotten.
-
-    The first sample of each address does not count: it may be the last value that a subscription starts with.
-    """
-
-    def __init__(self) -> None:
-        self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
-
-    def add(self, sample: Sample[Message]) -> bool:
-        """Add a sample that was received just now; return whether it counts."""
-        address = sample.address
-        known = address in self._streams
-        stream = self._streams.pop(address, None)
-        if known:
-            stream = stream or StreamHealth(sample.topic)
-            stream.add(sample.message, received=time.monotonic_ns(), latency=sample.latency, lost=sample.lost)
-        elif len(self._streams) >= _MAX_STREAMS:
-            del self._streams[next(iter(self._streams))]
-        self._streams[address] = stream
-        return known
-
-    def snapshot(self) -> dict[Address, Health]:
-        """Return the health of each stream, sorted by address."""
-        return {address: stream.snapshot() for address in sorted(self._streams) if (stream := self._streams[address])}
-
-    def forget(self, address: Address) -> None:
-        """Forget a stream; it is followed anew if it comes back."""
-        self._streams.pop(address, None)
+def _look(message: Message | Mapping[str, object]) -> tuple[int, ...]:
+    """Return the values of _NAMES; 0 for what is not given."""
+    if not isinstance(message, Mapping):
+        return cast("tuple[int, ...]", _of_message(message))
+    try:
+        return cast("tuple[int, ...]", _of_fields(message))
+    except KeyError:
+        return cast("tuple[int, ...]", tuple(message.get(name, 0) for name in _NAMES))
 
 
 def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:

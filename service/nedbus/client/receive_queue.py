@@ -7,11 +7,10 @@ was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond. Bot
 from __future__ import annotations
 
 import logging
-import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
 from nedbus.transport import RawSample, entity_name
@@ -21,6 +20,7 @@ from .decoder import MAX_KEYS, Arrival, Decode, Decoder
 from .questions import Question, Questions
 from .sample import Counts, M_co, Mode, Sample
 from .sequence_tracker import SequenceTracker
+from .wakeups import Wakeups
 
 if TYPE_CHECKING:
     from zenoh.ext import Miss
@@ -49,12 +49,11 @@ class ReceiveQueue:
         """Set by whoever receives, while it waits and nothing is left to receive."""
         self.unsettled_until = 0.0
         """Monotonic seconds: until then there may be publishers that sent something, and are not known yet."""
-        self.wake: Callable[[], object] | None = None
+        self.wakeups = Wakeups()
         self._name = name
         self._warned = False
         self._decoder = decoder
         self._lock = threading.Lock()
-        self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
         self._unreported: dict[str, int] = {}  # losses before a sample that was invalid, by key
@@ -70,6 +69,11 @@ class ReceiveQueue:
             self._apply_announcements()
             dropped = self._dropped + self._tracker.dropped
             return Counts(self._received, self._tracker.lost, dropped, self._decoder.invalid)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait to be read."""
+        return len(self._every) or len(self._newest)
 
     def announce_loss(self, miss: Miss) -> None:
         """Note that messages were lost in transit; called on Zenoh's thread, before the next sample."""
@@ -118,20 +122,18 @@ class ReceiveQueue:
         """Let readers know that nothing more comes, and publishers that nobody reads any more."""
         self.ended = True
         self._answer(drained=True)
-        self.wake_reader()
+        self.wakeups.wake()
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
         end = None if timeout is None else time.monotonic() + timeout
         while not (self._every or self._newest or self.ended):
-            try:
-                self._wakeups.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
-            except queue.Empty:
+            if not self.wakeups.wait(None if end is None else max(0.0, end - time.monotonic())):
                 return False
             if timeout is None:
                 break
         if self.ended:
-            self.wake_reader()  # for other threads that wait
+            self.wakeups.wake()  # other threads that wait
         return True
 
     def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:
@@ -173,13 +175,6 @@ class ReceiveQueue:
             return None
         self._received += len(batch)
         return batch
-
-    def wake_reader(self) -> None:
-        """Let a reader that waits look again."""
-        if self._wakeups.empty():
-            self._wakeups.put(None)
-        if self.wake is not None:
-            self.wake()
 
     def _take(self) -> Arrival | None:
         """Take the next sample; several threads may take."""

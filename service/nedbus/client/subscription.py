@@ -42,6 +42,11 @@ class Subscription:
         """What became of the messages so far."""
         return self._queue.counts
 
+    @property
+    def waiting(self) -> int:
+        """How many messages have arrived and wait to be read."""
+        return self._queue.waiting
+
     def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
         """Wait for the next sample and return it.
 

@@ -92,7 +92,7 @@ class ZenohSubscriber:
             self._receive()
         finally:
             self._receiving.release()
-        self._queue.wake_reader()  # another thread, that could not receive
+        self._queue.wakeups.wake()  # another thread, that could not receive
         return True
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ class ZenohSubscriber:
                     self._receive()
                 finally:
                     self._receiving.release()
-                self._queue.wake_reader()
+                self._queue.wakeups.wake()
         except BaseException:
             _log.exception("%s: the subscription ends after an unexpected error", self._name)
             raise

@@ -19,7 +19,7 @@ from nedbus.transport import UPLINK_POLL, Session, Uplinks, dial_endpoint, open_
 from nedbus_msgs import decode, provenance_of, status_key
 
 from .clock import SystemClock
-from .status import Role, ServiceStatus, SourceStatus
+from .status import Role, ServiceStatus, SourceMeasures, SourceStatus
 from .worker import Worker
 
 _log = logging.getLogger(__name__)
@@ -47,6 +47,7 @@ class Daemon:
         self._changed = threading.Event()
         self._workers: list[Worker] = []
         self._registry: PublisherRegistry | None = None
+        self._session: Session | None = None
         # In containers every service may be process 1 of the same host name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.ready = threading.Event()
@@ -80,6 +81,19 @@ class Daemon:
         """The status of each source now."""
         return tuple(worker.status for worker in self._workers)
 
+    @property
+    def measures(self) -> list[SourceMeasures]:
+        """What is measured of each source, for metrics."""
+        return [worker.measures for worker in self._workers]
+
+    @property
+    def sessions(self) -> int:
+        """How many sessions are connected: to the embedded router, or of this client to its router."""
+        session = self._session
+        if session is None or session.is_closed():
+            return 0
+        return len(session.info.transports())
+
     def newest(self) -> list[Sample]:
         """Return the last message of each address that was published."""
         publishers = self._registry.publishers if self._registry else []
@@ -106,6 +120,7 @@ class Daemon:
             return True
         if self.role == "router":
             self._log_router()
+        self._session = session
         settings, queries = self._settings, QueryServer(session)
         registry = self._registry = PublisherRegistry(session, queries, prefix=self._settings.prefix)
         threads: list[threading.Thread] = []

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from pydantic import ValidationError
 
-from nedbus.client import Publisher, PublisherRegistry, StreamHealth
+from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
 from nedbus.errors import AddressInUseError
 from nedbus.sources import Rejection, SourceMessage
 from nedbus_msgs import Address, describe, upgrade_fields
@@ -21,10 +23,12 @@ _log = logging.getLogger(__name__)
 
 _STALE: Final = 3.0  # s without a message after which a live address is no longer published
 _MAX_ADDRESSES: Final = 1000  # of one live source
-_MAX_STREAMS: Final = 100  # in a status: it must fit a message
 _MAX_WARNINGS: Final = 50  # rejections that are remembered, one for each `where`
 _MAX_TEXT: Final = 300  # characters of a rejection that are logged: any peer may have sent it
 _MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
+_MAX_RULES: Final = 50  # that are counted one by one
+_NO_MESSAGE: Final = "input that is no message"
+_DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 1e-1, 1.0)  # s
 
 
 @dataclass(slots=True, eq=False)
@@ -41,6 +45,10 @@ class SourceOutput:
 
     def __init__(self, name: str, text: str, registry: PublisherRegistry, clock: Clock) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
+        self.rejections: Counter[str] = Counter()
+        """How many messages each rule rejected."""
+        self.durations = Histogram(_DURATIONS)
+        """How long it took to validate, encode and send a message [s]."""
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]
@@ -61,10 +69,9 @@ class SourceOutput:
         streams = list(self._streams.items())
         return [address for address, stream in streams if stream.publisher is None and stream.heard is not None]
 
-    @property
-    def streams(self) -> tuple[StreamStatus, ...]:
-        """The health of up to 100 streams."""
-        streams, now = list(self._streams.items())[:_MAX_STREAMS], self._now()
+    def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
+        """Return the health of all streams, or of so many."""
+        streams, now = list(self._streams.items())[:limit], self._now()
         return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 
     @property
@@ -109,14 +116,16 @@ class SourceOutput:
         if stream.publisher is None:
             raise KeyError(message.address)
         if message.error is not None:
-            self._reject_invalid(message, message.error)
+            self._reject_invalid(message, _NO_MESSAGE, message.error)
             return
+        start = time.perf_counter()
         try:
             fields = upgrade_fields(message.fields)
             stream.publisher.publish(fields)
         except ValidationError as exc:
-            self._reject_invalid(message, describe(exc))
+            self._reject_invalid(message, _rule_of(exc), describe(exc))
             return
+        self.durations.add(time.perf_counter() - start)
         self.published += 1
         stream.health.add(fields, received=self._now(), lost=message.lost)
 
@@ -157,7 +166,7 @@ class SourceOutput:
 
     def reject(self, rejection: Rejection) -> None:
         """Count something that is not a message, log it once for each place, and report it if it has an address."""
-        self.rejected += rejection.count
+        self._count_rejected(_NO_MESSAGE, rejection.count)
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
@@ -169,11 +178,21 @@ class SourceOutput:
         """Return monotonic ns: rates and ages do not follow the wall clock."""
         return round(self._clock.now() * 1e9)
 
-    def _reject_invalid(self, message: SourceMessage, reason: str) -> None:
-        self.rejected += 1
+    def _count_rejected(self, rule: str, count: int = 1) -> None:
+        self.rejected += count
+        self.rejections[rule if rule in self.rejections or len(self.rejections) < _MAX_RULES else "other"] += count
+
+    def _reject_invalid(self, message: SourceMessage, rule: str, reason: str) -> None:
+        self._count_rejected(rule)
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
             last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
             _log.warning("%s: %s rejected: %s%s", self._name, message.address, reason, last)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._registry.reject(message.address, report)
+
+
+def _rule_of(error: ValidationError) -> str:
+    """Return which rule a message violates, the first of several: its field, and the rule without any value."""
+    detail = error.errors(include_input=False, include_url=False)[0]
+    return f"{detail['loc'][0]}: {detail['msg'].partition(' (')[0]}" if detail["loc"] else detail["type"]

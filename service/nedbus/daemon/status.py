@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal, get_args
 
-from nedbus.client import Health
+from nedbus.client import Health, Histogram
 
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
+STATES: Final[tuple[State, ...]] = get_args(State)
 Role = Literal["router", "client"]
 
 
@@ -26,6 +27,7 @@ class SourceStatus:
     `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
     `lost`: messages that were lost before they reached a live source, as far as it can count; `reboots` of vehicles.
     `stale`: addresses that a live source published, until nothing arrived for 3 s.
+    `rejections`: how many messages each rule rejected.
     `retries`: how often it failed and was started again; `error`: why it failed last.
     `streams`: the health of each stream that is published, of up to 100 of them.
     """
@@ -36,6 +38,7 @@ class SourceStatus:
     stale: tuple[str, ...]
     published: int
     rejected: int
+    rejections: dict[str, int]
     lost: int
     reboots: int
     done: int
@@ -50,6 +53,15 @@ class SourceStatus:
     def ended(self) -> bool:
         """Whether it will publish no more."""
         return self.state in {"done", "failed"}
+
+
+@dataclass(frozen=True, slots=True)
+class SourceMeasures:
+    """What is measured of one source, for metrics: its status, all its streams, and how long publishing takes [s]."""
+
+    status: SourceStatus
+    streams: tuple[StreamStatus, ...]
+    durations: Histogram
 
 
 @dataclass(frozen=True, slots=True)

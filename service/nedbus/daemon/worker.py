@@ -15,12 +15,13 @@ from .clock import Clock
 from .live import listen
 from .output import SourceOutput
 from .replay import replay
-from .status import SourceStatus, State
+from .status import SourceMeasures, SourceStatus, State
 
 _log = logging.getLogger(__name__)
 
 _BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a source that failed is started again
 _MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must not be read thousands of times a second
+_MAX_STREAMS: Final = 100  # in a status: it must fit a message
 _POLL: Final = 0.05  # s between two checks for a reader
 
 
@@ -67,6 +68,7 @@ class Worker:
             stale=tuple(map(str, output.stale)),
             published=output.published,
             rejected=output.rejected,
+            rejections=dict(output.rejections),
             lost=output.lost,
             reboots=output.reboots,
             done=self._done,
@@ -75,8 +77,13 @@ class Worker:
             summary=run.summary if run else "",
             warnings=run.warnings if run else output.warnings,
             error=self._error,
-            streams=output.streams,
+            streams=output.streams(_MAX_STREAMS),
         )
+
+    @property
+    def measures(self) -> SourceMeasures:
+        """What is measured of the source, for metrics."""
+        return SourceMeasures(self.status, self._output.streams(), self._output.durations)
 
     def run(self) -> None:
         """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""

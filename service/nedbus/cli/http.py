@@ -1,0 +1,65 @@
+"""HTTP for commands: serving pages while they run, and the command that serves nothing else, export."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from nedbus import __version__
+from nedbus.client import Bus
+from nedbus.settings import split_http
+from nedbus_msgs import ANY
+
+from .options import InstanceOption, TopicArgument, TopicOption, VehicleOption, choose, on_bus
+from .run import run_until_stopped
+
+if TYPE_CHECKING:
+    from nedbus.monitoring import Page
+
+_log = logging.getLogger("nedbus")
+
+DEFAULT_HTTP: Final = "127.0.0.1:9464"
+
+
+@contextmanager
+def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator[None]:
+    """Serve pages on HOST:PORT for as long as this is entered."""
+    from nedbus.monitoring import HttpServer
+
+    server = HttpServer(where, pages)
+    host, _ = split_http(where)
+    _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where)
+    if host not in {"127.0.0.1", "::1", "localhost"}:
+        _log.warning("whoever reaches %s can read them; nothing can be changed there", where)
+    try:
+        yield
+    finally:
+        server.close()
+
+
+@on_bus
+def export(
+    bus: Bus,
+    topic: TopicArgument = None,
+    *,
+    topic_option: TopicOption = None,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    http: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to serve them")] = DEFAULT_HTTP,
+) -> None:
+    """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
+    from nedbus.monitoring import Exporter
+
+    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
+    exporter = Exporter(bus, selection, version=__version__)
+
+    def run(stop: threading.Event) -> None:
+        with serve_pages(http, exporter.pages):
+            exporter.run(stop)
+
+    run_until_stopped(run)

@@ -1,0 +1,50 @@
+"""The health of all streams of a subscription; no I/O."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from nedbus_msgs import Address, Message
+
+from .health import Health, StreamHealth
+from .histogram import Histogram
+from .sample import Sample
+
+_MAX_STREAMS: Final = 4096  # that a monitor follows
+
+
+class Monitor:
+    """Follow all streams of a subscription, at most 4096: then the one that was silent for longest is forgotten.
+
+    The first sample of each address does not count: it may be the last value that a subscription starts with.
+    """
+
+    def __init__(self) -> None:
+        self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
+
+    def add(self, sample: Sample[Message]) -> bool:
+        """Add a sample that was received just now; return whether it counts."""
+        address = sample.address
+        known = address in self._streams
+        stream = self._streams.pop(address, None)
+        if known:
+            stream = stream or StreamHealth(sample.topic)
+            stream.add(sample.message, received=time.monotonic_ns(), latency=sample.latency, lost=sample.lost)
+        elif len(self._streams) >= _MAX_STREAMS:
+            del self._streams[next(iter(self._streams))]
+        self._streams[address] = stream
+        return known
+
+    def snapshot(self) -> dict[Address, Health]:
+        """Return the health of each stream, sorted by address."""
+        return {address: stream.snapshot() for address in sorted(self._streams) if (stream := self._streams[address])}
+
+    def latencies(self, address: Address) -> Histogram | None:
+        """Return the latencies of a stream since the start [s]."""
+        stream = self._streams.get(address)
+        return stream.latencies if stream is not None else None
+
+    def forget(self, address: Address) -> None:
+        """Forget a stream; it is followed anew if it comes back."""
+        self._streams.pop(address, None)

@@ -1,0 +1,15 @@
+"""What a monitoring system reads over HTTP: metrics, health, readiness, status."""
+
+from typing import TYPE_CHECKING
+
+from nedbus.extras import lazy_exports
+
+from .http_server import HttpServer, Page
+from .pages import service_pages, why_not_ready
+
+if TYPE_CHECKING:
+    from .exporter import Exporter
+else:
+    __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
+
+__all__ = ["Exporter", "HttpServer", "Page", "service_pages", "why_not_ready"]

@@ -1,0 +1,93 @@
+"""An exporter: a reader of every message that shows what it sees, where no service of ours serves metrics.
+
+Needs the extra `metrics`.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Final
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from nedbus.client import Bus, Monitor
+from nedbus.errors import NoDataError
+from nedbus_msgs import Address, Selection
+
+from .exposition import build_info, metrics_page
+from .families import MAX_STREAMS, Stream, stream_families
+from .http_server import Page
+
+_RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
+_POLL: Final = 0.5  # s
+
+
+class Exporter(Collector):
+    """Read all that a selection matches, and make pages of what was seen."""
+
+    def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+        self._bus = bus
+        self._version = version
+        self._subscription = bus.subscribe(
+            selection.topic, vehicle=selection.vehicle, instance=selection.instance, mode="every"
+        )
+        self._monitor = Monitor()
+        self._sources: dict[Address, str] = {}
+
+    def run(self, stop: threading.Event) -> None:
+        """Read until `stop` is set."""
+        while not stop.is_set():
+            with suppress(NoDataError):
+                sample = self._subscription.receive(_POLL)
+                self._monitor.add(sample)
+                if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
+                    self._sources[sample.address] = sample.source or ""
+
+    @property
+    def pages(self) -> Mapping[str, Callable[[], Page]]:
+        """The pages by path."""
+        return {
+            "/metrics": lambda: metrics_page(self),
+            "/healthz": lambda: Page.text("ok"),
+            "/readyz": self._ready,
+            "/status": self._status,
+        }
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics."""
+        yield build_info(self._version)
+        yield GaugeMetricFamily("nedbus_connected", "1 while there is a link to a router", value=self._bus.connected)
+        counts = self._subscription.counts
+        yield CounterMetricFamily(
+            "nedbus_messages_dropped", "Messages for which the exporter was too slow", counts.dropped
+        )
+        yield CounterMetricFamily("nedbus_messages_invalid", "Payloads that were no valid message", counts.invalid)
+        yield GaugeMetricFamily(
+            "nedbus_queue_messages", "Messages that wait to be read", value=self._subscription.waiting
+        )
+        streams = [
+            Stream(
+                address.vehicle,
+                str(address).partition("/")[2],
+                self._sources.get(address, ""),
+                health,
+                latencies=self._monitor.latencies(address),
+            )
+            for address, health in self._monitor.snapshot().items()
+        ]
+        yield from stream_families(streams, messages=_RECEIVED)
+
+    def _ready(self) -> Page:
+        if self._bus.connected:
+            return Page.text("ready")
+        return Page.text(f"no router answers at {' or '.join(self._bus.routers)}", status=503)
+
+    def _status(self) -> Page:
+        streams = {str(address): asdict(health) for address, health in self._monitor.snapshot().items()}
+        status = {"connected": self._bus.connected, **asdict(self._subscription.counts), "streams": streams}
+        return Page(200, "application/json", json.dumps(status, indent=2).encode())

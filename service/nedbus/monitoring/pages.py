@@ -1,0 +1,52 @@
+"""The pages of a service: /metrics, /healthz, /readyz and /status."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+
+from nedbus.daemon import Daemon
+from nedbus.errors import ConfigError
+from nedbus.extras import needs
+
+from .http_server import Page
+
+
+def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
+    """Return the pages of a daemon by path."""
+    return {
+        "/metrics": lambda: _metrics(daemon),
+        "/healthz": lambda: Page.text("ok"),
+        "/readyz": lambda: _ready(daemon),
+        "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
+    }
+
+
+def why_not_ready(daemon: Daemon) -> list[str]:
+    """Return what keeps a service from being ready: no router, or a source that should speak and does not."""
+    if not daemon.ready.is_set():
+        return [f"the service starts: {' or '.join(daemon.endpoints)}"]
+    reasons = []
+    if daemon.role == "client" and not daemon.sessions:
+        reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
+    for source in daemon.sources:
+        silent = source.state == "waiting" and not source.addresses  # a replay that waits for a reader has some
+        if silent or source.state in {"starting", "retrying", "failed"}:
+            what = "nothing arrives" if silent else source.state
+            reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
+    return reasons
+
+
+def _ready(daemon: Daemon) -> Page:
+    reasons = why_not_ready(daemon)
+    return Page.text("\n".join(reasons), status=503) if reasons else Page.text("ready")
+
+
+def _metrics(daemon: Daemon) -> Page:
+    try:
+        collector = needs("metrics", "nedbus.monitoring.service_metrics").ServiceCollector(daemon)
+    except ConfigError as exc:
+        return Page.text(str(exc), status=501)
+    page: Page = needs("metrics", "nedbus.monitoring.exposition").metrics_page(collector)
+    return page
