@@ -24,7 +24,9 @@ FROM ${NEDBUS_BASE_IMAGE}
 RUN useradd --uid 1000 --create-home nedbus
 COPY --from=dependencies /opt/nedbus /opt/nedbus
 COPY --from=code /code /opt/nedbus
-ENV PATH=/opt/nedbus/bin:$PATH PYTHONUNBUFFERED=1
+# Metrics, health and status of `nedbus serve`, for other containers: nothing can be changed there.
+ENV PATH=/opt/nedbus/bin:$PATH PYTHONUNBUFFERED=1 NEDBUS_HTTP=0.0.0.0:9464
+EXPOSE 9464
 # A nedbus.toml mounted here is read.
 WORKDIR /etc/nedbus
 USER nedbus

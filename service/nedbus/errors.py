@@ -68,12 +68,16 @@ class AddressInUseError(NedbusError, ValueError):
 
 
 class ConfigError(NedbusError, ValueError):
-    """Raised for an invalid setting; `where` names the flag, the environment variable, or file, line and column."""
+    """Raised for an invalid setting; `where` names the flag, the environment variable, or file, line and column.
 
-    def __init__(self, where: str, reason: str) -> None:
+    `key` is the option of a source that is wrong, if it is one.
+    """
+
+    def __init__(self, where: str, reason: str, *, key: str = "") -> None:
         super().__init__(f"{where}: {reason}")
         self.where = where
         self.reason = reason
+        self.key = key
 
     @classmethod
     def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:

@@ -14,6 +14,7 @@ import zenoh
 
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NedbusError, NoDataError
+from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -100,7 +101,7 @@ class Ros2Bridge:
         the bridge.
         """
         key = node_token(self._domain, self._zid, self._node)
-        with while_open(self._session):
+        with while_open():
             token = self._session.liveliness().declare_token(key)
         try:
             if self._observer is not None:
@@ -147,7 +148,7 @@ class Ros2Bridge:
         """Say what was held back, query what is on the bus and in ROS 2, and do what the arbiter decides."""
         held_back = self._late_filter.report()
         if held_back:
-            _log.warning("%s: ROS 2 would use them as the current estimate", held_back)
+            _log.warning("%s: ROS 2 would use them as the current estimate", held_back, extra=about("held-back"))
         addresses = [
             address
             for addresses in self._bus.vehicles().values()
@@ -165,17 +166,33 @@ class Ros2Bridge:
         address, topic, other = decision.address, decision.topic, decision.other
         if decision.action == "publish":
             self._open(address, topic)
-            _log.info("%s -> /%s, %s of layout %s", address, topic, ROS2_TYPE, self._layout)
+            _log.info(
+                "%s -> /%s, %s of layout %s", address, topic, ROS2_TYPE, self._layout, extra=about("bridged", address)
+            )
         elif decision.action == "conflict":
-            _log.warning("%s is not published: %s has the topic /%s already: set --namespace", address, other, topic)
+            _log.warning(
+                "%s is not published: %s has the topic /%s already: set --namespace",
+                address,
+                other,
+                topic,
+                extra=about("conflict", address),
+            )
         else:
             if address in self._publishers:
                 self._publishers.pop(address).close()
             if decision.action == "defer":
-                _log.warning("%s: node %s publishes /%s already: left to that node", address, other, topic)
+                _log.warning(
+                    "%s: node %s publishes /%s already: left to that node",
+                    address,
+                    other,
+                    topic,
+                    extra=about("conflict", address),
+                )
             else:
                 self._late_filter.forget(address)
-                _log.info("%s is no longer published: /%s is withdrawn", address, topic)
+                _log.info(
+                    "%s is no longer published: /%s is withdrawn", address, topic, extra=about("withdrawn", address)
+                )
 
     def _other_publisher(self, key: TopicKey) -> str | None:
         """Return the name of another node that publishes this topic."""
@@ -189,7 +206,7 @@ class Ros2Bridge:
         key = self._key(topic)
         self._entities += 1
         token = publisher_token(key, self._zid, self._node, self._entities)
-        with while_open(self._session):
+        with while_open():
             self._publishers[address] = _Ros2Publisher(
                 gid_of_token(token),
                 self._session.declare_publisher(
@@ -203,7 +220,7 @@ class Ros2Bridge:
         payload = encode_cdr(downgrade(sample.message, self._layout), layout=self._layout)
         publisher.sequence += 1
         attachment = bytes(Attachment(publisher.sequence, time.time_ns(), publisher.gid))
-        with while_open(self._session):
+        with while_open():
             publisher.publisher.put(payload, attachment=attachment)
 
     def _key(self, topic: str) -> TopicKey:

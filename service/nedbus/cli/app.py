@@ -10,12 +10,13 @@ import typer
 from nedbus import __version__
 
 from .bridges import foxglove, ros2
+from .check import check
 from .echo import echo
 from .files import convert, plot, record
 from .health import health
 from .http import export
 from .hz import hz
-from .logs import log_to_stderr
+from .logs import LogFormat, LogLevel, log_to_stderr
 from .options import command, write
 from .pki import pki
 from .query import get, info, list_, schema
@@ -37,6 +38,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "get": get,
     "info": info,
     "health": health,
+    "check": check,
     "export": export,
     "schema": schema,
     "ros2": ros2,
@@ -62,5 +64,11 @@ def _set_up(
     *,
     version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
+    log_level: Annotated[
+        LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Log from this level on")
+    ] = LogLevel.INFO,
+    log_format: Annotated[
+        LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="json: an object a line")
+    ] = LogFormat.TEXT,
 ) -> None:
-    log_to_stderr(debug=debug)
+    log_to_stderr(level=LogLevel.DEBUG if debug else log_level, log_format=log_format)

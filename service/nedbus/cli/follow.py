@@ -9,6 +9,7 @@ from typing import Final
 
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NoDataError
+from nedbus.log_event import about
 
 from .options import write_stderr
 
@@ -35,7 +36,8 @@ class Link:
         was, self.connected = self.connected, self._bus.connected
         if was != self.connected:
             text = "the link to %s is back" if self.connected else "the link to %s is broken: waiting for it"
-            _log.warning(text, " or ".join(self._bus.routers))
+            event = "link-back" if self.connected else "link-broken"
+            _log.warning(text, " or ".join(self._bus.routers), extra=about(event))
 
 
 def follow(

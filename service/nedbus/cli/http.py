@@ -12,6 +12,7 @@ import typer
 
 from nedbus import __version__
 from nedbus.client import Bus
+from nedbus.log_event import about
 from nedbus.settings import split_http
 from nedbus_msgs import ANY
 
@@ -33,9 +34,9 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
 
     server = HttpServer(where, pages)
     host, _ = split_http(where)
-    _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where)
+    _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where, extra=about("http"))
     if host not in {"127.0.0.1", "::1", "localhost"}:
-        _log.warning("whoever reaches %s can read them; nothing can be changed there", where)
+        _log.warning("whoever reaches %s can read them; nothing can be changed there", where, extra=about("http"))
     try:
         yield
     finally:

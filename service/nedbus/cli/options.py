@@ -18,13 +18,16 @@ import typer
 
 from nedbus.client import Bus, connect_with
 from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, NedbusError
+from nedbus.log_event import about
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, TOPICS, Selection
 
 from .format import MAX_TEXT, printable, to_text
+from .logs import logs_for_programs
 
 P = ParamSpec("P")
+_log = logging.getLogger("nedbus")
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
 ConnectOption = Annotated[
@@ -140,7 +143,11 @@ _BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
 
 
 def write_stderr(text: str) -> None:
-    """Write a line for a person to stderr, at once; if nobody can read it any more, go on."""
+    """Write a line for a person to stderr, at once, or log it for programs; if nobody can read it any more, go on."""
+    if logs_for_programs():
+        for line in text.splitlines():
+            _log.info("%s", line, extra=about("notice"))
+        return
     with suppress(OSError):
         sys.stderr.write(f"{printable(text)}\n")
         sys.stderr.flush()
@@ -195,7 +202,10 @@ def _exit_with(error: NedbusError, code: int) -> typer.Exit:
     """Return the exit for an error that is reported in one line; raise the error itself with --debug."""
     if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
         raise error
-    write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))
+    if logs_for_programs():
+        _log.error("%s", error, extra=about("error"))
+    else:
+        write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))
     return typer.Exit(code)
 
 

@@ -1,4 +1,4 @@
-"""Commands that make keys and certificates: pki ca, pki cert."""
+"""Commands that make keys and certificates: pki ca, pki cert; and the table of all that `nedbus pki` has."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import typer
 from nedbus import transport
 
 from .options import command, write, write_stderr
-
-FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
+from .pki_fleet import FolderArgument, enroll, list_, renew, rules
 
 pki = typer.Typer(help="Make keys and certificates for tls/ endpoints.", no_args_is_help=True)
 
@@ -37,6 +36,12 @@ def cert(
 ) -> None:
     """Make NAME.key and NAME.crt; config/router-secure.json5 defines what each name may do."""
     _write_paths(transport.make_certificate(folder, name, hosts=host or (), days=days or transport.DAYS))
+
+
+pki.command("enroll")(enroll)
+pki.command("list")(list_)
+pki.command("renew")(renew)
+pki.command("rules")(rules)
 
 
 def _write_paths(paths: list[Path]) -> None:

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 from nedbus.daemon import Daemon, SourceStatus
+from nedbus.log_event import about
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import DEFAULT_TOPIC
 
 from .format import to_line, to_text
-from .logs import log_to
+from .logs import log_to, logs_for_programs
 from .options import write_stderr
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Display:
         self._rates: dict[str, tuple[float, int]] = {}
 
     def __enter__(self) -> Self:
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() and not logs_for_programs():
             self._start_progress()
         return self
 
@@ -84,10 +85,11 @@ class Display:
         """Log the progress of each source, and the newest messages of some vehicles."""
         for status in self._daemon.sources:
             if status.state == "running":
-                _log.info("%s: %s", status.source.rstrip(":"), self._numbers(status))
+                name = status.source.rstrip(":")
+                _log.info("%s: %s", name, self._numbers(status), extra=about("progress", source=name))
         newest = [sample for sample in self._daemon.newest() if sample.topic == DEFAULT_TOPIC]
         for sample in newest[:_REPORTED]:
-            _log.info("%s", to_line(sample))
+            _log.info("%s", to_line(sample), extra=about("progress", sample.address))
 
     def _print(self, text: str) -> None:
         if self._progress is not None:

@@ -14,13 +14,18 @@ from typing import Final
 
 import typer
 
+from nedbus.log_event import about
+
 _log = logging.getLogger("nedbus")
 
 _LIMIT: Final = 1.6  # s after a signal by which the process has ended
 
 
 def _ignore_hangup() -> None:
-    _log.info("SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process")
+    _log.info(
+        "SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process",
+        extra=about("reload"),
+    )
 
 
 def run_until_stopped(body: Callable[[threading.Event], object]) -> None:
@@ -77,12 +82,15 @@ def run_until_signal(
         on_tick()
         thread.join(0.1)
     if signals:
-        _log.info("ending: %s", signal.Signals(signals[0]).name)
+        _log.info("ending: %s", signal.Signals(signals[0]).name, extra=about("ending"))
     deadline = time.monotonic() + _LIMIT
     while thread.is_alive() and time.monotonic() < deadline:
         thread.join(0.05)
     if thread.is_alive():
-        _log.error("not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost")
+        _log.error(
+            "not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost",
+            extra=about("ending"),
+        )
         sys.stderr.flush()
         os._exit(1)
     if isinstance(outcome[0], BaseException):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
@@ -11,16 +12,20 @@ from typing import Annotated
 import typer
 
 from nedbus import __version__
-from nedbus.daemon import Daemon
+from nedbus.daemon import Daemon, check_service
+from nedbus.errors import NedbusError
+from nedbus.log_event import about
 from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, open_router, router_endpoints
 
+from .check import report_mistakes
 from .http import serve_pages
 from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
 from .progress import Display
 from .run import run_until_signal, run_until_stopped
+from .systemd import Notifier
 
 _log = logging.getLogger("nedbus")
 _SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
@@ -59,30 +64,60 @@ def serve(
     ] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,
+    check: Annotated[bool, typer.Option("--check", help="Only say all that is wrong with the settings")] = False,
 ) -> None:
-    """Publish sources, validated; the service is a router itself unless it is to join one (--connect)."""
-    settings = load_settings(
-        config,
-        source=source and tuple(source),
-        connect=connect and tuple(connect),
-        listen=listen and tuple(listen),
-        router_config=router_config,
-        tls_ca=tls_ca,
-        tls_certificate=tls_certificate,
-        tls_key=tls_key,
-        prefix=prefix,
-        vehicle=vehicle,
-        http=http,
-        until_done=until_done,
-    )
+    """Publish sources, validated; the service is a router itself unless it is to join one (--connect).
+
+    SIGHUP reads the settings again: new sources start, those that are gone end, all others go on.
+    """
+    given: dict[str, object] = {
+        "source": source and tuple(source),
+        "connect": connect and tuple(connect),
+        "listen": listen and tuple(listen),
+        "router_config": router_config,
+        "tls_ca": tls_ca,
+        "tls_certificate": tls_certificate,
+        "tls_key": tls_key,
+        "prefix": prefix,
+        "vehicle": vehicle,
+        "http": http,
+        "until_done": until_done,
+    }
+    if check:
+        report_mistakes(check_service(config, given))
+        return
+    settings = load_settings(config, **given)
     daemon = Daemon(settings, version=__version__)
     with ExitStack() as closing:
         if settings.http is not None:
             closing.enter_context(serve_pages(settings.http, service_pages(daemon)))
+        notifier = closing.enter_context(Notifier(daemon))
         display = closing.enter_context(Display(daemon))
-        exit_code = run_until_signal(daemon.run, daemon.stop, on_tick=display.update)
+
+        def tick() -> None:
+            display.update()
+            notifier.tick()
+
+        def stop() -> None:
+            notifier.stopping()
+            daemon.stop()
+
+        exit_code = run_until_signal(
+            daemon.run, stop, on_tick=tick, on_hangup=lambda: _reload(daemon, notifier, config, given)
+        )
     if exit_code is not None:
         raise typer.Exit(exit_code)
+
+
+def _reload(daemon: Daemon, notifier: Notifier, config: Path | None, given: Mapping[str, object]) -> None:
+    """Read the settings again; what is wrong with them changes nothing."""
+    try:
+        with notifier.reloading():
+            done = daemon.reload(load_settings(config, **given))
+    except NedbusError as exc:
+        _log.error("the settings are rejected, and nothing changes: %s", exc, extra=about("reload"))
+    else:
+        _log.info("the settings were read again: %s", done, extra=about("reload"))
 
 
 @command
@@ -111,7 +146,7 @@ def router(
     def run(stop: threading.Event) -> None:
         session = open_router(listen=endpoints, connect=routers, config_file=config_file, tls=tls)
         joining = f", joining {', '.join(routers)}" if routers else ""
-        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joining)
+        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joining, extra=about("router"))
         uplinks = Uplinks(session, routers, tls=tls)
         while not stop.wait(UPLINK_POLL if routers else None):
             uplinks.check()

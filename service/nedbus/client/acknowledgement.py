@@ -15,6 +15,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus.log_event import about
 from nedbus.transport import LEASE, Session, entity_name, while_open
 from nedbus_msgs import ack_key
 
@@ -98,7 +99,7 @@ class Acknowledgement:
     def _tell_once(self) -> None:
         if not self._told:
             self._told = True
-            _log.info("%s: waiting for a slow reader", self._key.removesuffix("/@ack"))
+            _log.info("%s: waiting for a slow reader", self._key.removesuffix("/@ack"), extra=about("slow-reader"))
 
     def wait(self, published: int, *, timeout: float) -> bool:
         """Wait until all readers have `published` messages; return False if one has not within `timeout` seconds.
@@ -146,7 +147,7 @@ class Acknowledgement:
 
         parameters = write_parameters(entity_name(self._publisher.id), (published - 1) % 2**32, read=read)
         self._asked = published
-        with while_open(self._session):
+        with while_open():
             self._session.get(
                 f"{self._key}?{parameters}",
                 zenoh.handlers.Callback(on_reply, on_end, indirect=False),

@@ -31,7 +31,7 @@ class CatchUp:
         self._session = session
         self._queue = receive_queue
         self._asked: set[str] = set()  # publishers, since a link broke last
-        with while_open(session):
+        with while_open():
             self._listener = session.info.declare_transport_events_listener(
                 zenoh.handlers.Callback(self._on_link, indirect=False), history=False
             )

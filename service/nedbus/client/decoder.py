@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 import zenoh
 
+from nedbus.log_event import about
 from nedbus.transport import RawSample
 from nedbus_msgs import (
     PAYLOAD_LIMIT,
@@ -130,7 +131,9 @@ class Decoder:
             if key in self._warned or len(self._warned) >= MAX_KEYS:
                 return
             self._warned.add(key)
-        _log.warning("%r: %s", key, error)
+        stream = self._streams.get(key)
+        extra = about("invalid", stream.address if stream else None, reason=str(error))
+        _log.warning("%r: %s", key, error, extra=extra)
 
     def _inspect(self, payload: bytes, kind: zenoh.SampleKind) -> None:
         if len(payload) == PAYLOAD_SIZE:

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Sequence
 from typing import Final
 
+from nedbus.log_event import about
 from nedbus.transport import RawSample, Session, query
 from nedbus_msgs import ANY, schema_key, status_key
 
@@ -40,7 +41,7 @@ def _parse_json(raw: RawSample) -> object:
     try:
         return json.loads(raw.payload.to_bytes())
     except (ValueError, RecursionError):
-        _log.warning("%r: an answer that is not JSON", str(raw.key_expr))
+        _log.warning("%r: an answer that is not JSON", str(raw.key_expr), extra=about("invalid", reason="no JSON"))
         return None
 
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
+from nedbus.log_event import about
 from nedbus_msgs import FIELD_TYPES, UnknownLayoutError, decode
 
 _log = logging.getLogger(__name__)
@@ -50,4 +51,6 @@ class LayoutLookup:
         if fields is not None:
             self.newer = {**self.newer, layout: fields}
             unread = [name for name in fields if name not in FIELD_TYPES]
-            _log.warning("layout %d is newer than this reader; not read: %s", layout, ", ".join(unread) or "nothing")
+            names = ", ".join(unread) or "nothing"
+            extra = about("newer-layout")
+            _log.warning("layout %d is newer than this reader; not read: %s", layout, names, extra=extra)

@@ -69,7 +69,7 @@ class Publisher:
         self._encoding = encoding_of(source)
         qos = TOPIC_QOS[address.topic]
         misses = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT, sporadic_heartbeat=None)
-        with while_open(session):
+        with while_open():
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
@@ -121,7 +121,7 @@ class Publisher:
         payloads = encode_array(messages)
         put, new_timestamp = self._publisher.put, self._session.new_timestamp
         lossless, pace = self.lossless, self._acknowledgement.pace
-        with while_open(self._session):
+        with while_open():
             for start in range(0, len(payloads), PAYLOAD_SIZE):
                 payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
                 put(payload, timestamp=stamp)
@@ -182,7 +182,7 @@ class Publisher:
                 encoding = self._partial_encoding
                 self._publisher.put(payload, timestamp=stamp, encoding=encoding)
         except zenoh.ZError as exc:
-            raise translate_error(exc, self._session) from exc
+            raise translate_error(exc) from exc
         self.last = payload, stamp, encoding
         self.published += 1
         if self.lossless:

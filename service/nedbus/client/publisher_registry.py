@@ -13,6 +13,7 @@ import zenoh
 from pydantic_core import to_json
 
 from nedbus.errors import AddressInUseError
+from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
 from nedbus_msgs import Address, json_schema, layout_table, schema_key
 
@@ -79,7 +80,7 @@ class PublisherRegistry:
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
         """Publish why a message of this address was rejected; what JSON cannot hold is written as text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
-        with while_open(self._session):
+        with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
     def is_alive(self, address: Address) -> bool:
@@ -103,10 +104,12 @@ class PublisherRegistry:
             logged = False
             while not publisher.flush(_ASK_AGAIN):
                 if (stop and stop.is_set()) or time.monotonic() > end:
-                    _log.warning("%s: a reader does not have all of it", publisher.address)
+                    extra = about("slow-reader", publisher.address)
+                    _log.warning("%s: a reader does not have all of it", publisher.address, extra=extra)
                     return
                 if not logged:
-                    _log.info("%s: waiting for a slow reader", publisher.address)
+                    extra = about("slow-reader", publisher.address)
+                    _log.info("%s: waiting for a slow reader", publisher.address, extra=extra)
                 logged = True
 
     def _forget(self, address: Address) -> None:

@@ -13,6 +13,7 @@ from typing import Final
 
 import zenoh
 
+from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 
 _log = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ class QueryServer:
 
         # A Python thread of Zenoh's would keep the process from exiting: the callback is a direct one.
         callback = zenoh.handlers.Callback(enqueue, indirect=False)
-        with while_open(self._session):
+        with while_open():
             self._queryables.append(self._session.declare_queryable(key_expr, callback))
 
     def answer_json(self, key: str, content: Callable[[], Mapping[str, object]]) -> None:
@@ -96,4 +97,4 @@ class QueryServer:
             except zenoh.ZError as exc:
                 _log.debug("a query on %s could not be answered: %s", key_expr, exc)
             except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
-                _log.exception("a query on %s is not answered", key_expr)
+                _log.exception("a query on %s is not answered", key_expr, extra=about("bug"))

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
+from nedbus.log_event import about
 from nedbus.transport import RawSample, entity_name
 from nedbus_msgs import AddressError
 
@@ -107,7 +108,8 @@ class ReceiveQueue:
                 overflowed |= self._append(arrivals)
         if overflowed and not self.newest_only and not self._warned:
             self._warned = True
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name)
+            extra = about("dropped")
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
         if self._questions:
             self._answer(drained=True)
 

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from nedbus.log_event import about
 from nedbus.transport import MAX_ANSWERS, Session, ask_alive_keys, follow_alive_keys
 from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_expr
 
@@ -55,7 +56,10 @@ class VehicleDirectory:
         self._next_ask = float("inf") if complete else time.monotonic() + _ASK_AGAIN
         if not complete:
             _log.warning(
-                "%s: not all liveliness tokens are known, after %d: some vehicles are missing", key_expr, len(keys)
+                "%s: not all liveliness tokens are known, after %d: some vehicles are missing",
+                key_expr,
+                len(keys),
+                extra=about("incomplete"),
             )
 
     def _on_change(self, key: str, alive: bool) -> None:

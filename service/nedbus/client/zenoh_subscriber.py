@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
@@ -52,7 +53,7 @@ class ZenohSubscriber:
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None) if every else None
         # No late-publisher detection: after a router's restart its history query would win over recovery.
         history = zenoh.ext.HistoryConfig(max_samples=1)
-        with while_open(session):
+        with while_open():
             self._subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, key_expr, channel, history=history, recovery=recovery
             )
@@ -125,7 +126,7 @@ class ZenohSubscriber:
                     self._receiving.release()
                 self._queue.wakeups.wake()
         except BaseException:
-            _log.exception("%s: the subscription ends after an unexpected error", self._name)
+            _log.exception("%s: the subscription ends after an unexpected error", self._name, extra=about("error"))
             raise
         finally:
             self._queue.end()  # nobody waits for a pump that has ended
@@ -157,7 +158,8 @@ class ZenohSubscriber:
             overflowed = len(batch) >= _CHANNEL
             self._queue.put(self._catch_up.complete(batch) if self._catch_up else batch, overflowed=overflowed)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
-            _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch))
+            extra = about("bug")
+            _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
             self._queue.count_invalid(len(batch))
 
     def _listen(self, asked: zenoh.Handler[zenoh.Query]) -> None:

@@ -12,19 +12,22 @@ from dataclasses import asdict
 from typing import Final
 
 from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, Sample
-from nedbus.errors import ConfigError, ConnectError
-from nedbus.settings import Settings
-from nedbus.sources import LiveSource, Source, parse_source
-from nedbus.transport import UPLINK_POLL, Session, Uplinks, dial_endpoint, open_client, open_router
+from nedbus.errors import ConnectError
+from nedbus.log_event import about
+from nedbus.settings import Settings, locate_setting
+from nedbus.sources import LiveSource, Source
+from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router
 from nedbus_msgs import decode, provenance_of, status_key
 
-from .clock import SystemClock
+from .plan import Planned, is_finite, plan_sources
 from .status import Role, ServiceStatus, SourceMeasures, SourceStatus
 from .worker import Worker
+from .workers import Workers
 
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s that a source has to end
+_RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
 
 
 class Daemon:
@@ -36,16 +39,13 @@ class Daemon:
     """
 
     def __init__(self, settings: Settings, *, version: str) -> None:
-        if not settings.source:
-            raise ConfigError(
-                "source", "nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"
-            )
         self._settings = settings
         self._version = version
         self._started = time.time()
         self._stop = threading.Event()
         self._changed = threading.Event()
-        self._workers: list[Worker] = []
+        self._workers: Workers | None = None
+        self._planning = threading.Lock()  # `run` starts what is planned, `reload` changes it
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         # In containers every service may be process 1 of the same host name.
@@ -53,9 +53,7 @@ class Daemon:
         self.ready = threading.Event()
         self.role: Role = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
-        self._sources = [(text, self._open_source(text)) for text in settings.source]
-        if settings.until_done and not any(_is_finite(source) for _, source in self._sources):
-            raise ConfigError("until_done", "no source ever ends: give sim: a duration, or take loop=1 from ulog:")
+        self._plan = self._make_plan(settings)
 
     @property
     def until_done(self) -> bool:
@@ -79,20 +77,17 @@ class Daemon:
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
         """The status of each source now."""
-        return tuple(worker.status for worker in self._workers)
+        return tuple(worker.status for worker in self._list_workers())
 
     @property
     def measures(self) -> list[SourceMeasures]:
         """What is measured of each source, for metrics."""
-        return [worker.measures for worker in self._workers]
+        return [worker.measures for worker in self._list_workers()]
 
     @property
     def sessions(self) -> int:
         """How many sessions are connected: to the embedded router, or of this client to its router."""
-        session = self._session
-        if session is None or session.is_closed():
-            return 0
-        return len(session.info.transports())
+        return 0 if self._session is None else len(self._session.info.transports())
 
     def newest(self) -> list[Sample]:
         """Return the last message of each address that was published."""
@@ -107,6 +102,24 @@ class Daemon:
         """Ask it to end; callable from anywhere, a signal handler included."""
         self._stop.set()
         self._changed.set()
+
+    def reload(self, settings: Settings) -> str:
+        """Start sources that are new, stop those that are gone, leave all others alone; return what was done.
+
+        Raises ConfigError, and changes nothing, for a source that is invalid, or another setting than source and
+        vehicle that differs.
+        """
+        for name in type(settings).model_fields:
+            if name not in _RELOADED and getattr(settings, name) != getattr(self._settings, name):
+                raise locate_setting(settings, name, f"{name} cannot change while the service runs: restart it")
+        plan = self._make_plan(settings)
+        with self._planning:
+            self._settings, self._plan = settings, plan
+            if self._workers is None:
+                return "nothing runs yet"
+            started, stopped, kept = self._workers.apply(plan)
+        self._changed.set()
+        return f"{started} started, {stopped} stopped, {kept} unchanged"
 
     def run(self) -> bool:
         """Publish until done or stopped; return whether no source failed for good.
@@ -123,45 +136,44 @@ class Daemon:
         self._session = session
         settings, queries = self._settings, QueryServer(session)
         registry = self._registry = PublisherRegistry(session, queries, prefix=self._settings.prefix)
-        threads: list[threading.Thread] = []
         try:
             queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
-            clock, retry = SystemClock(self._stop), not self._settings.until_done
             router = session if self.role == "router" else None
-            self._workers = [
-                Worker(text, source, registry, router=router, clock=clock, retry=retry, on_end=self._changed.set)
-                for text, source in self._sources
-            ]
-            threads = [threading.Thread(target=worker.run, name=worker.text, daemon=True) for worker in self._workers]
-            for thread in threads:
-                thread.start()
+            with self._planning:
+                self._workers = Workers(
+                    registry, router=router, retry=not settings.until_done, on_end=self._changed.set
+                )
+                self._workers.apply(self._plan)
             self.ready.set()
             self._wait(registry, Uplinks(session, settings.connect, tls=settings.tls) if router else None)
         finally:
             self._stop.set()
-            deadline = time.monotonic() + _GRACE
-            for thread in threads:
-                thread.join(max(0.0, deadline - time.monotonic()))
+            if self._workers is not None:
+                self._workers.end(_GRACE)
             queries.close()
             session.close()
-        return not any(worker.status.state == "failed" for worker in self._workers)
+        return not any(source.state == "failed" for source in self.sources)
 
-    def _open_source(self, text: str) -> Source:
-        settings = self._settings
-        return parse_source(text).open_source(
-            vehicle=settings.vehicle, routers=tuple(map(dial_endpoint, self.endpoints)), tls=settings.tls
-        )
+    def _list_workers(self) -> list[Worker]:
+        return self._workers.workers if self._workers is not None else []
+
+    def _make_plan(self, settings: Settings) -> list[Planned]:
+        """Return the sources of these settings, opened; raise ConfigError, with its place, for the first mistake."""
+        plan, mistakes = plan_sources(settings, self.endpoints)
+        if mistakes:
+            raise mistakes[0]
+        return plan
 
     def _log_client(self) -> None:
         """Log whose client it is, and what made it one: NEDBUS_CONNECT may be set for scripts."""
         setter = self._settings.set_by("connect")
         hint = "" if setter == "connect" else f", as set by {setter}: it starts no router of its own without --listen"
-        _log.info("client of %s%s", ", ".join(self.endpoints), hint)
+        _log.info("client of %s%s", ", ".join(self.endpoints), hint, extra=about("client"))
 
     def _log_router(self) -> None:
         connect = self._settings.connect
         joining = f", joining {', '.join(connect)}" if connect else ""
-        _log.info("router on %s%s", ", ".join(self.endpoints), joining)
+        _log.info("router on %s%s", ", ".join(self.endpoints), joining, extra=about("router"))
 
     def _open(self) -> Session | None:
         """Open the session; a client waits for its router for as long as it takes."""
@@ -179,7 +191,7 @@ class Daemon:
                 return open_client(self.endpoints, timeout=1.0, tls=self._settings.tls, stop=self._stop)
             except ConnectError as exc:
                 if not logged:
-                    _log.warning("%s; still trying", exc)
+                    _log.warning("%s; still trying", exc, extra=about("link-broken"))
                 logged = True
         return None
 
@@ -188,7 +200,7 @@ class Daemon:
         watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
-                finite = [worker for worker in self._workers if _is_finite(worker.source)]
+                finite = [worker for worker in self._list_workers() if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # A reader that missed the very last message learns it from a heartbeat.
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
@@ -198,10 +210,6 @@ class Daemon:
             self._changed.clear()
             if uplinks is not None:
                 uplinks.check()
-
-
-def _is_finite(source: Source) -> bool:
-    return not isinstance(source, LiveSource) and source.finite
 
 
 def _is_paced(source: Source) -> bool:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
 from nedbus.errors import AddressInUseError
+from nedbus.log_event import about
 from nedbus.sources import Rejection, SourceMessage
 from nedbus_msgs import Address, describe, upgrade_fields
 
@@ -99,7 +100,12 @@ class SourceOutput:
         if stream.publisher is not None:
             return
         if self._registry.is_alive(address):
-            _log.warning("%s: %s is published by another process too: readers get both", self._name, address)
+            _log.warning(
+                "%s: %s is published by another process too: readers get both",
+                self._name,
+                address,
+                extra=about("duplicate", address, source=self._name),
+            )
         stream.publisher = self._registry.publisher(address, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
@@ -146,7 +152,8 @@ class SourceOutput:
                 self.reject(Rejection(str(address), str(exc)))
                 return
             self._live += not back
-            _log.info("%s: %s %s", self._name, address, "is back" if back else "is published")
+            event = "back" if back else "published"
+            _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
         self._streams[address].heard = self._clock.now()
         self.publish(message)
 
@@ -160,7 +167,13 @@ class SourceOutput:
         }
         for address in self.addresses:
             if address not in fresh:
-                _log.warning("%s: %s is stale: nothing arrived for %.0f s", self._name, address, _STALE)
+                _log.warning(
+                    "%s: %s is stale: nothing arrived for %.0f s",
+                    self._name,
+                    address,
+                    _STALE,
+                    extra=about("stale", address, source=self._name),
+                )
         self.release(keep=fresh)
         return bool(fresh)
 
@@ -170,7 +183,13 @@ class SourceOutput:
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
-            _log.warning("%s: %s: rejected: %s", self._name, where, reason)
+            _log.warning(
+                "%s: %s: rejected: %s",
+                self._name,
+                where,
+                reason,
+                extra=about("rejected", rejection.address, source=self._name, reason=reason),
+            )
         if rejection.address is not None:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
@@ -187,7 +206,14 @@ class SourceOutput:
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
             last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
-            _log.warning("%s: %s rejected: %s%s", self._name, message.address, reason, last)
+            _log.warning(
+                "%s: %s rejected: %s%s",
+                self._name,
+                message.address,
+                reason,
+                last,
+                extra=about("rejected", message.address, source=self._name, reason=reason),
+            )
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._registry.reject(message.address, report)
 

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
+from nedbus.log_event import about
 from nedbus.sources import ReplayRun, SourceMessage
 
 from .clock import Clock
@@ -24,7 +25,7 @@ def replay(
         if speed is not None:
             early = start + message.due / speed - clock.now()
             if early < -_LATE:
-                _log.warning("%s: %.1f s late, going on from here", name, -early)
+                _log.warning("%s: %.1f s late, going on from here", name, -early, extra=about("late", source=name))
                 start -= early
             elif early > 0:
                 clock.wait(early)

@@ -8,6 +8,7 @@ from typing import Final
 
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ClosedError, NedbusError
+from nedbus.log_event import about
 from nedbus.sources import LiveSource, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.transport import Session
 
@@ -90,11 +91,15 @@ class Worker:
         try:
             self._run_until_done()
         except BaseException as exc:  # noqa: BLE001 - a thread that ends must not look as if it ran
-            _log.exception("%s: an unexpected error ended it", self._name)
+            _log.exception("%s: an unexpected error ended it", self._name, extra=about("failed", source=self._name))
             self._error = _describe(exc)
             self._state = "failed"
         finally:
             self._on_end()
+
+    def withdraw(self) -> None:
+        """Publish nothing any more, once `run` has returned: its addresses are free for others."""
+        self._output.release()
 
     def _run_until_done(self) -> None:
         failures = 0
@@ -110,7 +115,7 @@ class Worker:
             except NedbusError as exc:
                 self._fail(str(exc))
             except BaseException as exc:  # noqa: BLE001 - of one source, not of the service; a panic of Rust is no Exception
-                _log.exception("%s: an unexpected error", self._name)
+                _log.exception("%s: an unexpected error", self._name, extra=about("retrying", source=self._name))
                 self._fail(_describe(exc))
             else:
                 if isinstance(self.source, LiveSource) or not self.source.loop:
@@ -137,9 +142,9 @@ class Worker:
         run = source.open()
         first = self._run is None
         if self._run is None or self._run.summary != run.summary:
-            _log.info("%s: %s", self._name, run.summary)
+            _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             for warning in run.warnings:
-                _log.warning("%s: %s", self._name, warning)
+                _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
         self._run, self._done = run, 0
         if source.wait and first:
             self._wait_for_reader(run)
@@ -155,27 +160,35 @@ class Worker:
 
     def _wait_for_reader(self, run: ReplayRun) -> None:
         self._state = "waiting"
-        _log.info("%s: waiting for a subscriber", self._name)
+        _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
         while not self._registry.is_read(run.addresses) and not self._clock.wait(_POLL):
             pass
 
     def _set_state(self, state: State) -> None:
         if state == "waiting" and self._state in {"starting", "retrying"}:
-            _log.info("%s: listening", self._name)
+            _log.info("%s: listening", self._name, extra=about("listening", source=self._name))
         self._state, self._error = state, None
 
     def _end(self, state: State) -> None:
         if not self._clock.stopped:
             self._state = state
             output = self._output
-            _log.info("%s: %s, %d published, %d rejected", self._name, state, output.published, output.rejected)
+            _log.info(
+                "%s: %s, %d published, %d rejected",
+                self._name,
+                state,
+                output.published,
+                output.rejected,
+                extra=about("failed" if state == "failed" else "done", source=self._name, reason=self._error),
+            )
 
     def _fail(self, reason: str) -> None:
         """Note why it failed, and release all addresses: another source may need them meanwhile."""
         self._error = reason
         self._state = "retrying"
         self._retries += 1
-        _log.error("%s", reason)
+        event = "retrying" if self._retry else "failed"
+        _log.error("%s", reason, extra=about(event, source=self._name, reason=reason))
         self._output.release()
 
 

@@ -38,15 +38,17 @@ class Exporter(Collector):
         )
         self._monitor = Monitor()
         self._sources: dict[Address, str] = {}
+        self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
     def run(self, stop: threading.Event) -> None:
         """Read until `stop` is set."""
         while not stop.is_set():
             with suppress(NoDataError):
                 sample = self._subscription.receive(_POLL)
-                self._monitor.add(sample)
-                if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
-                    self._sources[sample.address] = sample.source or ""
+                with self._lock:
+                    self._monitor.add(sample)
+                    if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
+                        self._sources[sample.address] = sample.source or ""
 
     @property
     def pages(self) -> Mapping[str, Callable[[], Page]]:
@@ -70,17 +72,23 @@ class Exporter(Collector):
         yield GaugeMetricFamily(
             "nedbus_queue_messages", "Messages that wait to be read", value=self._subscription.waiting
         )
-        streams = [
-            Stream(
-                address.vehicle,
-                str(address).partition("/")[2],
-                self._sources.get(address, ""),
-                health,
-                latencies=self._monitor.latencies(address),
-            )
-            for address, health in self._monitor.snapshot().items()
-        ]
-        yield from stream_families(streams, messages=_RECEIVED)
+        yield from stream_families(self._streams(), messages=_RECEIVED)
+
+    def _streams(self) -> list[Stream]:
+        """Return all streams, those that were seen first first: which ones have labels of their own does not change."""
+        with self._lock:
+            return [
+                Stream(
+                    address.vehicle,
+                    str(address).partition("/")[2],
+                    self._sources.get(address, ""),
+                    health,
+                    latencies=self._monitor.latencies(address),
+                )
+                for address, health in sorted(
+                    self._monitor.snapshot().items(), key=lambda item: item[0] not in self._sources
+                )
+            ]
 
     def _ready(self) -> Page:
         if self._bus.connected:
@@ -88,6 +96,7 @@ class Exporter(Collector):
         return Page.text(f"no router answers at {' or '.join(self._bus.routers)}", status=503)
 
     def _status(self) -> Page:
-        streams = {str(address): asdict(health) for address, health in self._monitor.snapshot().items()}
+        with self._lock:
+            streams = {str(address): asdict(health) for address, health in self._monitor.snapshot().items()}
         status = {"connected": self._bus.connected, **asdict(self._subscription.counts), "streams": streams}
         return Page(200, "application/json", json.dumps(status, indent=2).encode())

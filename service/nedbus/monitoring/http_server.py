@@ -6,10 +6,12 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
-from nedbus.errors import ListenError
+from nedbus.errors import ConfigError, ListenError
+from nedbus.log_event import about
 from nedbus.settings import split_http
 
 _log = logging.getLogger(__name__)
@@ -34,11 +36,14 @@ class Page(NamedTuple):
 class HttpServer:
     """Serve pages by path on HOST:PORT, in threads of its own, until it is closed.
 
-    Raises ListenError when it cannot listen there.
+    Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
     """
 
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
-        host, port = split_http(where)
+        try:
+            host, port = split_http(where)
+        except ValueError as exc:
+            raise ConfigError("--http", str(exc)) from exc
         try:
             self._server = _Server((host, port), _make_handler(pages))
         except OSError as exc:
@@ -55,19 +60,26 @@ class HttpServer:
 
 
 class _Server(ThreadingHTTPServer):
+    """Answer at most 16 clients at a time; when there are more, the one that was silent for longest has to go."""
+
     daemon_threads = True
     allow_reuse_address = True
 
     def __init__(self, where: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
         self.address_family = socket.AF_INET6 if ":" in where[0] else socket.AF_INET
         self._free = threading.BoundedSemaphore(_CLIENTS)
+        self._silent: dict[socket.socket, None] = {}  # those that have not asked yet, the oldest first
+        self._changing = threading.Lock()
         super().__init__(where, handler)
 
     def process_request(self, request: socket.socket | tuple[bytes, socket.socket], client_address: object) -> None:
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
+        if not (self._free.acquire(blocking=False) or self._make_room()):
             self.shutdown_request(request)
+            return
+        if isinstance(request, socket.socket):
+            with self._changing:
+                self._silent[request] = None
+        super().process_request(request, client_address)
 
     def process_request_thread(
         self, request: socket.socket | tuple[bytes, socket.socket], client_address: object
@@ -75,7 +87,25 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
+            if isinstance(request, socket.socket):
+                self.has_asked(request)
             self._free.release()
+
+    def has_asked(self, request: socket.socket) -> None:
+        """Note that a client has sent its request: it is answered, however many others come."""
+        with self._changing:
+            self._silent.pop(request, None)
+
+    def _make_room(self) -> bool:
+        """Disconnect the client that was silent for longest, and return whether there is room then."""
+        with self._changing:
+            oldest = next(iter(self._silent), None)
+            if oldest is None:
+                return False
+            del self._silent[oldest]
+            with suppress(OSError):  # it has gone by itself
+                oldest.shutdown(socket.SHUT_RDWR)
+        return self._free.acquire(timeout=_PATIENCE)
 
     def handle_error(self, request: object, client_address: object) -> None:
         _log.debug("an HTTP client went away", exc_info=True)
@@ -92,6 +122,11 @@ def _make_handler(pages: Mapping[str, Callable[[], Page]]) -> type[BaseHTTPReque
 
         def do_HEAD(self) -> None:
             self._answer()
+
+        def parse_request(self) -> bool:
+            is_valid = super().parse_request()
+            cast("_Server", self.server).has_asked(self.connection)
+            return is_valid
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002
             _log.debug(format, *args)
@@ -117,5 +152,5 @@ def _make_page(pages: Mapping[str, Callable[[], Page]], path: str) -> Page:
     try:
         return make()
     except Exception:  # noqa: BLE001 - of one page, not of the server
-        _log.exception("%s failed", path)
+        _log.exception("%s failed", path, extra=about("bug"))
         return Page.text("an unexpected error: the log has it", status=500)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 
 from prometheus_client.core import (
@@ -33,7 +34,7 @@ class ServiceCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
         daemon = self._daemon
-        status, sources = daemon.status, daemon.measures
+        status, sources = daemon.status, _with_names(daemon.measures)
         yield build_info(status.version)
         yield GaugeMetricFamily("nedbus_start_time_seconds", "When the service started", value=status.started)
         sessions = GaugeMetricFamily(
@@ -41,19 +42,33 @@ class ServiceCollector(Collector):
         )
         sessions.add_metric([status.role], daemon.sessions)
         yield sessions
-        streams = [stream for source in sources for stream in _streams(source)]
+        streams = [stream for name, source in sources for stream in _streams(name, source)]
         yield from stream_families(streams, messages=_PUBLISHED)
         yield from _source_families(sources)
 
 
-def _streams(measures: SourceMeasures) -> Iterator[Stream]:
+def _with_names(sources: Iterable[SourceMeasures]) -> list[tuple[str, SourceMeasures]]:
+    """Return each source with its label: two that are configured alike must not be one time series."""
+    seen: Counter[str] = Counter()
+    named = []
+    for measures in sources:
+        text = measures.status.source
+        seen[text] += 1
+        named.append((text if seen[text] == 1 else f"{text} ({seen[text]})", measures))
+    return named
+
+
+def _streams(name: str, measures: SourceMeasures) -> Iterator[Stream]:
     status = measures.status
     for stream in measures.streams:
         vehicle, _, topic = stream.address.partition("/")
-        yield Stream(vehicle, topic, status.source, stream.health, active=not status.ended)
+        yield Stream(vehicle, topic, name, stream.health, active=not status.ended)
 
 
-def _source_families(sources: Iterable[SourceMeasures]) -> Iterator[Metric]:
+def _source_families(sources: Iterable[tuple[str, SourceMeasures]]) -> Iterator[Metric]:
+    total = CounterMetricFamily(
+        "nedbus_source_rejected", "Messages that were not published, whatever rule they violate", labels=["source"]
+    )
     rejected = CounterMetricFamily(
         "nedbus_messages_rejected",
         "Messages that were not published, by the rule they violate",
@@ -62,6 +77,11 @@ def _source_families(sources: Iterable[SourceMeasures]) -> Iterator[Metric]:
     lost = CounterMetricFamily(
         "nedbus_source_lost", "Messages that were lost before they reached the source", labels=["source"]
     )
+    addresses = GaugeMetricFamily(
+        "nedbus_source_addresses",
+        "Addresses of a replay, or those that a live source publishes now: 0 while nothing arrives",
+        labels=["source"],
+    )
     state = GaugeMetricFamily("nedbus_source_state", "1 for the state that a source is in", labels=["source", "state"])
     restarts = CounterMetricFamily(
         "nedbus_source_restarts", "Times that a source failed, and began again", labels=["source"]
@@ -69,14 +89,15 @@ def _source_families(sources: Iterable[SourceMeasures]) -> Iterator[Metric]:
     durations = HistogramMetricFamily(
         "nedbus_publish_duration_seconds", "Time to validate, encode and send a message", labels=["source"]
     )
-    for measures in sources:
+    for name, measures in sources:
         status = measures.status
-        name = status.source
+        total.add_metric([name], status.rejected)
         for rule, count in status.rejections.items():
             rejected.add_metric([name, rule], count)
         lost.add_metric([name], status.lost)
+        addresses.add_metric([name], len(status.addresses))
         for each in STATES:
             state.add_metric([name, each], each == status.state)
         restarts.add_metric([name], status.retries)
         histogram(durations, [name], measures.durations)
-    yield from (rejected, lost, state, restarts, durations)
+    yield from (total, rejected, lost, addresses, state, restarts, durations)

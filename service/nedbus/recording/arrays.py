@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.extras import needs
+from nedbus.log_event import about
 from nedbus_msgs import (
     ANY,
     CURRENT,
@@ -87,7 +88,7 @@ def read(
     with Flight(path) as flight:
         messages, absent = flight.read(the_one(path, flight.addresses, selection))
         for warning in flight.warnings:
-            _log.warning("%s: %s", path, warning)
+            _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
     return messages if frame is None else _frame(messages, absent, frame)
 
 

@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from pydantic import ValidationError
 
 from nedbus.errors import OutputError
+from nedbus.log_event import about
 from nedbus.whole_file import whole_file
 from nedbus_msgs import Address, Provenance, VehicleLocalPosition, describe, upgrade
 from nedbus_msgs.arrays import to_array
@@ -85,7 +86,9 @@ def _write(
             except ValidationError as exc:
                 rejected += 1
                 if rejected <= _MAX_LOGGED:
-                    _log.warning("%s rejected: %s", each.address, each.error or describe(exc))
+                    reason = each.error or describe(exc)
+                    extra = about("rejected", each.address, source=source, reason=reason)
+                    _log.warning("%s rejected: %s", each.address, reason, extra=extra)
                 continue
             if start is None:
                 start = min(message.timestamp * 1000, _MAX_START)

@@ -1,10 +1,12 @@
 """Sources of messages: `parse_source` reads a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
+from .mavlink_link import Link, check_link, open_link
 from .source import LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
 from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 
 __all__ = [
     "SOURCE_KINDS",
+    "Link",
     "LiveSource",
     "Rejection",
     "ReplayRun",
@@ -14,6 +16,8 @@ __all__ = [
     "SourceKind",
     "SourceMessage",
     "SourceSpec",
+    "check_link",
+    "open_link",
     "parse_source",
     "source_text_of_file",
 ]

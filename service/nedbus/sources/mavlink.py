@@ -11,6 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
+from nedbus.log_event import about
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
@@ -117,7 +118,7 @@ class _LinkSession:
         lost, rebooted = vehicle.lost, vehicle.rebooted
         vehicle.lost, vehicle.rebooted = 0, False
         if rebooted:
-            _log.warning("%s: the vehicle rebooted", address)
+            _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _vehicle_of(self, system: int) -> str:
@@ -144,7 +145,9 @@ class _LinkSession:
         is_denied = message.result != dialect.MAV_RESULT_ACCEPTED
         if number is not None and is_denied and vehicle.has(number) and (address.vehicle, number) not in self._denied:
             self._denied.add((address.vehicle, number))
-            _log.info("%s: does not send %s when it is requested", address, dialect.mavlink_map[number].msgname)
+            name = dialect.mavlink_map[number].msgname
+            extra = about("unsupported", address, source=self._name)
+            _log.info("%s: does not send %s when it is requested", address, name, extra=extra)
         self._send_requests(now)
 
     def _send_requests(self, now: float) -> None:

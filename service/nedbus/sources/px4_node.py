@@ -57,7 +57,7 @@ class Px4ZenohNode:
         self._nodes.clear()
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
-        with while_open(self._session):
+        with while_open():
             return self._session.liveliness().declare_token(text)
 
 

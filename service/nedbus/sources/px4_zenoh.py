@@ -12,6 +12,7 @@ from typing import Final
 import zenoh
 
 from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
+from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
     Attachment,
@@ -51,7 +52,7 @@ class Px4ZenohSource:
         self._vehicle = options.vehicle or context.vehicle
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
-        """Receive; raise SourceError when no router answers, or the connection is closed."""
+        """Receive; raise SourceError when no router answers."""
         inbox = _Inbox()
         with ExitStack() as closing:
             if router is not None and self._is_own:
@@ -62,12 +63,12 @@ class Px4ZenohSource:
                 closing.callback(session.close)
             node = Px4ZenohNode(session)
             decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle), node)
-            with while_open(session):
+            with while_open():
                 for name in map(dds_type, ROS2_TYPES):
                     self._subscribe(session, name, inbox, closing)
             closing.callback(node.close)
             yield None
-            while not session.is_closed():
+            while True:  # until this iterator is closed: a session that lost its router connects again by itself
                 yield from inbox.overflow(self._name)
                 try:
                     sample = inbox.pending.get(timeout=_TICK)
@@ -75,7 +76,6 @@ class Px4ZenohSource:
                     yield None
                 else:
                     yield decoder.decode(sample)
-            raise SourceError(self._name, "the connection was closed")
 
     def _subscribe(self, session: Session, dds_type: str, inbox: _Inbox, closing: ExitStack) -> None:
         """Receive the messages of a type, and before them the tokens of those who publish them."""
@@ -174,7 +174,8 @@ class _Decoder:
             return Rejection(key, reason, stream.address if stream else None)
         rebooted = restarted and self._streams.is_reboot(stream)
         if rebooted:
-            _log.warning("%s: its publisher restarted: the vehicle rebooted", key)
+            extra = about("rebooted", stream.address, source="px4-zenoh")
+            _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
         return SourceMessage(0.0, stream.address, fields, lost, rebooted)
 
     def _follow(self, text: str, now: float, *, is_alive: bool) -> None:
@@ -193,4 +194,5 @@ class _Decoder:
     def _log_bridged(self, key: str) -> None:
         if key not in self._bridged:
             self._bridged.add(key)
-            _log.info("%s comes from nedbus ros2: ignored, as it would loop", key)
+            extra = about("looped", source="px4-zenoh")
+            _log.info("%s comes from nedbus ros2: ignored, as it would loop", key, extra=extra)

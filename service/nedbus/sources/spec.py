@@ -1,4 +1,4 @@
-"""The table of source kinds, and the parser of source texts: `KIND:TARGET?OPTION=VALUE&...`."""
+"""The table of source kinds, and the parser of sources: `KIND:TARGET?OPTION=VALUE&...`, or a table of TOML."""
 
 from __future__ import annotations
 
@@ -71,11 +71,20 @@ class SourceSpec:
         return make(self.target, self.options, SourceContext(vehicle, routers, tls))
 
 
-def parse_source(text: str) -> SourceSpec:
+def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path `%3F` stands for `?`, and `%25` for `%`.
+
+    A mapping has the kind, the target under its name (`file`, `link` or `endpoint`) and the options instead, such as
+    {"kind": "ulog", "file": "flight.ulg", "speed": 2, "vehicle": 7}: its text is made of them.
 
     Raises ConfigError for an unknown kind, a missing target, or an unknown or invalid option.
     """
+    if isinstance(source, str):
+        return _parse_text(source)
+    return _parse_text(_text_of_table(source))
+
+
+def _parse_text(text: str) -> SourceSpec:
     kind_name, _, rest = text.partition(":")
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
@@ -91,7 +100,8 @@ def parse_source(text: str) -> SourceSpec:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
         options = kind.options.model_validate(dict(pairs))
     except ValidationError as exc:
-        raise ConfigError(f"source {text!r}", _explain(exc, kind)) from exc
+        reason, name = _explain(exc, kind)
+        raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
         hint = ", and a path with ? in it has %3F instead" if kind.target == "FILE" else ""
         raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}") from None
@@ -107,7 +117,7 @@ def source_text_of_file(path: str | PurePath, vehicle: str | None = None) -> str
 
     Raises ConfigError for a file suffix that belongs to no kind.
     """
-    text = f"{format_of(path)}:{str(path).replace('%', '%25').replace('?', '%3F')}"
+    text = f"{format_of(path)}:{escape_path(str(path))}"
     return f"{text}?{urlencode({'vehicle': vehicle})}" if vehicle else text
 
 
@@ -117,10 +127,48 @@ def _check_file(text: str, path: Path) -> None:
         raise ConfigError(f"source {text!r}", f"{path} is not a regular file: save it as one, then give that")
 
 
-def _explain(error: ValidationError, kind: SourceKind) -> str:
+def _text_of_table(table: Mapping[str, object]) -> str:
+    """Return the text of a source that is given as a table; raise ConfigError for what no text can say."""
+    options = dict(table)
+    name = options.pop("kind", None)
+    kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
+    if kind is None:
+        problem = "kind is missing" if name is None else f"there is no kind {name!r}"
+        raise ConfigError(
+            "source", f"{problem}: choose from {', '.join(SOURCE_KINDS)}", key="" if name is None else "kind"
+        )
+    target_name = (kind.target or "").strip("[]").lower()
+    target = options.pop(target_name, "") if target_name else ""
+    if not isinstance(target, str) or not kind.accepts(target):
+        form = f'{target_name} = "..."'
+        raise ConfigError(
+            f"source {name!r}", f"it needs {form}" if target_name else "it has no target", key=target_name
+        )
+    if kind.target == "FILE":
+        target = escape_path(target)
+    query = urlencode({key: _text_of_value(value) for key, value in options.items()}, safe=":,/")
+    return f"{name}:{target}?{query}" if query else f"{name}:{target}"
+
+
+def _text_of_value(value: object) -> str:
+    """Return an option's value as a text has it: 1 for true, NAME:VEHICLE,NAME:VEHICLE for a table."""
+    if isinstance(value, Mapping):
+        return ",".join(f"{name}:{each}" for name, each in value.items())
+    if isinstance(value, list | tuple):
+        return ",".join(map(_text_of_value, value))
+    return str(int(value)) if isinstance(value, bool) else str(value)
+
+
+def escape_path(path: str) -> str:
+    """Return a path as the text of a source has it."""
+    return path.replace("%", "%25").replace("?", "%3F")
+
+
+def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
+    """Return what is wrong with an option, and its name."""
     detail = error.errors()[0]
     name = str(detail["loc"][0])
     field = kind.options.model_fields.get(name)
     if field is None:
-        return f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}"
-    return f"{name}={detail['input']} is invalid: expected {field.description}"
+        return f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}", name
+    return f"{name}={detail['input']} is invalid: expected {field.description}", name

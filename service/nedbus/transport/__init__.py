@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
+from .access_rules import CERTIFICATE_PREFIX, RulesChange, certificate_name, read_access_rules, write_access_rules
+from .certificate import Certificate
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
 from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query, query_kept
 from .rmw_zenoh import (
@@ -19,7 +21,7 @@ from .rmw_zenoh import (
     publishers_of_type_key_expr,
     subscription_token,
 )
-from .router import open_router, router_endpoints
+from .router import RouterConfig, open_router, read_router_config, router_endpoints
 from .session import (
     LEASE,
     RawSample,
@@ -37,23 +39,37 @@ from .uplink import UPLINK_POLL, Uplinks
 
 if TYPE_CHECKING:
     from .pki import CA_DAYS, DAYS, make_authority, make_certificate
+    from .pki_bundle import TARGET, make_bundle
+    from .pki_renewal import RENEW_WITHIN, CertificateEntry, list_certificates, renew_certificate
 else:
     __getattr__ = lazy_exports(
-        __name__, dict.fromkeys(("CA_DAYS", "DAYS", "make_authority", "make_certificate"), ("pki", "pki"))
+        __name__,
+        dict.fromkeys(("CA_DAYS", "DAYS", "make_authority", "make_certificate"), ("pki", "pki"))
+        | dict.fromkeys(("TARGET", "make_bundle"), ("pki", "pki_bundle"))
+        | dict.fromkeys(
+            ("RENEW_WITHIN", "CertificateEntry", "list_certificates", "renew_certificate"), ("pki", "pki_renewal")
+        ),
     )
 
 __all__ = [
     "BRIDGED_ENCODING",
     "CA_DAYS",
+    "CERTIFICATE_PREFIX",
     "DAYS",
     "DEFAULT_ENDPOINT",
     "LEASE",
     "MAX_ANSWERS",
     "NO_HASH",
+    "RENEW_WITHIN",
+    "TARGET",
     "UPLINK_POLL",
     "Attachment",
+    "Certificate",
+    "CertificateEntry",
     "PublisherToken",
     "RawSample",
+    "RouterConfig",
+    "RulesChange",
     "Session",
     "SourceInfo",
     "Tls",
@@ -61,13 +77,16 @@ __all__ = [
     "Uplinks",
     "alive_keys",
     "ask_alive_keys",
+    "certificate_name",
     "check_endpoints",
     "dial_endpoint",
     "entity_name",
     "follow_alive_keys",
     "gid_of_token",
     "is_forked",
+    "list_certificates",
     "make_authority",
+    "make_bundle",
     "make_certificate",
     "node_token",
     "open_client",
@@ -77,9 +96,13 @@ __all__ = [
     "publishers_of_type_key_expr",
     "query",
     "query_kept",
+    "read_access_rules",
+    "read_router_config",
+    "renew_certificate",
     "require_unforked",
     "router_endpoints",
     "subscription_token",
     "translate_error",
     "while_open",
+    "write_access_rules",
 ]

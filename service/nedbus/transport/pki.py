@@ -10,12 +10,14 @@ import datetime as dt
 import ipaddress
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from nedbus.errors import PkiError
@@ -34,12 +36,8 @@ def make_authority(folder: Path, *, days: int = CA_DAYS) -> list[Path]:
 
     Raises PkiError when there is one already, or the folder cannot be written.
     """
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = _name("nedbus CA")
-    builder = _builder(name, name, key.public_key(), days)
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    builder = builder.add_extension(_usage(sign_certificates=True), critical=True)
-    return _write(folder, "ca", key, builder.sign(key, hashes.SHA256()))
+    key = new_key()
+    return write_pair(folder, "ca", key, sign_authority(key, days=days))
 
 
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int = DAYS) -> list[Path]:
@@ -52,23 +50,106 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
     """
     if not name or len(name) > _NAME_LENGTH or "/" in name or name.startswith("."):
         raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {_NAME_LENGTH} characters without /")
-    authority, authority_key = _read_authority(folder)
-    key = ec.generate_private_key(ec.SECP256R1())
-    builder = _builder(_name(name), authority.subject, key.public_key(), days)
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-    builder = builder.add_extension(_usage(sign_certificates=False), critical=True)
-    # A router is a client of other routers too.
-    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
-    builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
-    if hosts:
-        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
-    return _write(folder, name, key, builder.sign(authority_key, hashes.SHA256()))
+    authority = Authority.read(folder)
+    key = new_key()
+    return write_pair(folder, name, key, authority.sign(name, key.public_key(), hosts=hosts, days=days))
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """The CA of a folder: its certificate, and the key that signs."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @classmethod
+    def read(cls, folder: Path) -> Authority:
+        """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
+        try:
+            certificate = x509.load_pem_x509_certificate((folder / "ca.crt").read_bytes())
+            key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
+        except OSError as exc:
+            reason = (exc.strerror or "").lower()
+            raise PkiError(f"{exc.filename}: {reason}: make the CA first, 'nedbus pki ca'") from exc
+        except ValueError as exc:
+            raise PkiError(f"{folder}: ca.crt and ca.key are not a certificate and its key in PEM") from exc
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise PkiError(f"{folder / 'ca.key'} is not a key that 'nedbus pki ca' made")
+        return cls(certificate, key)
+
+    def sign(
+        self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int = DAYS
+    ) -> x509.Certificate:
+        """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
+        builder = _builder(_name(name), self.certificate.subject, key, days, end=self.certificate.not_valid_after_utc)
+        builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        builder = builder.add_extension(_usage(sign_certificates=False), critical=True)
+        # A router is a client of other routers too.
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        if hosts:
+            builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
+        return builder.sign(self.key, hashes.SHA256())
+
+
+def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int = CA_DAYS) -> x509.Certificate:
+    """Return the certificate of a CA for its key; what that key signed before stays valid under it."""
+    name = _name("nedbus CA")
+    builder = _builder(name, name, key.public_key(), days)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+    builder = builder.add_extension(_usage(sign_certificates=True), critical=True)
+    return builder.sign(key, hashes.SHA256())
+
+
+def new_key() -> ec.EllipticCurvePrivateKey:
+    """Return a new key, on the curve P-256."""
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def write_secret(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Write a key into a new file that only its owner can read."""
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    _write_new(path, secret, 0o600)
+
+
+def write_certificate(path: Path, certificate: x509.Certificate) -> None:
+    """Write a certificate into a new file that everybody can read."""
+    _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def write_pair(
+    folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate, *, replace: bool = False
+) -> list[Path]:
+    """Write key and certificate, both or neither, and return their paths; nobody else may read the key.
+
+    Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
+    """
+    paths = [folder / f"{name}.key", folder / f"{name}.crt"]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with whole_file(paths[0], replace=replace) as first, whole_file(paths[1], replace=replace) as second:
+            write_secret(first, key)
+            write_certificate(second, certificate)
+    except FileExistsError as exc:
+        reason = "it is not overwritten; move it away, or take another folder or name"
+        raise PkiError(f"{exc.filename} exists: {reason}") from exc
+    except OSError as exc:
+        raise PkiError(f"{folder / name} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+    return paths
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+    subject: x509.Name, issuer: x509.Name, key: CertificatePublicKeyTypes, days: int, *, end: dt.datetime | None = None
 ) -> x509.CertificateBuilder:
     now = dt.datetime.now(dt.UTC)
+    until = now + dt.timedelta(days=days)
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -76,8 +157,8 @@ def _builder(
         .public_key(key)
         .serial_number(x509.random_serial_number())
         # A vehicle's clock may be behind when it boots.
-        .not_valid_before(now - dt.timedelta(days=1))
-        .not_valid_after(now + dt.timedelta(days=days))
+        .not_valid_before(min(now, until) - dt.timedelta(days=1))
+        .not_valid_after(until if end is None else min(until, end))
     )
 
 
@@ -104,37 +185,3 @@ def _host(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
-
-
-def _read_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    try:
-        certificate = x509.load_pem_x509_certificate((folder / "ca.crt").read_bytes())
-        key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
-    except OSError as exc:
-        raise PkiError(f"{exc.filename}: {(exc.strerror or '').lower()}: make the CA first, 'nedbus pki ca'") from exc
-    except ValueError as exc:
-        raise PkiError(f"{folder}: ca.crt and ca.key are not a certificate and its key in PEM") from exc
-    if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise PkiError(f"{folder / 'ca.key'} is not a key that 'nedbus pki ca' made")
-    return certificate, key
-
-
-def _write(folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> list[Path]:
-    """Write key and certificate, both or neither; neither ever replaces a file, and nobody else may read the key."""
-    secret = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    public = certificate.public_bytes(serialization.Encoding.PEM)
-    paths = [folder / f"{name}.key", folder / f"{name}.crt"]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(paths[0]) as first, whole_file(paths[1]) as second:
-            for path, content, mode in ((first, secret, 0o600), (second, public, 0o644)):
-                with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-                    file.write(content)
-    except FileExistsError as exc:
-        reason = "it is not overwritten; move it away, or take another folder or name"
-        raise PkiError(f"{exc.filename} exists: {reason}") from exc
-    except OSError as exc:
-        raise PkiError(f"{folder / name} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
-    return paths

@@ -24,7 +24,7 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
     """Return what is answered within `timeout` seconds, at most 10,000: the newest answer for each key, or all."""
     mode = zenoh.ConsolidationMode.LATEST if newest else zenoh.ConsolidationMode.NONE
     collector = _Collector()
-    with while_open(session):
+    with while_open():
         session.get(
             key_expr,
             collector.handler,
@@ -41,7 +41,7 @@ def query_kept(session: Session, key: str, publisher: str, *, end: int, timeout:
     `publisher` is its name as `entity_name` returns it.
     """
     collector = _Collector()
-    with while_open(session):
+    with while_open():
         session.get(
             f"{key}/@adv/*/{publisher.replace(':', '/')}/**?_sn=..{end - 1}",
             collector.handler,
@@ -69,7 +69,7 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
     """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
     collector = _Collector()
-    with while_open(session):
+    with while_open():
         session.liveliness().get(key_expr, collector.handler, timeout=_zenoh_timeout(timeout))
     answers = collector.wait(timeout)
     keys = sorted({str(reply.ok.key_expr) for reply in answers if reply.ok is not None})
@@ -88,7 +88,7 @@ def follow_alive_keys(
     def on_sample(sample: zenoh.Sample) -> None:
         on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-    with while_open(session):
+    with while_open():
         subscriber = session.liveliness().declare_subscriber(
             key_expr, zenoh.handlers.Callback(on_sample, indirect=False)
         )

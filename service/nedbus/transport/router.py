@@ -6,12 +6,14 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import zenoh
 
 from nedbus.errors import ConfigError, ListenError
+from nedbus.log_event import about
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
 from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings, open_session
@@ -57,7 +59,12 @@ def open_router(
         config = _read_config(config_file)
         plugins = json.loads(config.get_json("plugins"))
         if plugins:
-            _log.warning("%s: without %s: this router loads no plugins, as zenohd does", config_file, _names(plugins))
+            _log.warning(
+                "%s: without %s: this router loads no plugins, as zenohd does",
+                config_file,
+                _names(plugins),
+                extra=about("router"),
+            )
         insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
     if tls is not None and not json.loads(config.get_json("transport/link/tls")).get("root_ca_certificate"):
         files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
@@ -75,11 +82,50 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
     """
     if listen or config_file is None:
         return tuple(listen) or (DEFAULT_ENDPOINT,)
-    found = json.loads(_read_config(config_file).get_json("listen/endpoints"))
-    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ()) or (DEFAULT_ENDPOINT,)
+    return _endpoints(_read_config(config_file), "listen") or (DEFAULT_ENDPOINT,)
+
+
+class RouterConfig(NamedTuple):
+    """What a router's configuration file says: its endpoints, and the PEM files of its TLS section by name."""
+
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    tls_files: Mapping[str, Path]
+
+
+def read_router_config(path: Path) -> RouterConfig:
+    """Read a file for zenohd or for a router of ours; raise ConfigError, with line and column, for a mistake."""
+    config = _parse_config(path)
+    tls = json.loads(config.get_json("transport/link/tls"))
+    files = {
+        name: Path(value) for name, value in tls.items() if value and name.endswith(("_certificate", "_private_key"))
+    }
+    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), files)
+
+
+def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
+    found = json.loads(config.get_json(f"{name}/endpoints"))
+    return tuple(found.get("router", ()) if isinstance(found, dict) else found or ())
 
 
 def _read_config(path: Path) -> zenoh.Config:
+    """Read a file that a router in this process is to use; raise ConfigError for what it cannot do."""
+    config = _parse_config(path)
+    plugins = json.loads(config.get_json("plugins"))
+    required = [name for name, settings in plugins.items() if settings and settings.get("__required__")]
+    if required:
+        reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
+        raise ConfigError.in_file(path, reason)
+    for name, value in json.loads(config.get_json("transport/link/tls")).items():
+        # Zenoh would report only that there is no such file, and not which.
+        if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
+            raise ConfigError.in_file(
+                path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
+            )
+    return config
+
+
+def _parse_config(path: Path) -> zenoh.Config:
     if path.suffix not in {".json5", ".json", ".yaml", ".yml"}:
         raise ConfigError.in_file(path, "a Zenoh configuration is a .json5, .json, .yaml or .yml file")
     if not path.is_file():
@@ -93,17 +139,6 @@ def _read_config(path: Path) -> zenoh.Config:
         position = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
         raise ConfigError.in_file(path, _parser_message(text), line=line, column=column) from exc
-    plugins = json.loads(config.get_json("plugins"))
-    required = [name for name, settings in plugins.items() if settings and settings.get("__required__")]
-    if required:
-        reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
-        raise ConfigError.in_file(path, reason)
-    for name, value in json.loads(config.get_json("transport/link/tls")).items():
-        # Zenoh would report only that there is no such file, and not which.
-        if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
-            raise ConfigError.in_file(
-                path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
-            )
     return config
 
 

@@ -24,6 +24,7 @@ RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
 
 RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+_CLOSED: Final = re.compile(r"session closed|undeclared", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
 LEASE: Final = 5.0
@@ -131,17 +132,21 @@ def entity_name(entity: zenoh.EntityGlobalId) -> str:
 
 
 @contextmanager
-def while_open(session: Session) -> Iterator[None]:
+def while_open() -> Iterator[None]:
     """Translate what Zenoh raises: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
     try:
         yield
     except zenoh.ZError as exc:
-        raise translate_error(exc, session) from exc
+        raise translate_error(exc) from exc
 
 
-def translate_error(error: zenoh.ZError, session: Session) -> NedbusError:
-    """Return what `while_open` raises for this error."""
-    return ClosedError() if session.is_closed() else NedbusError(f"Zenoh reports: {error_reason(error)}")
+def translate_error(error: zenoh.ZError) -> NedbusError:
+    """Return what `while_open` raises for this error.
+
+    The session itself is not asked: `is_closed` waits for a lock of Zenoh's without giving up the interpreter's, and
+    stops the process for good while a liveliness query holds that lock and calls Python.
+    """
+    return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 
 
 def error_reason(error: zenoh.ZError) -> str:

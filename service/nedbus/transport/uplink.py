@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from nedbus.log_event import about
+
 from .session import Session
 from .tls import Tls
 
@@ -45,15 +47,17 @@ class Uplinks:
                 if endpoint not in self._up:
                     self._up.add(endpoint)
                     self._warned.discard(endpoint)
-                    _log.info("joined %s", endpoint)
+                    _log.info("joined %s", endpoint, extra=about("link-back"))
             elif endpoint in self._up:
                 self._up.remove(endpoint)
                 self._down_since[endpoint] = self._now()
                 self._warned.add(endpoint)
-                _log.warning("the link to %s is lost: still trying", endpoint)
+                _log.warning("the link to %s is lost: still trying", endpoint, extra=about("link-broken"))
             elif endpoint not in self._warned and self._now() - since >= _PATIENCE:
                 self._warned.add(endpoint)
-                _log.warning("no link to %s%s: still trying", endpoint, self._reason(endpoint))
+                _log.warning(
+                    "no link to %s%s: still trying", endpoint, self._reason(endpoint), extra=about("link-broken")
+                )
 
     def _reason(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):

@@ -1,0 +1,104 @@
+"""The workers of a service, each in a thread of its own; sources are started and stopped while others go on."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from nedbus.client import PublisherRegistry
+from nedbus.log_event import about
+from nedbus.transport import Session
+
+from .clock import SystemClock
+from .plan import Planned
+from .worker import Worker
+
+_log = logging.getLogger(__name__)
+
+_GRACE: Final = 5.0  # s that a source which is gone from the configuration has to end
+
+
+@dataclass(frozen=True, slots=True)
+class _Running:
+    planned: Planned
+    worker: Worker
+    stop: threading.Event
+    thread: threading.Thread
+
+
+class Workers:
+    """Run what is planned; `router` is what the service's router lends, `on_end` is called when a worker has ended.
+
+    Not thread-safe, but for reading `workers`.
+    """
+
+    def __init__(
+        self, registry: PublisherRegistry, *, router: Session | None, retry: bool, on_end: Callable[[], object]
+    ) -> None:
+        self._registry = registry
+        self._router = router
+        self._retry = retry
+        self._on_end = on_end
+        self._running: tuple[_Running, ...] = ()
+
+    @property
+    def workers(self) -> list[Worker]:
+        """The workers, in the order of the plan."""
+        return [each.worker for each in self._running]
+
+    def apply(self, plan: Sequence[Planned]) -> tuple[int, int, int]:
+        """Start what is new and stop what is gone; return how many were started, were stopped, and went on."""
+        left, ordered = list(self._running), []
+        for planned in plan:
+            same = next((each for each in left if each.planned.is_same(planned)), None)
+            if same is not None:
+                left.remove(same)
+            ordered.append(same)
+        self._stop(left)
+        # Those that are new may need the addresses of those that are gone.
+        self._running = tuple(same or self._start(planned) for same, planned in zip(ordered, plan, strict=True))
+        started = sum(same is None for same in ordered)
+        return started, len(left), len(plan) - started
+
+    def end(self, grace: float) -> None:
+        """Let all end, and wait for them for so many seconds."""
+        for each in self._running:
+            each.stop.set()
+        deadline = time.monotonic() + grace
+        for each in self._running:
+            each.thread.join(max(0.0, deadline - time.monotonic()))
+
+    def _start(self, planned: Planned) -> _Running:
+        stop = threading.Event()
+        worker = Worker(
+            planned.text,
+            planned.source,
+            self._registry,
+            router=self._router,
+            clock=SystemClock(stop),
+            retry=self._retry,
+            on_end=self._on_end,
+        )
+        thread = threading.Thread(target=worker.run, name=worker.text, daemon=True)
+        thread.start()
+        return _Running(planned, worker, stop, thread)
+
+    def _stop(self, gone: Sequence[_Running]) -> None:
+        for each in gone:
+            each.stop.set()
+        deadline = time.monotonic() + _GRACE
+        for each in gone:
+            each.thread.join(max(0.0, deadline - time.monotonic()))
+            if each.thread.is_alive():
+                _log.warning(
+                    "%s: does not end, perhaps because of a slow reader; it goes on until then",
+                    each.worker.text,
+                    extra=about("reload"),
+                )
+            else:
+                each.worker.withdraw()
+                _log.info("%s: ended, as it is not configured any more", each.worker.text, extra=about("reload"))

@@ -1,0 +1,6 @@
+"""Settings from `nedbus.toml`, the environment and flags; nothing else reads them."""
+
+from .load import find_mistakes, load_settings, locate_setting, locate_source
+from .model import Settings, split_http
+
+__all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source", "split_http"]

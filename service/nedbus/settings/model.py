@@ -1,0 +1,126 @@
+"""All settings: their names, types, defaults and checks."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from nedbus.errors import ConfigError
+from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoints
+from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
+
+
+def _split_sources(value: object) -> object:
+    """Split at semicolons and line breaks; without any, at commas before KIND: that are no part of an option."""
+    if not isinstance(value, str):
+        return value
+    parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
+    return tuple(part.strip() for part in parts if part.strip())
+
+
+def _split(value: object) -> object:
+    return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
+
+
+def _endpoints(value: tuple[str, ...]) -> tuple[str, ...]:
+    check_endpoints(value, where="endpoint")
+    return value
+
+
+def _prefix(value: str) -> str:
+    check_prefix(value)
+    return value
+
+
+def split_http(where: str) -> tuple[str, int]:
+    """Return host and port of HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
+    host, _, port = where.rpartition(":")
+    bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
+    if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
+        raise ValueError(f"{where!r} is not an address: write HOST:PORT, such as 127.0.0.1:9464")
+    return bare, int(port)
+
+
+def _http(value: str) -> str:
+    split_http(value)
+    return value
+
+
+def _text(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def _vehicle(value: str) -> str:
+    check_vehicle(value)
+    return value
+
+
+Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split), AfterValidator(_endpoints)]
+
+
+class Settings(BaseSettings):
+    """All settings; every field is also NEDBUS_<FIELD> in the environment, with commas between several values.
+
+    Sources whose options contain commas are separated by semicolons.
+    `load_settings` makes one; it raises ConfigError with the flag, the variable, or file, line and column.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
+
+    connect: Endpoints = Field((), description="Zenoh routers to join, the first that answers")
+    tls_ca: Path | None = Field(None, description="Authority that signed the routers of tls/ endpoints, PEM")
+    tls_certificate: Path | None = Field(None, description="Certificate that this client shows to a router, PEM")
+    tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
+    listen: Endpoints = Field((), description="Endpoints of the embedded router")
+    router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
+    prefix: Annotated[str, AfterValidator(_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
+    vehicle: Annotated[str, BeforeValidator(_text), AfterValidator(_vehicle)] = Field(
+        "1", description="Vehicle of sources that name none"
+    )
+    source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(_split_sources)] = Field(
+        (), description="What is published: texts, or tables of TOML"
+    )
+    http: Annotated[str, AfterValidator(_http)] | None = Field(
+        None, description="HOST:PORT of /metrics, /healthz, /readyz and /status"
+    )
+    until_done: bool = Field(False, description="End when every finite source has ended")
+
+    _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
+    _file: Path | None = PrivateAttr(None)
+
+    @property
+    def routers(self) -> tuple[str, ...]:
+        """The endpoints that a client joins: `connect`, else the router that these settings start on this host."""
+        return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
+
+    @property
+    def router_endpoints(self) -> tuple[str, ...]:
+        """The endpoints on which the embedded router of a service with these settings listens."""
+        return router_endpoints(self.listen, self.router_config)
+
+    @property
+    def is_client(self) -> bool:
+        """Whether a service with these settings joins other routers without being one itself."""
+        return bool(self.connect) and not (self.listen or self.router_config)
+
+    @property
+    def file(self) -> Path | None:
+        """The file that was read, if there is one."""
+        return self._file
+
+    def set_by(self, name: str) -> str:
+        """Return what sets a setting: the name of a flag, an environment variable, or a file; "" for a default."""
+        return self._set_by.get(name, "")
+
+    @property
+    def tls(self) -> Tls | None:
+        """The files of a client of tls/ endpoints; raise ConfigError for half of what is needed."""
+        if self.tls_ca is None:
+            if self.tls_certificate or self.tls_key:
+                raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")
+            return None
+        return Tls(self.tls_ca, self.tls_certificate, self.tls_key)

@@ -1,0 +1,60 @@
+"""A settings file in TOML: reading it, and finding where in it a setting is, for whoever has to correct it."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from nedbus.errors import ConfigError
+
+Place = tuple[int | None, int | None]
+"""Line and column, from 1; None where they are not known."""
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file, without the mark that editors on Windows put first; raise ConfigError."""
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as exc:
+        raise ConfigError.in_file(path, "this is not text in UTF-8") from exc
+    except OSError as exc:
+        raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """Return the content of a file; raise ConfigError with line and column."""
+    text = read_text(path)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as exc:
+        position = re.search(r"\(at line (\d+), column (\d+)\)", str(exc))
+        reason = re.sub(r" \(at .*\)", "", str(exc))
+        if position is None:  # "at end of document"
+            lines = text.splitlines() or [""]
+            raise ConfigError.in_file(path, reason, line=len(lines), column=len(lines[-1]) + 1) from exc
+        raise ConfigError.in_file(path, reason, line=int(position[1]), column=int(position[2])) from exc
+
+
+def find_key(text: str, name: str) -> Place:
+    """Return line and column of a key or a table; TOML parsers do not keep them."""
+    found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
+    if found is None:
+        return None, None
+    return _place(text, found.start(1))
+
+
+def find_source(text: str, index: int, source: object, key: str = "") -> Place:
+    """Return line and column of the source with this index, or of an option of it: a table, or a text in a list."""
+    headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
+    if not isinstance(source, str) and index < len(headers):
+        start = headers[index].start(1)
+        end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
+        option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
+        return _place(text, start + option.start(1) if option else start)
+    found = text.find(source) if isinstance(source, str) else -1
+    return find_key(text, "source") if found < 0 else _place(text, found)
+
+
+def _place(text: str, start: int) -> Place:
+    return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

@@ -1,0 +1,163 @@
+"""Checking settings and router files: every mistake at once, each with its place; and sources as tables of TOML."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from nedbus.errors import ConfigError
+from nedbus.settings import load_settings
+from nedbus.sources import parse_source
+from nedbus.transport import make_authority, make_certificate
+from tests.conftest import Start, free_endpoint
+
+ROOT = Path(__file__).parents[2]
+
+
+def check(run_nedbus: Start, *arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:
+    """Return the lines of a check that finds something."""
+    checked = run_nedbus(*command, *map(str, arguments))
+    assert checked.wait() == 2
+    assert checked.out == ""
+    return [line.removeprefix("nedbus: ") for line in checked.err.splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ('kind = "sim"', "sim:"),
+        ('kind = "sim"\nvehicle = 7\nwait = true\nduration = 2.5', "sim:?vehicle=7&wait=1&duration=2.5"),
+        ('kind = "ulog"\nfile = "a?b 100%.ulg"\nspeed = "max"', "ulog:a%3Fb 100%25.ulg?speed=max"),
+        (
+            'kind = "mavlink"\nlink = "udpin:0.0.0.0:14540"\nvehicles = { 1 = "wing", 2 = "tail" }',
+            "mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail",
+        ),
+        ('kind = "px4-zenoh"\n[source.vehicles]\nleft = "a"\nright = "b"', "px4-zenoh:?vehicles=left:a,right:b"),
+        ('kind = "px4-zenoh"\nendpoint = "tcp/10.0.0.2:7447"\ndomain = 5', "px4-zenoh:tcp/10.0.0.2:7447?domain=5"),
+    ],
+)
+def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, table: str, text: str) -> None:
+    """Both forms give the same options; the text is how status and metrics name the source."""
+    (tmp_path / "nedbus.toml").write_text(f"[[source]]\n{table}\n")
+    (source,) = load_settings().source
+    spec = parse_source(source)
+    assert spec.text == text
+    assert spec == parse_source(text)
+
+
+def test_tables_and_texts_may_be_mixed(tmp_path: Path) -> None:
+    """As a list of TOML, in one order."""
+    (tmp_path / "nedbus.toml").write_text('source = ["sim:", { kind = "sim", vehicle = 2 }]\n')
+    assert [parse_source(source).text for source in load_settings().source] == ["sim:", "sim:?vehicle=2"]
+
+
+@pytest.mark.parametrize(
+    ("source", "reason"),
+    [
+        ({}, "kind is missing: choose from sim, ulog"),
+        ({"kind": "ulg"}, "there is no kind 'ulg': choose from sim, ulog"),
+        ({"kind": 5}, "there is no kind 5"),
+        ({"kind": "ulog"}, 'it needs file = "..."'),
+        ({"kind": "ulog", "link": "a.ulg"}, 'it needs file = "..."'),
+        ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
+        ({"kind": "sim", "sed": 1}, "there is no option 'sed'"),
+        ({"kind": "sim", "speed": 0}, "speed=0 is invalid: expected a factor from 0.001"),
+        ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
+    ],
+)
+def test_wrong_table_is_explained(source: dict[str, object], reason: str) -> None:
+    """As a wrong text is."""
+    with pytest.raises(ConfigError, match=re.escape(reason)):
+        parse_source(source)
+
+
+def test_variable_carries_options_with_commas(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Semicolons or lines separate sources whose options have commas."""
+    texts = ["mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail", "px4-zenoh:?vehicles=left:a,right:b"]
+    for separator in (";", "\n"):
+        monkeypatch.setenv("NEDBUS_SOURCE", separator.join(texts))
+        assert [parse_source(source).text for source in load_settings().source] == texts
+
+
+def test_all_mistakes_are_said_at_once(run_nedbus: Start, tmp_path: Path) -> None:
+    """Values that cannot be read come first: until they are right, nothing else can be judged."""
+    file = tmp_path / "nedbus.toml"
+    file.write_text('prefix = "a//b"\nconect = 1\nvehicle = "a b"\n')
+    for command, given in ((("check",), file), (("serve", "--check", "--config"), file)):
+        lines = check(run_nedbus, given, command=command)
+        assert sorted(line.partition(": ")[0] for line in lines) == [
+            f"{file}, line {line}, column 1" for line in (1, 2, 3)
+        ]
+
+
+def test_sources_endpoints_and_files_are_tried(run_nedbus: Start, tmp_path: Path) -> None:
+    """A missing log, an option that there is not, a router that does not answer, an address of another host."""
+    file, closed = tmp_path / "nedbus.toml", free_endpoint()
+    file.write_text(
+        f'listen = "tcp/192.0.2.1:7447"\nconnect = ["tcp/nowhere.invalid:7447", "{closed}"]\n'
+        'tls_ca = "gone.crt"\n\n[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n'
+    )
+    lines = check(run_nedbus, file)
+    for expected in (
+        f"{file}, line 7, column 1: source 'sim:?sed=1': there is no option 'sed'",
+        f"{file}, line 9, column 3: source 'ulog:gone.ulg': gone.ulg: no such file",
+        f"{file}, line 3, column 1: gone.crt cannot be read",
+        f"{file}, line 2, column 1: tcp/nowhere.invalid:7447: this host finds no address of nowhere.invalid",
+        f"{file}, line 2, column 1: {closed}: nothing answers (connection refused)",
+        f"{file}, line 1, column 1: tcp/192.0.2.1:7447: 192.0.2.1 is no address of this host",
+    ):
+        assert any(line.startswith(expected) for line in lines), expected
+    assert len(lines) == 6
+    offline = check(run_nedbus, file, command=("check", "--offline"))
+    assert [line.partition(": ")[0] for line in offline] == [f"{file}, line 7, column 1"]
+
+
+def test_router_files(run_nedbus: Start, tmp_path: Path) -> None:
+    """A file for zenohd is read as zenohd reads it; what is shipped has no mistake in its text."""
+    broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
+    broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
+    unknown.write_text('{ mode: "router",\n  lisen: {} }\n')
+    lines = check(run_nedbus, broken, unknown)
+    assert len(lines) == 2
+    assert lines[0].startswith(f"{broken}, line 4, column 1: ")
+    assert lines[1].startswith(f"{unknown}, line ")
+    missing = tmp_path / "router.json5"
+    missing.write_text('{\n  transport: { link: { tls: {\n    listen_certificate: "/no/such.crt" } } } }\n')
+    (line,) = check(run_nedbus, missing)
+    assert line.startswith(f"{missing}, line 3, column 26: listen_certificate: /no/such.crt cannot be read")
+    shipped = run_nedbus("check", "--offline", *map(str, sorted((ROOT / "config").glob("*.json5"))))
+    assert shipped.wait() == 0, shipped.err
+    assert shipped.out == "nothing is wrong\n"
+
+
+def test_what_runs_passes(run_nedbus: Start, endpoint: str) -> None:
+    """The flags of a service that works are right, also while it runs."""
+    checked = run_nedbus("serve", "--check", "--connect", endpoint, "-s", "sim:")
+    assert checked.wait() == 0, checked.err
+    assert checked.out == "nothing is wrong\n"
+
+
+def test_certificates_that_expire_are_named(run_nedbus: Start, tmp_path: Path) -> None:
+    """Expired, and within 30 days: of a client, and of a router's file; what is valid for longer is not mentioned."""
+    make_authority(tmp_path / "pki")
+    for name, days in (("soon", 20), ("late", 200)):
+        make_certificate(tmp_path / "pki", name, days=days)
+    settings, router = tmp_path / "nedbus.toml", tmp_path / "router.json5"
+    settings.write_text(
+        f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n'
+        f'tls_certificate = "{tmp_path}/pki/soon.crt"\ntls_key = "{tmp_path}/pki/soon.key"\n'
+    )
+    files = {"listen_certificate": "soon.crt", "listen_private_key": "soon.key", "root_ca_certificate": "ca.crt"}
+    tls = ",\n".join(f'"{name}": "{tmp_path}/pki/{file}"' for name, file in files.items())
+    router.write_text(f"{{ transport: {{ link: {{ tls: {{\n{tls} }} }} }} }}\n")
+    lines = check(run_nedbus, settings, router)
+    expires = f"{tmp_path}/pki/soon.crt expires in "
+    assert [line.partition(" days")[0][:-2].strip() for line in lines] == [
+        f"{settings}, line 3, column 1: {expires}".strip(),
+        f"{router}, line 2, column 24: listen_certificate: {expires}".strip(),
+    ]
+    settings.write_text(settings.read_text().replace("soon", "late"))
+    fine = run_nedbus("check", str(settings))
+    assert fine.wait() == 0, fine.err

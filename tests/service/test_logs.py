@@ -1,0 +1,420 @@
+"""The log: JSON for programs, priorities for the journal, levels, a closed list of events, and a limit for floods."""
+
+from __future__ import annotations
+
+import ast
+import json
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus.cli.log_format import JournalFormatter, JsonFormatter, TextFormatter
+from nedbus.cli.log_limit import BURST, PER_MINUTE, RateLimit
+from nedbus.log_event import EVENTS, about
+from nedbus.transport import Session
+from nedbus_msgs import Address, encode
+from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
+
+from .test_px4_zenoh import Px4
+
+ROOT = Path(__file__).parents[2]
+SERVICE = ROOT / "service" / "nedbus"
+VLP = "vehicle_local_position"
+EVIL = 'a\x1b[2J\n{"event": "forged"}\u2028'
+VEHICLES = 2 * BURST + 10
+
+
+def record(
+    text: str = "%s is stale", *values: object, event: str | None = "stale", **more: object
+) -> logging.LogRecord:
+    """Return a record as a log call of a service makes it."""
+    extra = about(event) if event else {}
+    return logging.makeLogRecord(
+        {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": values}
+        | extra
+        | more
+    )
+
+
+# Events
+
+
+def log_calls(tree: ast.AST) -> Iterator[ast.Call]:
+    """Yield the calls that log something above DEBUG."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            logger, level = node.func.value, node.func.attr
+            name = logger.id if isinstance(logger, ast.Name) else ""
+            if name == "_log" and level in {"info", "warning", "error", "exception", "critical", "log"}:
+                yield node
+
+
+def is_about(node: ast.expr | None) -> bool:
+    return isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "about"
+
+
+def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
+    """Yield what an expression can be: itself, either side of a condition, or what is assigned to its name."""
+    if isinstance(node, ast.IfExp):
+        yield from values_of(node.body, tree)
+        yield from values_of(node.orelse, tree)
+    elif isinstance(node, ast.Name):
+        for other in ast.walk(tree):
+            if isinstance(other, ast.Assign) and any(
+                isinstance(t, ast.Name) and t.id == node.id for t in other.targets
+            ):
+                yield from values_of(other.value, tree)
+    else:
+        yield node
+
+
+def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
+    """Return the events that a log call may have."""
+    extras = [value for each in call.keywords if each.arg == "extra" for value in values_of(each.value, tree)]
+    assert extras, f"line {call.lineno} has no event: extra=about(...)"
+    assert all(is_about(each) for each in extras), f"line {call.lineno}: extra is not about(...)"
+    events = [value for each in extras if isinstance(each, ast.Call) for value in values_of(each.args[0], tree)]
+    return {str(each.value) if isinstance(each, ast.Constant) else ast.unparse(each) for each in events}
+
+
+def test_each_line_has_an_event_of_the_table() -> None:
+    """Whatever is logged above DEBUG has an event that EVENTS documents; no event of the table is left over."""
+    used: set[str] = set()
+    for path in sorted(SERVICE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        for call in log_calls(tree):
+            events = events_of(call, tree)
+            assert events <= EVENTS.keys(), f"{path}, line {call.lineno}"
+            used |= events
+    assert used == EVENTS.keys() - {"left-out"}
+
+
+def test_manual_lists_every_event() -> None:
+    """The table in docs/operate.md is the table in the code."""
+    section = (ROOT / "docs" / "operate.md").read_text().partition("\n## Logs\n")[2].partition("\n## ")[0]
+    listed = re.findall(r"^\| `([a-z-]+)` \| (.+?) \| (yes|never) \|$", section, re.MULTILINE)
+    assert listed == [(name, each.doc, "yes" if each.limited else "never") for name, each in EVENTS.items()]
+    assert f"{BURST} lines" in section
+    assert f"{PER_MINUTE} a minute" in section
+
+
+# Formats
+
+
+def test_json_is_one_harmless_object() -> None:
+    """Whatever a peer sent, a line is one object of ASCII, and its texts act on no terminal."""
+    address = Address("7", "estimator_local_position", 2)
+    extra = about("rejected", address, source=EVIL, reason=EVIL * 1000)
+    line = JsonFormatter().format(record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5))
+    assert line.isascii()
+    assert line.isprintable()
+    assert len(line) < 20_000
+    fields = json.loads(line)
+    assert list(fields) == [
+        "time", "level", "event", "message", "logger", "vehicle", "topic", "instance", "source", "reason",
+    ]  # fmt: skip
+    assert (fields["time"], fields["level"]) == ("1970-01-01T00:00:01.500Z", "warning")
+    assert (fields["vehicle"], fields["topic"], fields["instance"]) == ("7", "estimator_local_position", 2)
+    assert all(text.isprintable() for text in fields.values() if isinstance(text, str))
+
+
+def test_json_leaves_out_what_is_not_known() -> None:
+    """Lines of other packages have no event; nothing is null but that."""
+    fields = json.loads(JsonFormatter().format(record("plain", event=None)))
+    assert list(fields) == ["time", "level", "event", "message", "logger"]
+    assert fields["event"] is None
+
+
+def test_traceback_is_one_text() -> None:
+    """In JSON a traceback is one string; the end of a long one is kept, where the error is named."""
+    try:
+        raise ValueError("x" * 100_000 + EVIL + "the end")
+    except ValueError:
+        line = JsonFormatter().format(record(exc_info=sys.exc_info()))
+    exception = json.loads(line)["exception"]
+    assert exception.endswith("the end")
+    assert exception.replace("\n", "").isprintable()
+    assert len(exception) < 30_000
+
+
+def test_journal_gets_a_priority_for_each_line() -> None:
+    """Each line of a traceback has the priority of syslog, 3 for errors to 7 for debug."""
+    formatter = JournalFormatter(TextFormatter("%(message)s"))
+    assert formatter.format(record("%s\nforged", "x")) == "<4>x\\nforged"
+    for level, number in ((logging.DEBUG, 7), (logging.INFO, 6), (logging.ERROR, 3), (logging.CRITICAL, 3)):
+        assert formatter.format(record("text", levelno=level)) == f"<{number}>text"
+    try:
+        raise ValueError("two\nlines")
+    except ValueError:
+        lines = formatter.format(record(exc_info=sys.exc_info())).split("\n")
+    assert len(lines) >= 5
+    assert all(line.startswith("<4>") for line in lines)
+
+
+# The commands
+
+
+def has_event(service: Process, event: str) -> bool:
+    return f'"event": "{event}"' in service.err
+
+
+def test_service_logs_json(run_nedbus: Start, endpoint: str) -> None:
+    """Each line of a service is an object with an event; NEDBUS_LOG_FORMAT does what the option does."""
+    by_option = run_nedbus("--log-format", "json", "serve", "-c", endpoint, "-s", "sim:?duration=1&speed=max")
+    by_variable = run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=2", NEDBUS_LOG_FORMAT="json")
+    for service, event in ((by_option, "done"), (by_variable, "opened")):
+        wait_for(partial(has_event, service, event), what=event)
+        service.signal(signal.SIGTERM)
+        assert service.wait() == 0
+        lines = [json.loads(line) for line in service.err.splitlines()]
+        assert [line["event"] for line in lines][:2] == ["client", "opened"]
+        assert lines[-1]["event"] == "ending"
+        assert {line["source"] for line in lines if line["event"] in {"opened", "done"}} <= {
+            "sim:?duration=1&speed=max",
+            "sim:?vehicle=2",
+        }
+
+
+def test_error_of_a_command_is_an_object(run_nedbus: Start) -> None:
+    """What ends a command is one object too, with the traceback where the level is debug."""
+    for level in ("info", "debug"):
+        ended = run_nedbus("--log-format", "json", "--log-level", level, "get", "-c", "tcp/127.0.0.1:1")
+        assert ended.wait() == 1
+        (fields,) = [json.loads(line) for line in ended.err.splitlines()]
+        assert (fields["event"], fields["level"]) == ("error", "error")
+        assert fields["message"].startswith("nothing answers at tcp/127.0.0.1:1")
+        assert ("exception" in fields) == (level == "debug")
+
+
+def test_router_logs_nothing_for_people_in_json(run_nedbus: Start) -> None:
+    """What a person would read beside the log, such as what to type, is in an object, or left out."""
+    service = run_nedbus("--log-format", "json", "serve", "-l", "tcp/127.0.0.1:0", "-s", "sim:")
+    wait_for(lambda: '"notice"' in service.err, what="the hint")
+    assert all(json.loads(line)["event"] in EVENTS for line in service.err.splitlines())
+
+
+def test_level_selects(run_nedbus: Start, endpoint: str) -> None:
+    """With --log-level warning a service says nothing while all is well; --debug wins; other words are refused."""
+    quiet = run_nedbus(
+        "--log-level", "warning", "serve", "-c", endpoint, "-s", "sim:?duration=1&speed=max", "--until-done"
+    )
+    assert quiet.wait() == 0
+    assert quiet.err == ""
+    loud = run_nedbus("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
+    assert loud.wait() == 1
+    assert "Traceback" in loud.err
+    wrong = run_nedbus("list", "-c", endpoint, NEDBUS_LOG_LEVEL="loud")
+    assert wrong.wait() == 2
+    assert "NEDBUS_LOG_LEVEL" in wrong.err
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("is_journal", [True, False])
+def test_journal_is_recognised(endpoint: str, tmp_path: Path, is_journal: bool) -> None:
+    """Lines have priorities and no date where JOURNAL_STREAM names stderr, and only there."""
+    path = tmp_path / "journal"
+    with path.open("wb") as stderr:
+        status = os.fstat(stderr.fileno())
+        stream = f"{status.st_dev}:{status.st_ino + (not is_journal)}"
+        ended = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "nedbus",
+                "serve",
+                "-c",
+                endpoint,
+                "-s",
+                "sim:?duration=1&speed=max",
+                "--until-done",
+            ],
+            stderr=stderr,
+            timeout=DEADLINE,
+            check=False,
+            env={**os.environ, "JOURNAL_STREAM": stream},
+        )
+    assert ended.returncode == 0
+    lines = path.read_text().splitlines()
+    pattern = r"<6>[^\d<].*" if is_journal else r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    .*"
+    assert lines
+    assert all(re.fullmatch(pattern, line) for line in lines), lines
+
+
+# The limit
+
+
+class Limited:
+    """A rate limit with a clock of the test's, and what passed."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.lines: list[str] = []
+        self.limit = RateLimit(self.handle, now=lambda: self.now)
+
+    def handle(self, record: logging.LogRecord) -> None:
+        if self.limit.filter(record):
+            self.lines.append(record.getMessage())
+
+    def flood(self, count: int, text: str = "%s is stale", *, event: str | None = "stale") -> int:
+        """Log this many; return how many passed."""
+        before = len(self.lines)
+        for number in range(count):
+            self.handle(record(text, number, event=event))
+        return len(self.lines) - before
+
+
+def test_burst_then_a_few_a_minute() -> None:
+    """A burst passes, then so many a minute, each after a line that says how many were left out before it."""
+    limited = Limited()
+    assert limited.flood(1000) == BURST
+    limited.now += 60 / PER_MINUTE
+    assert limited.flood(1000) == 2
+    assert limited.lines[-2:] == [
+        f"{1000 - BURST} more lines like this one were left out: {BURST} is stale",
+        "0 is stale",
+    ]
+    limited.now += 3600
+    assert limited.flood(1000) == 1 + BURST
+
+
+def test_an_hour_of_flood_is_bounded() -> None:
+    """Ten lines a second for an hour are a burst, and two lines for each that is due."""
+    limited = Limited()
+    for _ in range(3600):
+        limited.flood(10)
+        limited.now += 1
+    assert len(limited.lines) <= BURST + 2 * 60 * PER_MINUTE
+    limited.limit.flush()
+    told = [int(line.split()[0]) for line in limited.lines if "left out" in line]
+    assert sum(told) + len(limited.lines) - len(told) == 36_000
+
+
+def test_kinds_are_limited_each_for_itself() -> None:
+    """A flood of one kind leaves the lines of another alone, and the same text of another event."""
+    limited = Limited()
+    limited.flood(1000)
+    assert limited.flood(3, "%s is back", event="back") == 3
+    assert limited.flood(3, event="back") == 3
+
+
+def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
+    """When a flood has ended, the next line of any kind says what was left out of it; the end of the process, too."""
+    limited = Limited()
+    limited.flood(BURST + 5)
+    assert limited.flood(1, "%s", event="done") == 1
+    limited.now += 60
+    assert limited.flood(1, "%s", event="done") == 2
+    assert limited.lines[-2].startswith("5 more lines")
+    limited.limit.flush()
+    limited.flood(BURST + 5, "%s is back", event="back")
+    limited.limit.flush()
+    assert limited.lines[-1].startswith("5 more lines")
+
+
+def test_lifecycle_is_never_left_out() -> None:
+    """What the process says of its own life passes, however much was logged before."""
+    limited = Limited()
+    own = [name for name, event in EVENTS.items() if not event.limited]
+    assert {"retrying", "failed", "done", "router", "ending", "error"} <= set(own)
+    for name in own:
+        assert limited.flood(10 * BURST, event=name) == 10 * BURST
+
+
+def test_lines_of_other_packages_are_limited() -> None:
+    """A line without an event is limited, and texts without placeholders take up no more than so much memory."""
+    limited = Limited()
+    assert limited.flood(1000, event=None) == BURST
+    for number in range(5000):
+        limited.handle(record(f"text {number}", event=None))
+    assert len(limited.limit._buckets) <= 1001
+    assert len(limited.lines) <= 1000 + 2 * BURST
+
+
+def test_report_is_an_event() -> None:
+    """A line that says what was left out has its number, the event, and the level of what it stands for."""
+    limited = Limited()
+    reports: list[logging.LogRecord] = []
+    limited.limit = RateLimit(reports.append, now=lambda: limited.now)
+    for _ in range(BURST + 3):
+        limited.limit.filter(record("\x1b[2J"))
+    limited.limit.flush()
+    (report,) = reports
+    fields = json.loads(JsonFormatter().format(report))
+    assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("left-out", "stale", 3, "warning")
+    assert fields["message"].isprintable()
+
+
+# Attacks
+
+
+def count_lines(text: str, elapsed: float) -> Counter[str]:
+    """Return how often each event happened, logged or left out; hold that few were logged."""
+    happened: Counter[str] = Counter()
+    logged: Counter[str] = Counter()
+    for line in text.splitlines():
+        fields = json.loads(line)
+        event = str(fields["event"])
+        happened[fields.get("of", event)] += fields.get("count", 1)
+        logged[f"left-out {fields['of']}" if event == "left-out" else event] += 1
+    due = elapsed / 60 * PER_MINUTE + 1
+    for event, count in logged.items():
+        # The last report is at the end of the process.
+        assert count <= (due + 1 if event.startswith("left-out") else BURST + due), event
+    return happened
+
+
+def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+    """A peer that sends nonsense under ever new keys makes a reader log a few lines, and the number of the rest."""
+    start = time.monotonic()
+    echo = run_nedbus("--log-format", "json", "echo", "*", "-c", endpoint)
+    wait_for_reader(raw, f"nedbus/1/{VLP}")
+    block = zenoh.CongestionControl.BLOCK
+    for number in range(1000):
+        raw.put(f"nedbus/flood-{number}/{VLP}", b"garbage", congestion_control=block)
+    raw.put(f"nedbus/1/{VLP}", encode(message(1)), congestion_control=block)
+    wait_for(lambda: echo.out, what="the last message")
+    echo.signal(signal.SIGINT)
+    assert echo.wait() == 130
+    happened = count_lines(echo.err, time.monotonic() - start)
+    assert happened["invalid"] == 1000
+
+
+def test_flapping_vehicles_are_bounded(run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
+    """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
+    start = time.monotonic()
+    service = run_nedbus("--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
+    wait_for(lambda: '"listening"' in service.err, what="the source")
+    fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]
+
+    def status(name: str) -> object:
+        (answer,) = bus.services()
+        (source,) = cast("list[dict[str, object]]", answer["sources"])
+        return source[name]
+
+    for px4 in fleet:
+        px4.put(2_000_000)
+        px4.put(2_010_000)
+        px4.reboot()
+        px4.put(1_000_000)
+        px4.raw(b"garbage")
+    wait_for(lambda: status("reboots") == VEHICLES, what="the reboots")
+    wait_for(lambda: len(cast("list[str]", status("stale"))) == VEHICLES, what="the silence")
+    service.signal(signal.SIGTERM)
+    assert service.wait() == 0
+    happened = count_lines(service.err, time.monotonic() - start)
+    assert happened["published"] == happened["rebooted"] == VEHICLES
+    assert happened["stale"] >= VEHICLES
+    assert happened["ending"] == 1
