@@ -72,14 +72,15 @@ def router() -> Iterator[tuple[Process, str]]:
         port = free.getsockname()[1]
     process = start("-m", "nedbus", "router", "--listen", f"tcp/127.0.0.1:{port}")
     try:
-        _wait_for(port, process)
+        wait_for_router(port, process)
         yield process, f"tcp/127.0.0.1:{port}"
     finally:
         process.terminate()
         end(process, patience=5.0)
 
 
-def _wait_for(port: int, process: Process) -> None:
+def wait_for_router(port: int, process: Process) -> None:
+    """Wait until a router listens; raise RuntimeError if it ends."""
     deadline = time.monotonic() + PATIENCE
     while process.poll() is None and time.monotonic() < deadline:
         with suppress(OSError):

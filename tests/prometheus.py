@@ -1,0 +1,90 @@
+"""Debian's Prometheus, for tests: the programs where they are installed, and a running one that can be asked."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import urllib.request
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+import pytest
+
+from tests.conftest import Process, Start, free_endpoint, wait_for
+
+PACKAGING: Final = Path(__file__).parents[1] / "packaging"
+ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
+# Whatever `start` starts is Python: this one reads a file as its input and becomes another program.
+_BECOME: Final = "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
+
+
+def free_port() -> int:
+    """Return a TCP port of loopback that nobody uses now."""
+    return int(free_endpoint().rpartition(":")[2])
+
+
+def find_program(name: str) -> str:
+    """Return the path of `prometheus` or `promtool`; skip the test where it is not installed."""
+    path = shutil.which(name)
+    if path is None:
+        pytest.skip(f"no {name}: apt-get install --no-install-recommends prometheus")
+    return path
+
+
+def start_promtool(start: Start, *arguments: str, stdin: Path | str = os.devnull) -> Process:
+    """Start promtool, with a file as its input; it is killed at the end of the test."""
+    return start("-c", _BECOME, os.fspath(stdin), find_program("promtool"), *arguments)
+
+
+class Prometheus:
+    """A Prometheus that scrapes and evaluates every second, its data in a folder of the test.
+
+    It is killed at the end of the test, as all that `start` starts.
+    """
+
+    def __init__(self, start: Start, folder: Path, rules: str, jobs: dict[str, list[str]]) -> None:
+        program = find_program("prometheus")
+        (folder / "alerts.yml").write_text(rules)
+        scraped = [{"job_name": job, "static_configs": [{"targets": targets}]} for job, targets in jobs.items()]
+        every = {"scrape_interval": "1s", "scrape_timeout": "1s", "evaluation_interval": "1s"}
+        config = folder / "prometheus.yml"  # JSON is YAML
+        config.write_text(json.dumps({"global": every, "rule_files": ["alerts.yml"], "scrape_configs": scraped}))
+        self._url = f"http://127.0.0.1:{free_port()}"
+        self.process = start(
+            "-c", _BECOME, os.devnull, program,
+            f"--config.file={config}", f"--storage.tsdb.path={folder / 'data'}",
+            f"--web.listen-address={self._url.removeprefix('http://')}", "--log.level=warn",
+        )  # fmt: skip
+        wait_for(self._is_ready, what=f"Prometheus: {self.process.err}")
+
+    def alerts(self, name: str) -> list[dict[str, str]]:
+        """Return the labels of what an alert fires for now."""
+        found = self._get("/api/v1/alerts")["alerts"]
+        return [each["labels"] for each in found if each["labels"]["alertname"] == name and each["state"] == "firing"]
+
+    def annotations(self) -> list[str]:
+        """Return the texts of all alerts, pending ones included."""
+        return [text for each in self._get("/api/v1/alerts")["alerts"] for text in each["annotations"].values()]
+
+    def query(self, expression: str) -> list[tuple[dict[str, str], float]]:
+        """Return the labels and the value of each series that an expression has now."""
+        result = self._get(f"/api/v1/query?query={quote(expression)}")["result"]
+        return [(each["metric"], float(each["value"][1])) for each in result]
+
+    def scrape_errors(self) -> dict[str, str]:
+        """Return the last error of each target, by its address; "" for none."""
+        targets = self._get("/api/v1/targets")["activeTargets"]
+        return {each["labels"]["instance"]: each["lastError"] for each in targets}
+
+    def _is_ready(self) -> bool:
+        try:
+            urllib.request.urlopen(f"{self._url}/-/ready", timeout=5).close()  # noqa: S310 - http, on loopback
+        except OSError:
+            return False
+        return True
+
+    def _get(self, path: str) -> Any:
+        with urllib.request.urlopen(f"{self._url}{path}", timeout=10) as answer:  # noqa: S310 - http, on loopback
+            return json.load(answer)["data"]

@@ -1,0 +1,274 @@
+"""A real Prometheus scrapes real services and evaluates the rules that are shipped: each alert fires, and clears."""
+
+from __future__ import annotations
+
+import json
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus_msgs import encode
+from nedbus_msgs.arrays import to_array
+from tests.conftest import Process, Start, free_endpoint, message, wait_for
+from tests.prometheus import ALERTS, PACKAGING, Prometheus, free_port, start_promtool
+from tests.ulogs import write_log
+
+VLP = "vehicle_local_position"
+PEER = str(Path(__file__).with_name("mavlink_peer.py"))
+ROW = {
+    "x": 1.5, "y": -2.25, "z": -10.0, "vx": 0.5, "vy": -0.25, "vz": 0.125, "heading": -1.0, "eph": 0.5, "epv": 0.75,
+    "ref_lat": 47.3977418, "ref_lon": 8.5455939, "ref_alt": 487.957, "dist_bottom": 10.5,
+}  # fmt: skip
+VALID = {
+    **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0),
+    **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True),
+}
+PATIENCE = 90.0  # s until all alerts have fired, or cleared: sources that failed begin again after up to 30 s
+# An exporter that keeps 100 messages for its reader in place of 65,536, so that a small burst is too much for it.
+SMALL_EXPORTER = """
+import nedbus.client.receive_queue
+nedbus.client.receive_queue.CAPACITY = 100
+from nedbus.cli import main
+main()
+"""
+
+
+class Traffic:
+    """What clients publish, and what a stranger sends to a MAVLink port, 20 times a second; `bad` while it is bad.
+
+    While it is bad vehicle "gone" is silent, "lost" leaves out every other number of its sequence, "doubtful" is
+    invalid and flies by dead reckoning, "many" sends bursts, and junk is sent to a key and to the port.
+    """
+
+    def __init__(self, bus: nedbus.Bus, udp_port: int) -> None:
+        self.bad = False
+        self._bus = bus
+        self._udp_port = udp_port
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Send until the end of the block."""
+        self._thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            self._thread.join()
+
+    def _run(self) -> None:
+        gone, doubtful, many = (self._bus.publisher(VLP, vehicle=name) for name in ("gone", "doubtful", "many"))
+        junk, numbered = (self._bus._session.declare_publisher(f"nedbus/{name}/{VLP}") for name in ("junk", "lost"))
+        number = 0
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            while not self._stop.wait(0.05):
+                bad = self.bad
+                number += 2 if bad else 1
+                doubts: dict[str, object] = {"xy_valid": False, "z_valid": False, "dead_reckoning": True} if bad else {}
+                time = 50_000 * number
+                doubtful.publish(message(time, **{**VALID, **doubts}))
+                numbered.put(encode(message(time, **VALID)), source_info=zenoh.SourceInfo(numbered.id, number))
+                many.publish_many(to_array([message(time + each, **VALID) for each in range(1000 if bad else 1)]))
+                if bad:
+                    junk.put(b"junk")
+                    with suppress(ConnectionError):
+                        stranger.sendto(b"\xfd junk", ("127.0.0.1", self._udp_port))
+                else:
+                    gone.publish(message(time, **VALID))
+
+
+def shorten(rules: str) -> str:
+    """Return rules that wait 1 s before they fire, and look back 10 s: nothing else is changed."""
+    return re.sub(r"\[5m\]", "[10s]", re.sub(r"for: \d+[sm]", "for: 1s", rules))
+
+
+def free_udp_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def names_of(rules: str) -> set[str]:
+    return set(re.findall(r"alert: (\w+)", rules))
+
+
+@pytest.mark.timeout(300)
+def test_every_alert_fires_and_clears(
+    start: Start, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path
+) -> None:
+    """Each alert is caused by what it is for, names what it is about, and ends with its cause.
+
+    All are caused at the same time; the rules are those that are shipped, with shorter times.
+    """
+    rules = shorten(ALERTS.read_text())
+    silent, lossy = free_udp_port(), free_udp_port()
+    second, missing = free_endpoint(), tmp_path / "flight.ulg"
+    addresses = [f"127.0.0.1:{free_port()}" for _ in range(5)]
+    service, exporter, lonely, lonely_exporter, ended = addresses
+    values = tmp_path / "values.json"
+    values.write_text(json.dumps([ROW]))
+
+    def fly(port: int, *options: str) -> Process:
+        return start(PEER, "--to", f"127.0.0.1:{port}", "--values", str(values), *options)
+
+    def route() -> Process:
+        return run_nedbus("router", "-l", second)
+
+    def export_ended() -> Process:
+        return run_nedbus("export", "-c", endpoint, "--vehicle", "gone", "--http", ended)
+
+    sources = {
+        "silent": f"mavlink:udpin:127.0.0.1:{silent}?vehicles=1:silent",
+        "lossy": f"mavlink:udpin:127.0.0.1:{lossy}?vehicles=1:lossy",
+        "missing": f"ulog:{missing}?vehicle=missing&loop=1",
+    }
+    configured = [f"--source={text}" for text in sources.values()]
+    start("-c", SMALL_EXPORTER, "export", "-c", endpoint, "--http", exporter)
+    router = route()
+    run_nedbus("serve", "-c", second, "--http", lonely, "-s", "sim:?speed=0.3&vehicle=lonely")
+    run_nedbus("export", "-c", second, "--http", lonely_exporter)
+    to_end = export_ended()
+    vehicle = fly(lossy, "--drop", "0.3")
+    run_nedbus("serve", "-c", endpoint, "--http", service, *configured)
+    prometheus = Prometheus(start, tmp_path, rules, {"nedbus": addresses})
+    wait_for(lambda: len(prometheus.query("up == 1")) == 5, what="all five to be scraped", seconds=PATIENCE)
+    traffic = Traffic(bus, silent)
+
+    expected: dict[str, list[dict[str, str]]] = {
+        "NedbusDown": [{"instance": ended}],
+        "NedbusNoRouter": [{"instance": lonely}, {"instance": lonely_exporter}],
+        "NedbusSourceDown": [{"source": sources["missing"], "state": "retrying"}],
+        "NedbusSourceSilent": [{"source": sources["silent"]}],
+        "NedbusStreamStale": [{"vehicle": "gone", "topic": VLP, "instance": exporter}],
+        "NedbusPositionInvalid": [{"vehicle": "doubtful", "flag": flag} for flag in ("xy_valid", "z_valid")],
+        "NedbusDeadReckoning": [{"vehicle": "doubtful"}],
+        "NedbusMessagesLost": [{"source": sources["lossy"]}, {"vehicle": "lost", "instance": exporter}],
+        "NedbusMessagesRejected": [{"source": sources["silent"]}],
+        "NedbusPayloadsInvalid": [{"instance": exporter}],
+        "NedbusReaderSlow": [{"instance": exporter}],
+    }
+    assert expected.keys() == names_of(rules)
+
+    with traffic.running():
+        of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
+        wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=PATIENCE)
+        traffic.bad = True
+        router.kill()
+        to_end.kill()
+        for name, causes in expected.items():
+            for cause in causes:
+                wait_for(fires(prometheus, name, cause), what=f"{name} {cause}", seconds=PATIENCE)
+        assert not [text for text in prometheus.annotations() if "<" in text]  # <no value>, <error expanding template>
+
+        traffic.bad = False
+        route()
+        export_ended()
+        vehicle.kill()
+        fly(lossy)
+        fly(silent)
+        write_log(missing, range(0, 10_000_000, 100_000), topic="vehicle_local_position_groundtruth")
+        for name in expected:
+            wait_for(partial(is_quiet, prometheus, name), what=f"the end of {name}", seconds=PATIENCE)
+    assert not any(prometheus.scrape_errors().values())
+    assert not prometheus.process.err
+
+
+def is_quiet(prometheus: Prometheus, name: str) -> bool:
+    return not prometheus.alerts(name)
+
+
+def fires(prometheus: Prometheus, name: str, cause: dict[str, str]) -> Callable[[], bool]:
+    """Return whether an alert fires with these labels."""
+    return lambda: any(cause.items() <= labels.items() for labels in prometheus.alerts(name))
+
+
+@pytest.mark.parametrize(
+    ("name", "series", "times"),
+    [
+        (  # dead reckoning of 15 s, as in every lap of the simulation, is not long; 31 s are
+            "NedbusDeadReckoning",
+            'nedbus_stream_flag_ratio{topic="vehicle_local_position", flag="dead_reckoning"} 0x10 1x14 0x5 1x60',
+            {"25s": False, "1m0s": False, "1m10s": True},
+        ),
+        ("NedbusStreamStale", "nedbus_stream_age_seconds 0+1x20", {"3s": False, "9s": True}),
+        (  # 0.2 Hz: two intervals are 10 s
+            "NedbusStreamStale",
+            "nedbus_stream_age_seconds 0+1x30; nedbus_stream_usual_rate_hertz 0.2x30",
+            {"9s": False, "16s": True},
+        ),
+        (  # the count by rule appears with 1, which increase() does not see; the one of the source was 0 before
+            "NedbusMessagesRejected",
+            "nedbus_source_rejected_total 0x30 1x500; nedbus_messages_rejected_total _x30 1x500",
+            {"25s": False, "45s": True, "5m45s": False},
+        ),
+        (  # a replay that waits for a reader
+            "NedbusSourceSilent",
+            'nedbus_source_state{state="waiting"} 1x100; nedbus_source_addresses 5x100',
+            {"1m30s": False},
+        ),
+    ],
+)
+def test_rules_wait_as_long_as_they_say(
+    start: Start, tmp_path: Path, name: str, series: str, times: dict[str, bool]
+) -> None:
+    """With their own times rules neither fire too early, nor for what is no fault."""
+    inputs = []
+    for each in series.split("; "):
+        metric, _, values = each.rpartition("} ") if "}" in each else each.partition(" ")
+        inputs.append({"series": f"{metric}}}" if "{" in metric else metric, "values": values})
+    file = tmp_path / "test.yml"  # JSON is YAML
+    expected = [{"eval_time": time, "alertname": name, "exp_alerts": []} for time in times]
+    file.write_text(
+        json.dumps({"rule_files": [str(ALERTS)], "evaluation_interval": "1s", "tests": [
+            {"interval": "1s", "input_series": inputs, "alert_rule_test": [each]} for each in expected
+        ]})
+    )  # fmt: skip
+    promtool = start_promtool(start, "test", "rules", str(file))
+    assert promtool.wait() == int(any(times.values())), promtool.err
+    fired = {time for time in times if f"time: {time}," in promtool.out + promtool.err}
+    assert fired == {time for time, fires in times.items() if fires}, promtool.out + promtool.err
+
+
+def test_rules_and_scrape_configuration_are_valid(start: Start) -> None:
+    """Promtool accepts both, and each rule says how bad it is, what it is, and what to do."""
+    for arguments in (("rules", str(ALERTS)), ("config", str(ALERTS.with_name("prometheus.yml")))):
+        promtool = start_promtool(start, "check", *arguments)
+        assert promtool.wait() == 0, promtool.err
+    rules = ALERTS.read_text().split("- alert: ")[1:]
+    assert rules
+    for rule in rules:
+        assert re.search("severity: (critical|warning)\n", rule), rule
+        assert "summary: " in rule, rule
+        assert "description: " in rule, rule
+
+
+def test_dashboard_and_rules_use_what_exists(run_nedbus: Start, start: Start, endpoint: str, tmp_path: Path) -> None:
+    """Each metric of the rules and of the dashboard is one that a service or an exporter has; each query has data."""
+    dashboard = json.loads((PACKAGING / "grafana" / "nedbus.json").read_text())
+    assert {each["name"] for each in dashboard["templating"]["list"]} == {"datasource", "vehicle", "topic"}
+    queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    addresses = [f"127.0.0.1:{free_port()}" for _ in range(2)]
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:", "--http", addresses[0])
+    run_nedbus("export", "-c", endpoint, "--http", addresses[1])
+    prometheus = Prometheus(start, tmp_path, ALERTS.read_text(), {"nedbus": addresses})
+    for query in queries:
+        filled = re.sub(r"\$__(rate_interval|range)", "10s", query).replace("$vehicle", ".*").replace("$topic", "ve.*")
+        assert "$" not in filled
+        found = partial(prometheus.query, filled.removesuffix(" > 0"))  # only what increased is shown
+        if "rejected" in query:  # it has no series before the first rejection
+            found()
+        else:
+            wait_for(found, what=query)
+    exposed = {each["__name__"] for each, _ in prometheus.query('{__name__!=""}')}
+    used = set(re.findall(r"\b(?:nedbus|process)_\w+", " ".join([*queries, ALERTS.read_text()])))
+    assert used - exposed == {"nedbus_messages_rejected_total"}
+    assert len(used) > 20
