@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
     "errors", "extras", "whole_file", "log_event", "transport", "settings", "client", "recording", "sources", "daemon",
-    "monitoring", "bridges", "cli",
+    "monitoring", "doctor", "bridges", "cli",
 ]  # fmt: skip
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {
@@ -31,6 +31,7 @@ ONLY: dict[str, set[str]] = {
         "nedbus/client/acknowledgement", "nedbus/client/catch_up",
         "nedbus/client/query_server", "nedbus/client/qos",
         "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",
+        "nedbus/doctor/traffic", "nedbus/doctor/write_probe",
     },
     "msgpack": {"nedbus_msgs/wire"},
     "xxhash": {"nedbus/transport/rmw_zenoh"},
@@ -56,7 +57,7 @@ ONLY: dict[str, set[str]] = {
     "pandas": {"nedbus/recording/arrays"},
     "polars": {"nedbus/recording/arrays"},
     "matplotlib": {"nedbus/recording/plot"},
-    "pymavlink": {"nedbus/sources/mavlink"},
+    "pymavlink": {"nedbus/sources/mavlink", "nedbus/doctor/mavlink"},
     "serial": {"nedbus/sources/mavlink_link"},
     "foxglove": {"nedbus/bridges/foxglove", "nedbus/bridges/foxglove_messages"},
     "prometheus_client": {
@@ -68,7 +69,7 @@ ONLY: dict[str, set[str]] = {
     "typer": {
         "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
         "nedbus/cli/query", "nedbus/cli/echo", "nedbus/cli/health", "nedbus/cli/serve", "nedbus/cli/run",
-        "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check",
+        "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check", "nedbus/cli/doctor",
     },
 }  # fmt: skip
 MAX_LINES = 250

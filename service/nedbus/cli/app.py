@@ -11,6 +11,7 @@ from nedbus import __version__
 
 from .bridges import foxglove, ros2
 from .check import check
+from .doctor import doctor
 from .echo import echo
 from .files import convert, plot, record
 from .health import health
@@ -38,6 +39,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "get": get,
     "info": info,
     "health": health,
+    "doctor": doctor,
     "check": check,
     "export": export,
     "schema": schema,

@@ -1,0 +1,45 @@
+"""What is found through a router that answers: permissions, services, vehicles, clocks, other keys."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from nedbus.transport import Tls, open_client
+
+from .clocks import check_clocks
+from .finding import Finding, limit_findings
+from .observation import Observation, observe
+from .other_keys import check_other_keys
+from .permissions import check_permissions
+from .services import check_services
+from .vehicles import check_vehicles
+from .write_probe import probe_write
+
+_OPEN = 1.5  # s
+
+
+def check_network(
+    routers: Sequence[str], tls: Tls | None, *, prefix: str, version: str, vehicle: str | None, listen: float
+) -> list[Finding]:
+    """Join the first of these routers, which all answer, and return what is found there."""
+    with open_client(routers[:1], timeout=_OPEN, tls=tls) as session:
+        verdict = None
+        if vehicle is not None:
+            with open_client(routers[:1], timeout=_OPEN, tls=tls) as writer:
+                verdict = probe_write(session, writer, vehicle, prefix=prefix)
+        seen = observe(session, prefix=prefix, listen=listen)
+    groups = (
+        [_count(seen)],
+        check_permissions(seen, vehicle, verdict),
+        check_services(seen, version=version),
+        check_vehicles(seen, vehicle, writes_only=verdict == "allowed" and tls is not None),
+        check_clocks(seen),
+        check_other_keys(seen),
+    )
+    return [finding for group in groups for finding in limit_findings(list(group))]
+
+
+def _count(seen: Observation) -> Finding:
+    if seen.sessions is None:
+        return Finding("router", "", "ok", "joined; who else is connected this client is not told")
+    return Finding("router", "", "ok", f"joined; sessions that are connected, with this one: {seen.sessions}")

@@ -1,0 +1,205 @@
+"""What is seen of a network in a few seconds: services, tokens, streams, routers; judged elsewhere."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Final
+
+from nedbus.transport import PublisherToken, RawSample, Session, alive_keys, publishers_of_type_key_expr, query
+from nedbus_msgs import (
+    ANY,
+    DEFAULT_TOPIC,
+    ROS2_TYPE,
+    Address,
+    AddressError,
+    DecodeError,
+    address_of_alive_key,
+    alive_key_expr,
+    dds_type,
+    status_key,
+)
+
+from .traffic import Stream, Traffic
+
+LISTEN: Final = 3.0
+"""Seconds for which the doctor listens, unless it is told otherwise."""
+
+_LEAST: Final = 1.0  # s of them after all questions, for what is measured at its arrival
+
+_TICK: Final = 0.02  # s until what arrived is looked at: it makes a message look that much older
+_TIMEOUT: Final = 1.0  # s of a query
+_MAX_ANSWER: Final = 2**18  # bytes of a status that is read
+_CLOCKS: Final = 2.0  # s after which no further service is asked for its clock
+_MAX_SERVICES: Final = 20  # that are looked at: any peer may claim to be a service
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """The status of a service as it reports it, and what its clock says: ahead of ours by `offset` +- `error` [s]."""
+
+    key: str
+    status: Mapping[str, object]
+    offset: float | None = None
+    error: float = 0.0
+
+    @property
+    def sources(self) -> list[Mapping[str, object]]:
+        """The status of its sources."""
+        sources = self.status.get("sources")
+        return [each for each in sources if isinstance(each, dict)] if isinstance(sources, list) else []
+
+    def text(self, name: str) -> str:
+        """Return a value of the status as text, "" if it has none."""
+        value = self.status.get(name)
+        return "" if value is None else str(value)
+
+
+@dataclass(slots=True)
+class Observation:
+    """What was seen.
+
+    `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
+    `streams`: what arrived, by key; `publishers`: who declares to publish, by key.
+    `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
+    `sessions`: how many the routers have, None if they do not say; `listened`: for how long streams were [s].
+    """
+
+    prefix: str
+    services: list[Service] = field(default_factory=list)
+    alive: list[Address] = field(default_factory=list)
+    ages: dict[Address, float | None] = field(default_factory=dict)
+    streams: dict[str, Stream] = field(default_factory=dict)
+    publishers: dict[str, set[str]] = field(default_factory=dict)
+    elsewhere: set[str] = field(default_factory=set)
+    ros2: list[PublisherToken] = field(default_factory=list)
+    sessions: int | None = None
+    listened: float = 0.0
+
+
+def observe(session: Session, *, prefix: str, listen: float) -> Observation:
+    """Listen and ask, for little more than `listen` seconds."""
+    seen = Observation(prefix)
+    start = time.monotonic()
+    end = start + listen
+    with ExitStack() as closing:
+        here, anywhere = (
+            Traffic(session, key_expr, prefix=prefix) for key_expr in (f"{prefix}/*/**", f"**/{DEFAULT_TOPIC}/**")
+        )
+        closing.callback(here.close)
+        closing.callback(anywhere.close)
+        seen.sessions = _count_sessions(session)
+        for service in _services(session, prefix):
+            in_time = time.monotonic() < start + _CLOCKS
+            seen.services.append(_with_clock(session, service) if in_time else service)
+        seen.alive = _alive(session, prefix)
+        seen.publishers = _publishers(session, prefix)
+        seen.ros2 = _ros2_publishers(session)
+        seen.ages = _ages(session, prefix)
+        seen.elsewhere = {
+            key
+            for key in alive_keys(session, "**/@alive/**", timeout=_TIMEOUT)
+            if not key.startswith(f"{prefix}/") and not key.startswith("@")
+        }
+        here.take()
+        for stream in here.streams.values():
+            stream.delay = None  # these have waited for the queries above, and are older than they look
+        end = max(end, time.monotonic() + _LEAST)
+        while time.monotonic() < end:
+            time.sleep(_TICK)
+            here.take()
+            anywhere.take()
+    seen.streams = here.streams
+    seen.listened = time.monotonic() - start
+    seen.elsewhere |= {
+        key for key in anywhere.streams if not key.startswith(f"{prefix}/") and key.endswith(f"/{DEFAULT_TOPIC}")
+    }
+    return seen
+
+
+def _services(session: Session, prefix: str) -> list[Service]:
+    answers = query(session, status_key(ANY, prefix=prefix), timeout=_TIMEOUT)
+    return [each for each in map(_service, answers) if each is not None][:_MAX_SERVICES]
+
+
+def _service(answer: RawSample) -> Service | None:
+    if len(answer.payload) > _MAX_ANSWER:
+        return None
+    try:
+        status = json.loads(answer.payload.to_bytes())
+    except (ValueError, RecursionError):
+        return None
+    return Service(str(answer.key_expr), status) if isinstance(status, dict) else None
+
+
+def _with_clock(session: Session, service: Service) -> Service:
+    """Ask a service alone, so that the round trip is its own; its clock was read in the middle of it."""
+    before = time.time()
+    answer = next(map(_service, query(session, service.key, timeout=_TIMEOUT)), None)
+    after = time.time()
+    now = answer.status.get("now") if answer is not None else None
+    if answer is None or not isinstance(now, int | float):
+        return service
+    return Service(service.key, answer.status, now - (before + after) / 2, (after - before) / 2)
+
+
+def _alive(session: Session, prefix: str) -> list[Address]:
+    addresses = []
+    for key in alive_keys(session, alive_key_expr(prefix=prefix), timeout=_TIMEOUT):
+        try:
+            addresses.append(address_of_alive_key(key, prefix=prefix))
+        except AddressError:
+            continue
+    return addresses
+
+
+def _publishers(session: Session, prefix: str) -> dict[str, set[str]]:
+    """Return who declares to publish each key: two publishers of an address share its token, but not this one."""
+    found: dict[str, set[str]] = {}
+    for token in alive_keys(session, f"{prefix}/*/**/@adv/pub/*/*/**", timeout=_TIMEOUT):
+        key, _, publisher = token.partition("/@adv/pub/")
+        found.setdefault(key, set()).add(publisher)
+    return found
+
+
+def _ros2_publishers(session: Session) -> list[PublisherToken]:
+    """Return the publishers of ROS 2's keys with this message, other than our own bridge."""
+    found = []
+    for text in alive_keys(session, publishers_of_type_key_expr(None, dds_type(ROS2_TYPE)), timeout=_TIMEOUT):
+        try:
+            token = PublisherToken.parse(text)
+        except DecodeError:
+            continue
+        if not token.node.startswith("nedbus_"):
+            found.append(token)
+    return found
+
+
+def _ages(session: Session, prefix: str) -> dict[Address, float | None]:
+    """Return how old the last message of each address is that is still answered with; None without a timestamp."""
+    ages: dict[Address, float | None] = {}
+    for answer in query(session, f"{prefix}/*/**", timeout=_TIMEOUT):
+        try:
+            address = Address.from_key(str(answer.key_expr), prefix=prefix)
+        except AddressError:
+            continue
+        stamp = answer.timestamp
+        ages[address] = None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
+    return ages
+
+
+def _count_sessions(session: Session) -> int | None:
+    """Return how many sessions the routers have, this one included; None if they do not tell this client."""
+    counts = []
+    for answer in query(session, "@/*/router", timeout=_TIMEOUT):
+        try:
+            found = json.loads(answer.payload.to_bytes())
+        except (ValueError, RecursionError):
+            continue
+        sessions = found.get("sessions") if isinstance(found, dict) else None
+        if isinstance(sessions, list):
+            counts.append(len(sessions))
+    return sum(counts) if counts else None

@@ -1,0 +1,43 @@
+"""What this client may do at a router with access rules: read, and write a vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from .finding import Finding, list_names
+from .observation import Observation
+from .services import reported
+from .write_probe import Verdict
+
+_RULES = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
+
+
+def check_permissions(seen: Observation, vehicle: str | None, verdict: Verdict | None) -> Iterator[Finding]:
+    """Yield whether this client may read, by what it gets, and may write a vehicle, by what a probe showed."""
+    yield _reading(seen, verdict)
+    if vehicle is None or verdict is None:
+        advice = "with --vehicle it is: 'nedbus doctor --vehicle 1'"
+        yield Finding("write", "", "unknown", "whether a vehicle may be written is not probed", advice)
+    elif verdict == "allowed":
+        yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe came back")
+    elif verdict == "denied":
+        seen_text = f"the router drops what this client publishes as vehicle {vehicle}, without an error"
+        yield Finding("write", vehicle, "wrong", seen_text, f"use the certificate of that vehicle; {_RULES}")
+    else:
+        seen_text = f"cannot be told: the router does not let this client read a probe of vehicle {vehicle}"
+        advice = f"allow {seen.prefix}/*/@doctor/* as config/router-secure.json5 does, or look from a reader"
+        yield Finding("write", vehicle, "unknown", seen_text, advice)
+
+
+def _reading(seen: Observation, verdict: Verdict | None) -> Finding:
+    if any(stream.address is not None for stream in seen.streams.values()) or seen.ages:
+        return Finding("read", "", "ok", "this client may read: messages arrive")
+    published = sorted({address for service in seen.services for address in reported(service)})
+    if not published:
+        return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
+    seen_text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"
+    if verdict == "allowed":
+        advice = "a vehicle's certificate is for writing: look with that of a reader"
+        return Finding("read", "", "warning", seen_text, advice)
+    advice = f"may those services write these vehicles, and may this client read? {_RULES}"
+    return Finding("read", "", "wrong", seen_text, advice)

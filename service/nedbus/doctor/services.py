@@ -1,0 +1,67 @@
+"""What services report of themselves: sources that fail, that wait, that lost their vehicle, that reject messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from .finding import Finding, brief, list_names
+from .observation import Observation, Service
+
+_MAX_REASON: Final = 300  # characters of an error that a peer reports
+
+
+def check_services(seen: Observation, *, version: str) -> Iterator[Finding]:
+    """Yield what is found of each service, of its version and of its sources."""
+    for service in seen.services:
+        name = f"service {brief(service.text('service'))}"
+        theirs = brief(service.text("version") or "unknown")
+        sources = service.sources
+        if theirs.split(".")[:2] != version.split(".")[:2]:
+            advice = "install the same version on both sides; docs and CHANGELOG say what changed on the wire"
+            yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {version}", advice)
+        findings = [finding for source in sources for finding in _source(source)]
+        yield from findings
+        if not findings:
+            host = brief(service.text("host") or "an unknown host")
+            yield Finding(
+                "service", name, "ok", f"nedbus {theirs} on {host}, its sources have no fault: {len(sources)}"
+            )
+    if not seen.services:
+        advice = "'nedbus serve' is one; a script that publishes by itself is none"
+        yield Finding("service", "", "unknown", "no nedbus service answers", advice)
+
+
+def reported(service: Service) -> Iterator[str]:
+    """Yield the addresses that a service says it publishes."""
+    for source in service.sources:
+        addresses = source.get("addresses")
+        yield from map(brief, addresses if isinstance(addresses, list) else ())
+
+
+def has_source(seen: Observation, kind: str) -> bool:
+    """Return whether any service has a source of this kind."""
+    return any(
+        str(source.get("source")).startswith(f"{kind}:") for service in seen.services for source in service.sources
+    )
+
+
+def _source(source: Mapping[str, object]) -> Iterator[Finding]:
+    name, state = brief(source.get("source")), source.get("state")
+    error = str(source.get("error") or "it does not say why")[:_MAX_REASON]
+    if state in {"failed", "retrying"}:
+        ends = "it has ended" if state == "failed" else "it is tried again"
+        yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; the log of its service says more")
+    elif state in {"waiting", "starting"}:
+        advice = "is its vehicle on, does it send here? for MAVLink see 'nedbus doctor --mavlink LINK' on its host"
+        yield Finding("source", name, "warning", f"{state}: nothing has arrived yet", advice)
+    stale = source.get("stale")
+    if isinstance(stale, list) and stale:
+        advice = "is the vehicle on, is its link up? they come back by themselves"
+        seen = f"nothing arrives any more of {list_names(stale)}"
+        yield Finding("source", name, "warning", seen, advice)
+    rejected, rules = source.get("rejected"), source.get("rejections")
+    if isinstance(rejected, int) and rejected > 0:
+        why = f": {list_names(rules)}" if isinstance(rules, dict) and rules else ""
+        advice = "'nedbus echo' shows nothing of these; reasons are in the log of the service and on @rejected keys"
+        yield Finding("source", name, "warning", f"{rejected} messages were rejected{why}", advice)
