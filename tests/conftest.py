@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol, Self, cast
 
@@ -22,6 +23,7 @@ from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT_TOPIC, Address, VehicleLocalPosition
 
 DEADLINE = 30.0  # s that a test waits for a condition before it fails
+_SAID = 10_000  # characters of a process's output that a failure shows
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
 
 
@@ -346,11 +348,15 @@ class Process:
         return self._err.read_text()
 
     def wait(self, seconds: float = DEADLINE) -> int:
-        """Wait for its end and return its exit code; fail with what it said when it does not end."""
+        """Wait for its end and return its exit code; fail with what it said, and where it was, when it does not end."""
         try:
             return self.popen.wait(seconds)
         except subprocess.TimeoutExpired:
-            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{self.out}{self.err}")
+            self.popen.send_signal(signal.SIGABRT)  # Python writes the stacks of all threads
+            with suppress(subprocess.TimeoutExpired):
+                self.popen.wait(DEADLINE)
+            said = f"{self.out[-_SAID:]}{self.err[-_SAID:]}"
+            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{said}")
 
     def signal(self, number: signal.Signals) -> None:
         self.popen.send_signal(number)
@@ -375,7 +381,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
         if not measured:
             # A signal can find coverage inside its own lock, where it stays.
             inherited = {name: value for name, value in inherited.items() if not name.startswith("COVERAGE_")}
-        process = Process([sys.executable, *arguments], where, inherited | environment)
+        environment = inherited | {"PYTHONFAULTHANDLER": "1"} | environment
+        process = Process([sys.executable, *arguments], where, environment)
         processes.append(process)
         return process
 

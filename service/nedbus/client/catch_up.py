@@ -30,7 +30,6 @@ class CatchUp:
     def __init__(self, session: Session, receive_queue: ReceiveQueue) -> None:
         self._session = session
         self._queue = receive_queue
-        self._asked: set[str] = set()  # publishers, since a link broke last
         with while_open():
             self._listener = session.info.declare_transport_events_listener(
                 zenoh.handlers.Callback(self._on_link, indirect=False), history=False
@@ -41,12 +40,13 @@ class CatchUp:
         if time.monotonic() >= self._queue.unsettled_until:
             return batch
         complete: list[RawSample] = []
+        seen: set[str] = set()  # publishers of this batch, which the queue does not know before it has the batch
         for sample in batch:
             info = sample.source_info
-            if info is not None and info.source_sn:
-                publisher = entity_name(info.source_id)
-                if publisher not in self._asked and not self._queue.knows(publisher):
-                    self._asked.add(publisher)
+            publisher = entity_name(info.source_id) if info is not None else ""
+            if info is not None and publisher not in seen:
+                seen.add(publisher)
+                if info.source_sn and not self._queue.knows(publisher):
                     with suppress(NedbusError):  # closed meanwhile
                         key = str(sample.key_expr)
                         complete += query_kept(self._session, key, publisher, end=info.source_sn, timeout=_TIMEOUT)
@@ -58,5 +58,4 @@ class CatchUp:
         self._listener.undeclare()
 
     def _on_link(self, _: zenoh.TransportEvent) -> None:
-        self._asked = set()
         self._queue.unsettled_until = time.monotonic() + _PERIOD
