@@ -88,17 +88,24 @@ class Workers:
         return _Running(planned, worker, stop, thread)
 
     def _stop(self, gone: Sequence[_Running]) -> None:
-        for each in gone:
-            each.stop.set()
+        """Let these end, and wait a while: giving an address back may take as long as its slowest reader."""
+        retiring = [threading.Thread(target=_retire, args=[each], name="nedbus-retire", daemon=True) for each in gone]
+        for thread in retiring:
+            thread.start()
         deadline = time.monotonic() + _GRACE
-        for each in gone:
-            each.thread.join(max(0.0, deadline - time.monotonic()))
-            if each.thread.is_alive():
+        for each, thread in zip(gone, retiring, strict=True):
+            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.is_alive():
                 _log.warning(
                     "%s: does not end, perhaps because of a slow reader; it goes on until then",
                     each.worker.text,
                     extra=about("reload"),
                 )
-            else:
-                each.worker.withdraw()
-                _log.info("%s: ended, as it is not configured any more", each.worker.text, extra=about("reload"))
+
+
+def _retire(running: _Running) -> None:
+    """Let a source end, and publish it no more."""
+    running.stop.set()
+    running.thread.join()
+    running.worker.withdraw()
+    _log.info("%s: ended, as it is not configured any more", running.worker.text, extra=about("reload"))
