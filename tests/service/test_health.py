@@ -8,7 +8,7 @@ import time
 import pytest
 
 from nedbus import Health, Monitor, Sample, StreamHealth
-from nedbus.cli.state import describe_stream, stream_state
+from nedbus.client import describe_stream, stream_state
 from nedbus_msgs import DOUBT_FLAGS, Address, VehicleLocalPosition
 
 SECOND = 1_000_000_000

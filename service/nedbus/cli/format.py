@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from nedbus.client import Sample
+from nedbus.client import Sample, to_age
 from nedbus_msgs import FIELD_TYPES, message_doubts
 
 MAX_TEXT: Final = 1000
@@ -136,15 +136,6 @@ def csv_line(cells: Iterable[object]) -> str:
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(cells)
     return line.getvalue()
-
-
-def to_age(seconds: float) -> str:
-    """Return a duration in a suitable unit."""
-    if seconds < 1:
-        return f"{max(0.0, seconds) * 1e3:.0f} ms"
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
 
 
 def _to_value(sample: Sample, name: str) -> str:

@@ -9,11 +9,11 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus.client import Bus
+from nedbus.client import Bus, to_age
 from nedbus.errors import NedbusError
 from nedbus_msgs import ANY, check_vehicle
 
-from .format import to_age, to_text
+from .format import to_text
 from .options import JsonOption, on_bus, write
 from .status import sources_of, streams_of
 

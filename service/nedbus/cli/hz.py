@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Final
 
-from nedbus.client import Bus, Health, Monitor
+from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
 from nedbus_msgs import ANY, DOUBT_FLAGS, Address
 
 from .follow import Link, follow
-from .format import csv_line, to_age
+from .format import csv_line
 from .live_table import LiveTable
 from .options import (
     CountOption,
@@ -28,7 +28,6 @@ from .options import (
     require_one,
     write,
 )
-from .state import StreamState, describe_stream, stream_state
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
 _OPTIONAL: Final = ("JITTER", "MAX", "LATENCY", "LOST")

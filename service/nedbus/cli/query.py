@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import textwrap
-import time
 from collections.abc import Sequence
 from typing import Annotated, Final
 
 import typer
 
-from nedbus.client import Bus, Health, Sample, StreamHealth
+from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
 from nedbus_msgs import ANY, Address, json_schema, layout_table
 
-from .format import to_age, to_fields, to_json, to_text
+from .format import to_fields, to_json, to_text
 from .options import (
     InstanceOption,
     JsonOption,
@@ -26,7 +25,6 @@ from .options import (
     write,
     write_stderr,
 )
-from .state import describe_stream, stream_state
 from .status import sources_of, streams_of
 from .table import terminal_width, to_table
 
@@ -46,7 +44,7 @@ def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
     rows = []
     for address in sorted(published | newest.keys()):
         sample = newest.get(address)
-        health = _health_of(sample) if sample else None
+        health = health_of_last(sample) if sample else None
         state = stream_state(health, alive=address in published) if health else None
         age = health.age if health else None
         if json_output:
@@ -131,15 +129,6 @@ def schema(
 
 def _chunks(address: Address) -> dict[str, object]:
     return {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-
-
-def _health_of(sample: Sample) -> Health:
-    """Return the health of a stream of which only the last message is known; its age is of the wall clock."""
-    stream = StreamHealth(sample.topic)
-    stream.add(sample.message, received=0)
-    if sample.sent is None:
-        return stream.snapshot(0)
-    return stream.snapshot(max(0, time.time_ns() - sample.sent))
 
 
 def _write_rows(table: str, rows: Sequence[object]) -> None:

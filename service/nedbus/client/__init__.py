@@ -16,6 +16,7 @@ from .publisher import HEARTBEAT, Publisher
 from .publisher_registry import PublisherRegistry
 from .query_server import QueryServer
 from .sample import Counts, Mode, Sample
+from .stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
 from .subscription import Subscription
 
 if TYPE_CHECKING:
@@ -40,8 +41,13 @@ __all__ = [
     "QueryServer",
     "Sample",
     "StreamHealth",
+    "StreamState",
     "Subscription",
     "connect",
     "connect_async",
     "connect_with",
+    "describe_stream",
+    "health_of_last",
+    "stream_state",
+    "to_age",
 ]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from nedbus.client import Health
-from nedbus_msgs import describe_flags
+from nedbus_msgs import Message, describe_flags
 
-from .format import to_age
+from .health import Health, StreamHealth
+from .sample import Sample
 
 StateName = Literal["ok", "slow", "stale", "gone", "disconnected"]
 
@@ -61,3 +62,19 @@ def describe_stream(health: Health, state: StreamState) -> str:
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
     events = [f"{count} {name}" for count, name in counts if count]
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
+
+
+def health_of_last(sample: Sample[Message]) -> Health:
+    """Return the health of a stream of which only the last message is known; its age is of the wall clock."""
+    stream = StreamHealth(sample.topic)
+    stream.add(sample.message, received=0)
+    return stream.snapshot(0 if sample.sent is None else max(0, time.time_ns() - sample.sent))
+
+
+def to_age(seconds: float) -> str:
+    """Return a duration in a suitable unit, as text."""
+    if seconds < 1:
+        return f"{max(0.0, seconds) * 1e3:.0f} ms"
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
