@@ -27,8 +27,8 @@ def make_stack(images: None, tmp_path: Path) -> Iterator[StartStack]:
     """Make stacks of the shipped files; nothing is started yet."""
     stacks: list[Stack] = []
 
-    def make(name: str, *files: str, **environment: str) -> Stack:
-        stacks.append(Stack(name, tmp_path, *files, **environment))
+    def make(name: str, *files: str, directory: Path = ROOT, **environment: str) -> Stack:
+        stacks.append(Stack(name, tmp_path, *files, directory=directory, **environment))
         return stacks[-1]
 
     yield make

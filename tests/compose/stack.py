@@ -47,16 +47,19 @@ def docker(*arguments: str) -> str:
 
 
 class Stack:
-    """One project of compose, with its router on a free port of loopback; `down` leaves nothing behind."""
+    """One project of compose, with its router on a free port of loopback; `down` leaves nothing behind.
 
-    def __init__(self, name: str, where: Path, *files: str, **environment: str) -> None:
+    `files` are in the project's folder, if not absolute; what they name is relative to `directory`.
+    """
+
+    def __init__(self, name: str, where: Path, *files: str, directory: Path = ROOT, **environment: str) -> None:
         self.name = f"nedbus-test-{os.getpid()}-{name}"
         self.address = free_endpoint().removeprefix("tcp/")
         self._where = where
         self._runs: list[Process] = []
         self._environment = ENVIRONMENT | {"NEDBUS_PUBLISH": self.address, **environment}
         chosen = files or ("docker-compose.yml",)
-        self._command = [*find_compose(), "--project-name", self.name, "--project-directory", str(ROOT)]
+        self._command = [*find_compose(), "--project-name", self.name, "--project-directory", str(directory)]
         for file in chosen:
             self._command += ["--file", str(ROOT / file)]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -11,8 +10,9 @@ import pytest
 import nedbus
 from nedbus.transport import make_authority, make_certificate
 from nedbus_msgs import Address
-from tests.conftest import DEADLINE, Process, message, wait_for
+from tests.conftest import Process, message, wait_for
 
+from .certificates import FILES, USER, hand_out, join, make_certificates
 from .conftest import StartStack
 from .flight import Flight, is_whole
 from .recorder import Recorder, indices
@@ -29,34 +29,20 @@ PEOPLE = ("vehicle-1", "vehicle-2", "reader", "operator")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make certificates as docs/security.md says, and some that must not work; the first user of a host owns them."""
     folder = tmp_path_factory.mktemp("pki")
-    make_authority(folder)
-    make_certificate(folder, "router", hosts=["router", "localhost", "127.0.0.1"])
-    for name in PEOPLE:
-        make_certificate(folder, name)
+    make_certificates(folder, *PEOPLE)
     make_certificate(folder, "expired", days=-1)
     make_authority(folder / "foreign")
     make_certificate(folder / "foreign", "vehicle-1")
-    if os.getuid() == 0:
-        for file in folder.rglob("*"):
-            os.chown(file, 1000, 1000)
+    hand_out(folder)
     return folder
 
 
 @pytest.fixture
 def secure(make_stack: StartStack, pki: Path) -> Stack:
     """Start the shipped stack with these certificates."""
-    user = f"{os.getuid() or 1000}:{os.getgid() or 1000}"
-    files = ("docker-compose.yml", "docker-compose.secure.yml")
-    stack = make_stack("secure", *files, NEDBUS_PKI=str(pki), NEDBUS_USER=user)
+    stack = make_stack("secure", *FILES, NEDBUS_PKI=str(pki), NEDBUS_USER=USER)
     stack.up()
     return stack
-
-
-def join(stack: Stack, pki: Path, name: str | None, *, ca: str = "ca.crt", timeout: float = DEADLINE) -> nedbus.Bus:
-    """Connect from the host, as somebody."""
-    own, key = (None, None) if name is None else (pki / f"{name}.crt", pki / f"{name}.key")
-    endpoint = f"tls/{stack.address}"
-    return nedbus.connect(endpoint, tls=nedbus.Tls(pki / ca, own, key), timeout=timeout)
 
 
 @pytest.fixture
@@ -109,11 +95,11 @@ def test_strangers_are_refused(secure: Stack, pki: Path, reader: Recorder, ca: s
     """On the host and in a container: no session, and an error that says what to check."""
     with pytest.raises(nedbus.ConnectError, match=r"check that tls_ca is the router's authority"):
         join(secure, pki, certificate, ca=ca, timeout=1.0)
-    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]
+    volumes = [f"--volume={pki / ca}:/etc/nedbus/pki/ca.crt:ro"]  # over a file of the container's folder
     if certificate is None:
         volumes += ["--env=NEDBUS_TLS_CERTIFICATE=", "--env=NEDBUS_TLS_KEY="]
     else:
-        volumes += [f"--volume={pki / certificate}.{kind}:/etc/nedbus/pki/own.{kind}:ro" for kind in ("crt", "key")]
+        volumes += [f"--volume={pki / certificate}.{kind}:/etc/nedbus/pki/reader.{kind}:ro" for kind in ("crt", "key")]
     echo = secure.run("subscriber", "echo", "--count", "1", options=tuple(volumes))
     assert echo.wait(60.0) == 1, echo.out
     assert "check that tls_ca is the router's authority" in echo.err
@@ -126,7 +112,7 @@ import json, sys, threading, time, zenoh
 name, puts = sys.argv[1], int(sys.argv[2])
 tls = {"root_ca_certificate": "/etc/nedbus/pki/ca.crt", "enable_mtls": True}
 if name != "nobody":
-    tls |= {"connect_certificate": "/etc/nedbus/pki/own.crt", "connect_private_key": "/etc/nedbus/pki/own.key"}
+    tls |= {"connect_certificate": "/etc/nedbus/pki/reader.crt", "connect_private_key": "/etc/nedbus/pki/reader.key"}
 settings = {
     "mode": "peer",
     "listen/endpoints": ["tcp/0.0.0.0:7448"],
@@ -171,7 +157,7 @@ def test_peers_do_not_bypass_the_router(secure: Stack, pki: Path, reader: Record
     listener = secure.run("subscriber", "-c", PEER, "reader", "0", options=run)
     wait_for(lambda: "ready" in listener.out, what=f"the listening peer {listener.err}")
     for name in ("vehicle-2", "nobody"):
-        own = tuple(f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/own.{kind}:ro" for kind in ("crt", "key"))
+        own = tuple(f"--volume={pki}/vehicle-2.{kind}:/etc/nedbus/pki/reader.{kind}:ro" for kind in ("crt", "key"))
         peer = secure.run("subscriber", "-c", PEER, name, "300", options=(*run, *own))
         assert peer.wait(60.0) == 0, peer.err
         assert '{"genuine": 0, "forged": 300}' in peer.out, "it sees its own puts, and nothing else"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from nedbus.transport import make_authority, make_certificate
+from nedbus.transport import make_authority, make_bundle, make_certificate
 from tests.conftest import wait_for
 
 from .machine import Machine, build_machine, documented_commands
@@ -19,7 +20,14 @@ NEDBUS = "/opt/nedbus/bin/nedbus"
 CONFIG = "/etc/nedbus/nedbus.toml"
 SIMULATION = 'source = ["sim:"]\n'
 DIAL = "python3 -c 'import socket; socket.create_connection((\"127.0.0.1\", 7447))'"
-READER_TLS = "--tls-ca /root/pki/ca.crt --tls-certificate /root/pki/vehicle-1.crt --tls-key /root/pki/vehicle-1.key"
+ROUTER = "tls/127.0.0.1:7449"
+ROUTER_FILE = f"""{{listen: {{endpoints: ["{ROUTER}"]}}, mode: "router", transport: {{link: {{tls: {{
+    root_ca_certificate: "ca.crt", listen_certificate: "router.crt", listen_private_key: "router.key",
+    enable_mtls: true}}}}}}}}"""
+READER = f"-c {ROUTER} " + " ".join(
+    f"--tls-{option} /root/pki/{file}"
+    for option, file in (("ca", "ca.crt"), ("certificate", "reader.crt"), ("key", "reader.key"))
+)
 DROP_IN = "/etc/systemd/system/nedbus.service.d/test.conf"
 
 # A vehicle with system id 7 that sends its position to a UDP port, or to the other end of a terminal, which it prints.
@@ -221,24 +229,29 @@ def test_mavlink_over_serial_port(machine: Machine) -> None:
     machine.run("systemctl stop vehicle-serial; rm /dev/ttyACM0")
 
 
-def test_tls(machine: Machine, tmp_path: Path) -> None:
-    """Keys that are installed as documented can be read by the service, and by nobody else."""
+def test_bundle(machine: Machine, tmp_path: Path) -> None:
+    """What `nedbus pki enroll` makes, installed as its README.txt says, beside a router that asks for certificates.
+
+    The service can read its keys, and nobody else can.
+    """
     make_authority(tmp_path)
     make_certificate(tmp_path, "router", hosts=["localhost", "127.0.0.1"])
-    make_certificate(tmp_path, "vehicle-1")
+    make_certificate(tmp_path, "reader")
+    make_bundle(tmp_path, "wing", tmp_path / "bundle", routers=[ROUTER], sources=["sim:"])
     machine.run("rm -rf /root/pki")
     machine.copy(tmp_path, "/root/pki")
-    machine.run("cd /root/pki && install -g nedbus -m 640 ca.crt router.crt router.key vehicle-1.* /etc/nedbus/")
-    router = """{listen: {endpoints: ["tls/127.0.0.1:7449"]}, mode: "router", transport: {link: {tls: {
-        root_ca_certificate: "ca.crt", listen_certificate: "router.crt", listen_private_key: "router.key",
-        enable_mtls: true}}}}"""
-    machine.write(router, "/etc/nedbus/router.json5")
-    configure(machine, SIMULATION + 'router_config = "router.json5"\n')
-    tls = 'tls_ca = "ca.crt"\ntls_certificate = "vehicle-1.crt"\ntls_key = "vehicle-1.key"\n'
-    configure(machine, f'{SIMULATION}vehicle = "wing"\nconnect = ["tls/127.0.0.1:7449"]\n{tls}', "wing")
-    machine.run("systemctl start nedbus nedbus@wing")
-    assert_reads(machine, "wing", f"--config /etc/nedbus/wing.toml {READER_TLS}")
-    assert machine.call("setpriv --reuid=65534 --clear-groups cat /etc/nedbus/router.key").returncode != 0
+    machine.run("cd /root/pki && install -g nedbus -m 640 ca.crt router.crt router.key /etc/nedbus/")
+    machine.write(ROUTER_FILE, "/etc/nedbus/router.json5")
+    configure(machine, SIMULATION + 'router_config = "router.json5"\n', "router")
+    machine.run("systemctl start nedbus@router")
+    readme = (tmp_path / "bundle" / "README.txt").read_text()
+    commands = re.findall(r"^ {7}sudo (.*)$", readme.split("Or with systemd")[1].split("\n3. ")[0], re.MULTILINE)
+    assert len(commands) == 5
+    for command in commands:
+        machine.run(f"cd /root/pki/bundle && {command}")
+    assert_reads(machine, "wing", READER)
+    for key in ("router.key", "pki/vehicle-wing.key"):
+        assert machine.call(f"setpriv --reuid=65534 --clear-groups cat /etc/nedbus/{key}").returncode != 0
 
 
 def test_nothing_is_writable(machine: Machine) -> None:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import stat
+import subprocess
+import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -13,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import nedbus
+from nedbus.daemon import check_service
 from nedbus.transport import (
     certificate_name,
     list_certificates,
@@ -27,7 +32,8 @@ from nedbus_msgs import AddressError
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
 from tests.zenohd import start_zenohd
 
-CONFIG = Path(__file__).parents[2] / "config" / "router-secure.json5"
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "config" / "router-secure.json5"
 VLP = "vehicle_local_position"
 FLEET = [str(number) for number in range(1, 201)]
 SAMPLE = ("1", "99", "200")
@@ -132,6 +138,77 @@ def test_bundle_is_all_that_a_vehicle_needs(
     wait_for(lambda: reader.latest(VLP, vehicle="wing"), what="its messages")
     assert not reader.latest(VLP, vehicle="99")
     assert list(reader.vehicles()) == ["wing"]
+
+
+def test_documented_commands_lead_from_nothing_to_a_vehicle_that_is_read(run_nedbus: Start, tmp_path: Path) -> None:
+    """The commands of docs/security.md, one after the other in an empty folder, on loopback and without /etc."""
+    page = (ROOT / "docs" / "security.md").read_text()
+    section = page.split("## A fleet\n")[1].split("### Enroll a vehicle\n")[0]
+    here = tmp_path / "empty"
+    here.mkdir()
+    endpoint = free_endpoint().removeprefix("tcp/")
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+
+    def localize(text: str) -> str:
+        for documented, local in (
+            ("192.168.1.5:7447", endpoint),
+            ("0.0.0.0:7447", endpoint),
+            ("192.168.1.5", "127.0.0.1"),
+            ("~/nedbus", str(ROOT)),
+            ("/etc/nedbus", str(tmp_path / "etc")),
+            ("sudo ", ""),
+        ):
+            text = text.replace(documented, local)
+        return text
+
+    def run(command: str) -> str:
+        done = subprocess.run(
+            ["bash", "-e", "-c", localize(command)],
+            cwd=here,
+            env=os.environ | {"PATH": path},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    home, router, reader, later = re.findall(r"```bash\n(.*?)```", section, re.DOTALL)
+    assert run(home).endswith("+ 7\n- 1\n")
+    copy, start_router = router.splitlines()
+    run(copy)
+    assert start_router == "nedbus router router-secure.json5"
+    file = here / "router-secure.json5"
+    file.write_text(localize(file.read_text()))
+    run_nedbus("router", str(file))
+    shutil.copytree(here / "vehicle-7" / "pki", tmp_path / "etc" / "pki", dirs_exist_ok=True)
+    settings = (here / "vehicle-7" / "nedbus.toml").read_text().replace('# source = ["sim:', 'source = ["sim:')
+    (tmp_path / "etc" / "nedbus.toml").write_text(localize(settings))
+    run_nedbus("serve", "--config", str(tmp_path / "etc" / "nedbus.toml"))
+
+    def is_read() -> bool:
+        try:
+            return "1 vehicles" in run(reader)
+        except AssertionError:
+            return False
+
+    wait_for(is_read, what=f"a vehicle, by {reader}", seconds=120.0)
+    said = run(later)
+    assert "+ 8\n" in said
+    assert re.search(r"^vehicle-8 +client .* valid$", said, re.MULTILINE)
+
+
+def test_each_suggested_source_is_one(pki: Path, tmp_path: Path) -> None:
+    """Who removes a # in nedbus.toml has a configuration without a mistake."""
+    bundle = tmp_path / "wing"
+    make_bundle(pki, "wing", bundle, routers=["tls/127.0.0.1:7447"], target=bundle)
+    text = (bundle / "nedbus.toml").read_text()
+    suggested = re.findall(r"^# (source = .*)$", text, re.MULTILINE)
+    assert len(suggested) == 3
+    for source in suggested:
+        (bundle / "nedbus.toml").write_text(text.replace(f"# {source}", source).replace("# listen", "listen"))
+        assert check_service(bundle / "nedbus.toml", offline=True) == []
 
 
 def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path, run_nedbus: Start) -> None:

@@ -32,16 +32,17 @@ vehicle = {name}
 # What the service publishes.
 {source}
 
-# For programs on the vehicle that read, also while the link to the router is down:
+# For programs on the vehicle that read, also while the link to the router is down, and for `px4-zenoh:`, whose PX4
+# connects here; 0.0.0.0 in place of 127.0.0.1 lets in other computers, which may write as this vehicle.
 # listen = ["tcp/127.0.0.1:7447"]
 """
 _NO_SOURCE: Final = """\
 # Choose one, and remove the # before it; until then the service does not start.
-# source = ["mavlink:udpin:0.0.0.0:14540"]
-# source = ["px4-zenoh:"]
+# source = ["mavlink:udpin:0.0.0.0:14540?vehicles=1:{vehicle}"]  # 1 is the autopilot's MAV_SYS_ID
+# source = ["px4-zenoh:"]  # with `listen` below
 # source = ["sim:"]  # a simulated vehicle, to try the connection"""
 _COMPOSE: Final = """\
-# The service of vehicle {vehicle}, for a computer with Docker: docker compose up -d
+# The service of vehicle {vehicle}, for a computer with Docker; README.txt beside this file says how it is started.
 services:
   nedbus:
     image: ${{NEDBUS_IMAGE:-nedbus}}
@@ -49,9 +50,11 @@ services:
     restart: unless-stopped
     user: "${{NEDBUS_USER:-1000:1000}}" # who may read the key: $(id -u):$(id -g) of the owner of these files
     network_mode: host # the autopilot's packets arrive at the host
-    volumes:
-      - {{ type: bind, source: ./nedbus.toml, target: /etc/nedbus/nedbus.toml, read_only: true }}
-      - {{ type: bind, source: ./pki, target: {pki}, read_only: true }}
+    environment:
+      NEDBUS_HTTP: "${{NEDBUS_HTTP:-127.0.0.1:9464}}" # metrics and health, for this host only
+    working_dir: {target}
+    volumes: # the folder, so that a file that is replaced is seen
+      - {{ type: bind, source: ., target: {target}, read_only: true }}
     read_only: true
     cap_drop: [ALL]
     security_opt: ["no-new-privileges:true"]
@@ -64,29 +67,44 @@ it everywhere but on the vehicle.
 
 1. In nedbus.toml, set `source`: what this vehicle publishes.
 
-2. Either with Docker, in this folder:
+2. Either with Docker, where the image `nedbus` is (on a computer that has built it: docker save nedbus | ssh VEHICLE
+   docker load), as the owner of these files, in this folder:
 
+       echo "NEDBUS_USER=$(id -u):$(id -g)" > .env
        docker compose up -d
 
-   Or with systemd, where nedbus and its unit nedbus.service are installed:
+   After a change of nedbus.toml:
 
-       sudo mkdir -p {target}/pki
-       sudo cp nedbus.toml {target}/
-       sudo cp pki/ca.crt pki/{common_name}.crt pki/{common_name}.key {target}/pki/
-       sudo chown -R nedbus: {target}/pki
-       sudo systemctl enable --now nedbus
+       docker compose restart
 
-3. The router has to know vehicle {vehicle}. Where its file is, this says so, or writes the rules, which the router
-   takes when it starts again:
+   Or with systemd, where nedbus and its unit are installed (docs/systemd.md), in this folder:
+
+       sudo install -d -g nedbus -m 750 {pki}
+       sudo install -g nedbus -m 640 pki/ca.crt pki/{common_name}.crt pki/{common_name}.key {pki}/
+       sudo install -g nedbus -m 640 nedbus.toml /etc/nedbus/
+       sudo systemctl enable nedbus
+       sudo systemctl restart nedbus
+
+3. The router has to know vehicle {vehicle}. Where its file is, this writes the rules, or says that they are there;
+   the router takes new ones when it starts again:
 
        nedbus pki rules router-secure.json5 --add {vehicle}
 
-4. See that it arrives, as a reader:
+4. See that it arrives, on a computer with a reader's certificate:
 
-       nedbus health --vehicle {vehicle}
+       nedbus health --vehicle {vehicle} --connect {router} \\
+           --tls-ca pki/ca.crt --tls-certificate pki/reader.crt --tls-key pki/reader.key
 
-Before the certificate ends, `nedbus pki renew` makes {common_name}.crt anew: copy that one file over the old one. The
-key stays, and nothing has to be restarted: the file is read at the next connection, at the latest when the old
+   Where it does not, `nedbus doctor` says why: there with the same options, and on the vehicle, which may write and not
+   read, with `docker compose exec nedbus nedbus doctor --vehicle {vehicle}`, or without Docker, in /etc/nedbus, with
+   `sudo -u nedbus /opt/nedbus/bin/nedbus doctor --vehicle {vehicle}`.
+
+Before the certificate ends, `nedbus pki renew` makes {common_name}.crt anew: copy that one file over the old one, with
+Docker in the folder pki beside this file, with systemd:
+
+       sudo install -g nedbus -m 640 {common_name}.crt {pki}/
+
+The key stays, and nothing has to be restarted: the file is read at the next connection, at the latest when the old
 certificate ends.
 """
 
@@ -124,7 +142,7 @@ def make_bundle(
     certificate = authority.sign(name, key.public_key(), days=days)
     part = output.with_name(f".{os.getpid()}-part-{output.name}")
     until = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
-    facts = {"vehicle": vehicle, "common_name": name, "target": str(target), "until": until}
+    facts = {"vehicle": vehicle, "common_name": name, "pki": f"{target}/pki", "until": until, "router": routers[0]}
     try:
         with whole_file(folder / f"{name}.crt") as kept:
             write_certificate(kept, certificate)
@@ -134,7 +152,7 @@ def make_bundle(
             write_certificate(part / "pki" / f"{name}.crt", certificate)
             write_certificate(part / "pki" / "ca.crt", authority.certificate)
             (part / "nedbus.toml").write_text(_settings(facts, routers, sources))
-            (part / "compose.yml").write_text(_COMPOSE.format(vehicle=vehicle, pki=json.dumps(f"{target}/pki")))
+            (part / "compose.yml").write_text(_COMPOSE.format(vehicle=vehicle, target=json.dumps(str(target))))
             (part / "README.txt").write_text(_README.format(**facts))
             part.rename(output)
     except OSError as exc:
@@ -146,7 +164,7 @@ def make_bundle(
 
 def _settings(facts: Mapping[str, str], routers: Sequence[str], sources: Sequence[str]) -> str:
     """Return the content of nedbus.toml; a string of JSON is one of TOML."""
-    pki = f"{facts['target']}/pki"
+    pki = facts["pki"]
     return _SETTINGS.format(
         vehicle=facts["vehicle"],
         name=json.dumps(facts["vehicle"]),
@@ -154,5 +172,5 @@ def _settings(facts: Mapping[str, str], routers: Sequence[str], sources: Sequenc
         ca=json.dumps(f"{pki}/ca.crt"),
         certificate=json.dumps(f"{pki}/{facts['common_name']}.crt"),
         key=json.dumps(f"{pki}/{facts['common_name']}.key"),
-        source=f"source = {json.dumps(list(sources))}" if sources else _NO_SOURCE,
+        source=f"source = {json.dumps(list(sources))}" if sources else _NO_SOURCE.format(**facts),
     )

@@ -1,0 +1,150 @@
+"""What `nedbus pki enroll` makes, started with Docker beside the secure stack; and what `renew` and `rules` change."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import ssl
+import subprocess
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import DEADLINE, Start, free_endpoint, wait_for
+
+from .certificates import FILES, USER, hand_out, join, make_certificates
+from .conftest import StartStack
+from .recorder import Recorder
+from .stack import ROOT, Stack
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+
+VLP = "vehicle_local_position"
+RESTART = "docker compose -f docker-compose.yml -f docker-compose.secure.yml restart router"
+
+
+@pytest.fixture
+def pki(tmp_path: Path) -> Path:
+    make_certificates(tmp_path / "pki", "vehicle-1", "reader")
+    return tmp_path / "pki"
+
+
+@pytest.fixture
+def secure(make_stack: StartStack, tmp_path: Path, pki: Path) -> Stack:
+    """Prepare the shipped stack, with a copy of the router's file that a test may change."""
+    shutil.copytree(ROOT / "config", tmp_path / "config")
+    files = [str(ROOT / file) for file in FILES]
+    return make_stack("fleet", *files, directory=tmp_path, NEDBUS_PKI=str(pki), NEDBUS_USER=USER)
+
+
+def restart_router(stack: Stack) -> None:
+    """Restart it as documented."""
+    assert RESTART in (ROOT / "docs" / "security.md").read_text()
+    stack.compose(*RESTART.split()[-2:])
+
+
+def files_seen(stack: Stack, service: str) -> set[str]:
+    """Return the names of the files that a container sees of the certificates."""
+    return set(stack.compose("exec", "-T", service, "ls", "/etc/nedbus/pki").split())
+
+
+def router_certificate(stack: Stack, pki: Path) -> str:
+    """Return the certificate that the router shows, as PEM."""
+    host, port = stack.address.split(":")
+    shown = ssl.get_server_certificate((host, int(port)), ca_certs=str(pki / "ca.crt"), timeout=DEADLINE)
+    return shown.strip()
+
+
+def test_bundles_run_beside_the_secure_stack(
+    make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: list[Recorder]
+) -> None:
+    """As their README.txt says: who is in the router's rules is read, who is not is denied until the rules name it."""
+    rules = tmp_path / "config" / "router-secure.json5"
+
+    def pki_command(*arguments: str) -> None:
+        done = run_nedbus("pki", *arguments)
+        assert done.wait() == 0, done.err
+
+    bundles: dict[str, Stack] = {}
+    status: dict[str, str] = {}
+    for vehicle in ("wing", "stranger"):
+        folder = tmp_path / vehicle
+        router = f"tls/{secure.address}"
+        pki_command("enroll", str(pki), vehicle, "--router", router, "-o", str(folder), "-s", "sim:")
+        said = re.findall(
+            r"^ {7}(echo .* > \.env)\n {7}docker compose up -d$", (folder / "README.txt").read_text(), re.MULTILINE
+        )
+        subprocess.run(["bash", "-c", *said], cwd=folder, check=True, timeout=DEADLINE)
+        status[vehicle] = free_endpoint().removeprefix("tcp/")
+        bundles[vehicle] = make_stack(
+            vehicle, str(folder / "compose.yml"), directory=folder, NEDBUS_HTTP=status[vehicle]
+        )
+    pki_command("rules", str(rules), "wing")
+    secure.up("router")
+    for bundle in bundles.values():
+        bundle.up()
+    reader = join(secure, pki, "reader")
+    record.append(Recorder(reader.subscribe(VLP, mode="every")))
+    record[0].wait_for_more(100)
+    wait_for(lambda: published(status["stranger"]) > 100, what="what the stranger publishes in vain")
+    record[0].wait_for_more(100)
+    assert {sample.vehicle for sample in record[0].samples} == {"wing"}
+    assert list(reader.vehicles()) == ["wing"]
+    assert "1 vehicles" in bundles["wing"].compose("exec", "-T", "nedbus", "nedbus", "health")
+
+    pki_command("rules", str(rules), "--add", "stranger")
+    restart_router(secure)
+    wait_for(lambda: {sample.vehicle for sample in list(record[0].samples)} == {"wing", "stranger"}, what="both")
+    record[0].wait_for_more(100)
+    assert record[0].subscription.counts.lost == 0
+
+    pki_command("renew", str(pki), "vehicle-wing")
+    (pki / "vehicle-wing.crt").rename(tmp_path / "wing" / "pki" / "vehicle-wing.crt")
+    seen = bundles["wing"].compose("exec", "-T", "nedbus", "cat", "pki/vehicle-wing.crt")
+    assert seen == (tmp_path / "wing" / "pki" / "vehicle-wing.crt").read_text()
+
+
+def published(address: str) -> float:
+    """Return how many messages a service has published, by its metrics; 0 while it does not answer."""
+    try:
+        with urllib.request.urlopen(f"http://{address}/metrics", timeout=DEADLINE) as page:
+            text = page.read().decode()
+    except OSError:
+        return 0.0
+    counts = re.findall(rf'^nedbus_messages_published_total{{.*topic="{VLP}".*}} (\S+)$', text, re.MULTILINE)
+    return sum(map(float, counts))
+
+
+def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: Path, record: list[Recorder]) -> None:
+    """Copied as documented, containers see them without being made anew; the router shows its own after a restart."""
+    secure.up()
+    record.append(Recorder(join(secure, pki, "reader").subscribe(VLP, mode="every")))
+    record[0].wait_for_more(100)
+    for service, name in (("router", "router"), ("service", "vehicle-1")):
+        assert files_seen(secure, service) == {"ca.crt", f"{name}.crt", f"{name}.key"}
+    before = secure.container("router"), secure.container("service")
+    old = router_certificate(secure, pki)
+    renewed = run_nedbus("pki", "renew", str(pki), "router", "vehicle-1", "reader", "--days", "900")
+    assert renewed.wait() == 0, renewed.err
+    for name in ("router", "vehicle-1"):  # whoever copies may make a new file of the same name
+        (pki / name / f"{name}.crt").unlink()
+    hand_out(pki)
+    own = (pki / "vehicle-1.crt").read_text()
+    assert secure.compose("exec", "-T", "service", "cat", "/etc/nedbus/pki/vehicle-1.crt") == own
+    new = (pki / "router.crt").read_text().strip()
+    assert router_certificate(secure, pki) == old != new
+    restart_router(secure)
+    wait_for(lambda: is_shown(secure, pki, new), what="the router's new certificate")
+    record[0].wait_for_more(100)
+    assert record[0].subscription.counts.lost == 0
+    join(secure, pki, "reader").close()
+    assert (secure.container("router"), secure.container("service")) == before
+
+
+def is_shown(stack: Stack, pki: Path, certificate: str) -> bool:
+    """Return whether the router shows this certificate; not while it starts."""
+    try:
+        return router_certificate(stack, pki) == certificate
+    except OSError:
+        return False
