@@ -28,7 +28,7 @@ ONLY: dict[str, set[str]] = {
         "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries",
         "nedbus/client/zenoh_subscriber", "nedbus/client/receive_queue", "nedbus/client/decoder",
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
-        "nedbus/client/acknowledgement", "nedbus/client/catch_up",
+        "nedbus/client/acknowledgement", "nedbus/client/catch_up", "nedbus/client/rejections",
         "nedbus/client/query_server", "nedbus/client/qos",
         "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",
         "nedbus/doctor/traffic", "nedbus/doctor/write_probe",

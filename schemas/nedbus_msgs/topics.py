@@ -148,6 +148,19 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
 
 
+def rejected_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key expression for the reports of rejected messages of all addresses."""
+    return f"{prefix}/@rejected/**"
+
+
+def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
+    """Return the address that a report is about; raise AddressError for any other key."""
+    begin = f"{prefix}/@rejected/"
+    if not key.startswith(begin):
+        raise AddressError("key", key, f"{begin}<vehicle>/<topic>[/<instance>]")
+    return Address.from_key(f"{prefix}/{key.removeprefix(begin)}", prefix=prefix)
+
+
 def schema_key(*, prefix: str = DEFAULT_PREFIX) -> str:
     """Return the key to query for the JSON Schema and the layouts that a publisher knows."""
     return f"{prefix}/@schema/VehicleLocalPosition"

@@ -15,6 +15,7 @@ from .monitor import Monitor
 from .publisher import HEARTBEAT, Publisher
 from .publisher_registry import PublisherRegistry
 from .query_server import QueryServer
+from .rejections import RejectionReport, Rejections
 from .sample import Counts, Mode, Sample
 from .stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
 from .subscription import Subscription
@@ -39,6 +40,8 @@ __all__ = [
     "Publisher",
     "PublisherRegistry",
     "QueryServer",
+    "RejectionReport",
+    "Rejections",
     "Sample",
     "StreamHealth",
     "StreamState",

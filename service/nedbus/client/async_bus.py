@@ -12,6 +12,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 from .async_publisher import AsyncPublisher
 from .async_subscription import AsyncSubscription
 from .bus import Bus
+from .rejections import Rejections
 from .sample import Mode, Sample
 
 
@@ -73,6 +74,10 @@ class AsyncBus:
     async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
         """Return the status of every nedbus service as `Bus.services` does."""
         return await asyncio.to_thread(self._opened().services, timeout=timeout)
+
+    async def rejections(self) -> Rejections:
+        """Follow the reports of messages that services on this network reject from now on; `take` does not wait."""
+        return await asyncio.to_thread(self._opened().rejections)
 
     async def publisher(
         self,

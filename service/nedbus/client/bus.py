@@ -20,6 +20,7 @@ from .publisher import Publisher
 from .publisher_registry import LIVE, PublisherRegistry
 from .query_server import QueryServer
 from .receive_queue import ReceiveQueue
+from .rejections import Rejections
 from .sample import Mode, Sample
 from .subscription import Subscription
 from .vehicle_directory import VehicleDirectory
@@ -111,6 +112,11 @@ class Bus:
         """Return the status of every nedbus service on this network, as it reports it."""
         self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
+
+    def rejections(self) -> Rejections:
+        """Follow the reports of messages that services on this network reject from now on."""
+        self._require_open()
+        return Rejections(self._session, prefix=self.prefix, owner=self)
 
     def publisher(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from operator import itemgetter
 from typing import Final
 
 from nedbus_msgs import Address, Message
@@ -23,22 +24,24 @@ class Monitor:
     def __init__(self) -> None:
         self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
 
-    def add(self, sample: Sample[Message]) -> bool:
-        """Add a sample that was received just now; return whether it counts."""
+    def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
+        """Add a sample that was received just now, or at this time [ns] of another clock; return whether it counts."""
         address = sample.address
         known = address in self._streams
         stream = self._streams.pop(address, None)
         if known:
             stream = stream or StreamHealth(sample.topic)
-            stream.add(sample.message, received=time.monotonic_ns(), latency=sample.latency, lost=sample.lost)
+            now = time.monotonic_ns() if received is None else received
+            stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost)
         elif len(self._streams) >= _MAX_STREAMS:
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream
         return known
 
-    def snapshot(self) -> dict[Address, Health]:
-        """Return the health of each stream, sorted by address."""
-        return {address: stream.snapshot() for address in sorted(self._streams) if (stream := self._streams[address])}
+    def snapshot(self, now: int | None = None) -> dict[Address, Health]:
+        """Return the health of each stream, sorted by address, now or at this time [ns] of the other clock."""
+        streams = sorted(self._streams.items(), key=itemgetter(0))
+        return {address: stream.snapshot(now) for address, stream in streams if stream is not None}
 
     def latencies(self, address: Address) -> Histogram | None:
         """Return the latencies of a stream since the start [s]."""

@@ -24,7 +24,7 @@ RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
 
 RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
-_CLOSED: Final = re.compile(r"session closed|undeclared", re.IGNORECASE)
+_CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
 LEASE: Final = 5.0
