@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from nedbus.daemon import check_router_file
 from nedbus.errors import ConfigError
 from nedbus.settings import load_settings
 from nedbus.sources import parse_source
@@ -114,6 +115,26 @@ def test_sources_endpoints_and_files_are_tried(run_nedbus: Start, tmp_path: Path
     assert [line.partition(": ")[0] for line in offline] == [f"{file}, line 7, column 1"]
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "reasons"),
+    [
+        ("tcp/a..b:7447", ["a..b is no address of this host", "this host finds no address of a..b"]),
+        ("tcp/127.0.0.1:99999", ["is not an endpoint: port out of range 0-65535"] * 2),
+        ("tcp/[::1", ["is not an endpoint: invalid ipv6 url"] * 2),
+        ("udp/gcs:mavlink", ["is not an endpoint: port could not be cast to integer value as 'mavlink'"] * 2),
+    ],
+)
+def test_endpoint_that_is_none(tmp_path: Path, endpoint: str, reasons: list[str]) -> None:
+    """A router's file may name anything as an endpoint: it is a mistake with its place, whatever it is."""
+    file = tmp_path / "router.json5"
+    file.write_text(
+        f'{{ mode: "router", listen: {{ endpoints: ["{endpoint}"] }}, connect: {{ endpoints: ["{endpoint}"] }} }}'
+    )
+    mistakes = [str(each) for each in check_router_file(file)]
+    assert all(each.startswith(f"{file}, line 1, column 42: {endpoint}") for each in mistakes), mistakes
+    assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
+
+
 def test_router_files(run_nedbus: Start, tmp_path: Path) -> None:
     """A file for zenohd is read as zenohd reads it; what is shipped has no mistake in its text."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
@@ -161,3 +182,15 @@ def test_certificates_that_expire_are_named(run_nedbus: Start, tmp_path: Path) -
     settings.write_text(settings.read_text().replace("soon", "late"))
     fine = run_nedbus("check", str(settings))
     assert fine.wait() == 0, fine.err
+
+
+def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path: Path) -> None:
+    """What is not installed is no mistake in the settings: a warning says what is not checked, and why."""
+    make_authority(tmp_path / "pki")
+    settings = tmp_path / "nedbus.toml"
+    settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')
+    program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
+    checked = start("-c", program, "check", str(settings))
+    assert checked.wait() == 0, checked.err
+    assert checked.out == "nothing is wrong\n"
+    assert f"{tmp_path}/pki/ca.crt is not checked for when it expires: cryptography: not installed" in checked.err

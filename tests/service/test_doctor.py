@@ -110,6 +110,7 @@ def test_nothing_listens() -> None:
     advice = found(look(free_endpoint()), "endpoint", "wrong", "nothing listens there").advice
     assert "nedbus serve" in advice
     found(look("tcp/no-such-host.invalid:7447"), "endpoint", "wrong", "has no address|no name server answers")
+    found(look("tcp/a..b:7447"), "endpoint", "wrong", r"a\.\.b has no address")
 
 
 def test_http_server_in_place_of_a_router() -> None:
@@ -224,6 +225,17 @@ def test_what_services_report(raw: Session, endpoint: str) -> None:
     found(findings, "source", "warning", "nothing arrives any more of 9/x")
     found(findings, "source", "warning", "7 messages were rejected: xy_valid")
     found(findings, "version", "warning", r"it is nedbus 99\.1\.0, this is")
+
+
+@pytest.mark.parametrize("now", [10**400, float("nan"), float("-inf"), True, "noon", None, []])
+def test_status_that_makes_no_sense(raw: Session, endpoint: str, now: object) -> None:
+    """A peer may answer anything: what can be understood of it is said, and no other check is lost."""
+    states: list[object] = [[], {}, 7, None]
+    strange = [source(state=state, stale=5, rejections=[1], addresses={}) for state in states]
+    with reporting(raw, now=now, version=[1], host={}, sources=[*strange, 5, source(state="failed", error=["why"])]):
+        findings = look(endpoint)
+    found(findings, "source", "wrong", r"mavlink:x: failed: \['why'\]")
+    assert not [each for each in findings if "could not be examined" in each.seen]
 
 
 def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
@@ -408,6 +420,32 @@ def test_service_that_may_not_write_its_vehicle(run_router: Run, pki: Path, run_
     assert "for writing" in found(own, "read", "warning", "nothing of it arrives here").advice
 
 
+def test_certificates_without_the_package_that_reads_them(run_router: Run, pki: Path, start: Start) -> None:
+    """Names and dates are unknown then, and what to install is said; whether to trust it is told all the same."""
+    endpoints = {name: run_router(name) for name in ("router", "router-expired", "router-elsewhere")}
+    settings = {name: str(path) for name, path in files(pki, "reader").items()}
+    program = f"""
+import sys
+sys.modules["cryptography"] = None
+from nedbus.doctor import examine
+from nedbus.settings import load_settings
+for name, endpoint in {endpoints!r}.items():
+    for each in examine(load_settings(connect=(endpoint,), **{settings!r}), version="0", listen=0.5):
+        if each.check in ("tls", "certificate"):
+            print(name, each.check, each.state, each.seen, each.advice, sep="|")
+"""
+    process = start("-c", program)
+    assert process.wait() == 0, process.err
+    lines = [line.split("|") for line in process.out.splitlines()]
+    unread = [check for name, check, state, _, advice in lines if name == "router" and "nedbus[pki]" in advice]
+    assert sorted(unread) == ["certificate", "certificate", "tls"]
+    wrong = {name: seen for name, check, state, seen, _ in lines if state == "wrong"}
+    assert wrong.keys() == {"router-expired", "router-elsewhere"}
+    assert wrong["router-expired"].endswith("cannot be trusted: certificate has expired")
+    assert wrong["router-elsewhere"] == "the router's certificate is not for 127.0.0.1"
+
+
+@pytest.mark.filterwarnings("ignore:Parsed a serial number")
 def test_damaged_certificates_are_refused(pki: Path) -> None:
     """The bytes come from anybody: cut off or changed anywhere, they are a ValueError or a certificate."""
     pem = (pki / "router.crt").read_text()
@@ -416,7 +454,7 @@ def test_damaged_certificates_are_refused(pki: Path) -> None:
     for index in range(len(der)):
         for damaged in (der[:index], der[:index] + bytes([der[index] ^ 0xFF]) + der[index + 1 :]):
             try:
-                Certificate.parse(damaged)
+                Certificate.decode(damaged)
             except ValueError:
                 continue
 

@@ -8,7 +8,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +21,15 @@ from prometheus_client.registry import Collector
 
 import nedbus
 from nedbus import StreamHealth
-from nedbus.client import Histogram
+from nedbus.client import Health, Histogram
+from nedbus.daemon import Daemon, SourceMeasures
+from nedbus.daemon.status import SourceStatus, StreamStatus
 from nedbus.errors import ConfigError, ListenError
-from nedbus.monitoring import HttpServer, Page
+from nedbus.monitoring import Exporter, HttpServer, Page, families, http_server, service_pages
 from nedbus.monitoring.exposition import build_info, metrics_page
 from nedbus.monitoring.families import MAX_STREAMS, Stream, stream_families
+from nedbus.monitoring.service_metrics import _streams
+from nedbus.settings import load_settings
 from nedbus_msgs import VehicleLocalPosition, encode
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
 from tests.prometheus import free_port, start_promtool
@@ -325,6 +329,45 @@ def test_silent_clients_block_nobody(server: Pages, sent: bytes) -> None:
         assert b"200 OK" in silent[-1].recv(1000)
 
 
+@pytest.mark.parametrize(
+    ("sent", "answer"),
+    [
+        (b"\x16\x03\x01 a TLS handshake\r\n\r\n", b"Error code: 400"),
+        (b"GET\r\n\r\n", b"Error code: 400"),
+        (b"GET /page HTTP/9.9\r\n\r\n", b"Error code: 505"),
+        (b"GET /" + 70_000 * b"x" + b" HTTP/1.0\r\n\r\n", b"HTTP/1.0 414 "),
+        (b"GET /page HTTP/1.0\r\n" + 200 * b"a: b\r\n" + b"\r\n", b"HTTP/1.0 431 "),
+        (b"GET /page HTTP/1.0\r\na:" + 70_000 * b"x" + b"\r\n\r\n", b"HTTP/1.0 431 "),
+        (b"GET /\xff\x00<script> HTTP/1.0\r\n\r\n", b"HTTP/1.0 404 "),
+    ],
+)
+def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes) -> None:
+    """Whatever is sent gets an answer, and no line in the log; the next client gets its page."""
+    with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as client:
+        client.sendall(sent)
+        assert answer in client.recv(10_000)
+    assert server.ask("/page") == (200, "a page\n")
+    assert not caplog.records
+
+
+def test_clients_that_do_not_read_their_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 16 clients that read nothing of a large page, the next one is answered when their time is over."""
+    monkeypatch.setattr(http_server, "_PATIENCE", 0.1)
+    made = threading.Semaphore(0)
+
+    def make() -> Page:
+        made.release()
+        return Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+
+    server = HttpServer("127.0.0.1:0", {"/large": make, "/page": lambda: Page.text("a page")})
+    with closing(server), ExitStack() as clients:
+        for _ in range(16):
+            client = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
+            client.sendall(b"GET /large HTTP/1.0\r\n\r\n")
+            assert made.acquire(timeout=DEADLINE)
+        wait_for(lambda: Pages(server.port).ask("/page") == (200, "a page\n"), what="the time of one to be over")
+
+
 def test_more_clients_than_it_has_room_for(server: Pages) -> None:
     """While 16 are being answered no further one is; they get their answers, and then there is room again."""
     with ThreadPoolExecutor(16) as pool:
@@ -384,6 +427,87 @@ def test_text_is_that_of_the_official_client() -> None:
     page = metrics_page(Streams())
     assert page.content.decode().partition("# HELP process_")[0] == expected
     assert page.content.decode().count("\n# TYPE process_") == 6
+
+
+def test_stuck_source_is_not_healthy(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """/healthz is 503 when the loop of a source has not gone round for long: only a new start mends that."""
+    pages = service_pages(Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0"))
+    assert pages["/healthz"]() == Page.text("ok")
+    monkeypatch.setattr(Daemon, "busy", 20.0)
+    assert pages["/healthz"]() == Page.text("a source has been at one message for 20 s", status=503)
+
+
+def ages(page: Page) -> set[str]:
+    """Return the vehicles that have an age, on a page of metrics."""
+    families = {each.name: each for each in text_string_to_metric_families(page.content.decode())}
+    return {sample.labels["vehicle"] for sample in families["nedbus_stream_age_seconds"].samples}
+
+
+def test_vehicle_that_was_switched_off_has_no_age(
+    bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who is silent for long, and has no liveliness token, keeps its counts and is not stale; it may come back."""
+    exporter = Exporter(bus, nedbus.Selection(), version="0")
+    stop = threading.Event()
+    reading = threading.Thread(target=exporter.run, args=[stop])
+    reading.start()
+    try:
+        with (
+            nedbus.connect(endpoint) as other,
+            other.publisher(VLP, vehicle="here") as here,
+            other.publisher(VLP, vehicle="gone") as gone,
+        ):
+            for publisher in (here, gone):
+                for number in (1, 2, 3):
+                    publisher.publish(message(10_000 * number, **VALID))
+            wait_for(lambda: ages(exporter.pages["/metrics"]()) == {"here", "gone"}, what="both")
+            gone.close()
+            wait_for(lambda: "gone" not in bus.vehicles(), what="the end of its token")
+            assert ages(exporter.pages["/metrics"]()) == {"here", "gone"}
+            monkeypatch.setattr(families, "SWITCHED_OFF", 0.0)
+            assert ages(exporter.pages["/metrics"]()) == {"here"}
+            counted = f'nedbus_messages_received_total{{source="",topic="{VLP}",vehicle="gone"}}'
+            assert counted in exporter.pages["/metrics"]().content.decode()
+            with other.publisher(VLP, vehicle="gone"):
+                wait_for(lambda: ages(exporter.pages["/metrics"]()) == {"here", "gone"}, what="it to come back")
+    finally:
+        stop.set()
+        reading.join()
+
+
+def test_vehicle_of_a_service_that_was_switched_off_has_no_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A live source that has withdrawn a stream long ago has only its counts; one that is just stale has its age."""
+    status = SourceStatus(
+        "px4-zenoh:", "running", (f"on/{VLP}",), (f"off/{VLP}",), *(0, 0, {}, 0, 0, 0, None, 0, "", (), None, ())
+    )
+    health = streams(1)[0].health
+    both = tuple(StreamStatus(f"{vehicle}/{VLP}", health) for vehicle in ("on", "off"))
+    measures = SourceMeasures(status, both, Histogram((1.0,)))
+    assert [stream.active for stream in _streams("px4-zenoh:", measures)] == [True, True]
+    monkeypatch.setattr(families, "SWITCHED_OFF", 0.0)
+    assert [stream.active for stream in _streams("px4-zenoh:", measures)] == [True, False]
+
+
+def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page of a thousand streams is asked for every few seconds: nothing is computed twice for it."""
+    daemon = Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0")
+    running = threading.Thread(target=daemon.run)
+    running.start()
+    try:
+        wait_for(lambda: [len(source.streams) for source in daemon.measures] == [5], what="a message of each stream")
+        looks: list[StreamHealth] = []
+        original = StreamHealth.snapshot
+
+        def look(stream: StreamHealth, now: int) -> Health:
+            looks.append(stream)
+            return original(stream, now)
+
+        monkeypatch.setattr(StreamHealth, "snapshot", look)
+        assert service_pages(daemon)["/metrics"]().status == 200
+        assert len(looks) == len(set(looks)) == 5
+    finally:
+        daemon.stop()
+        running.join()
 
 
 def test_stream_that_has_ended_has_no_age() -> None:

@@ -28,7 +28,12 @@ def test_reports_arrive_with_their_reason(endpoint: str) -> None:
         queries = QueryServer(service._session)
         PublisherRegistry(service._session, queries, prefix="nedbus").reject(ADDRESS, {"reason": "x is NaN"})
         reports: list[RejectionReport] = []
-        wait_for(lambda: reports.extend(rejections.take()) or reports, what="the report")
+
+        def has_come() -> bool:
+            reports.extend(rejections.take())
+            return bool(reports)
+
+        wait_for(has_come, what="the report")
         assert [(report.address, report.reason) for report in reports] == [(ADDRESS, "x is NaN")]
         assert rejections.take() == []
         rejections.close()

@@ -15,9 +15,11 @@ import pytest
 
 from nedbus.cli.systemd import Notifier, NotifySocket, watchdog_interval
 from nedbus.daemon import Daemon
+from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.transport import open_router
 from tests.conftest import DEADLINE, Start, free_endpoint, wait_for
+from tests.prometheus import free_port
 
 Datagram = dict[str, str]
 
@@ -74,7 +76,12 @@ def running(daemon: Daemon) -> Iterator[None]:
 
 def simulation(*, listen: str | None = None, connect: str | None = None) -> Daemon:
     """Return a daemon that simulates a vehicle."""
-    settings = load_settings(source=("sim:",), listen=listen and (listen,), connect=connect and (connect,))
+    return publishing("sim:", listen=listen, connect=connect)
+
+
+def publishing(source: str, *, listen: str | None = None, connect: str | None = None) -> Daemon:
+    """Return a daemon with one source."""
+    settings = load_settings(source=(source,), listen=listen and (listen,), connect=connect and (connect,))
     return Daemon(settings, version="0")
 
 
@@ -167,6 +174,82 @@ def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
         assert not any("WATCHDOG" in datagram for datagram in stuck)
         notifier.tick()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
+
+
+@contextmanager
+def ticking(notifier: Notifier) -> Iterator[None]:
+    """Call `tick` again and again, as the main thread of a service does."""
+    end = threading.Event()
+
+    def run() -> None:
+        while not end.wait(0.01):
+            notifier.tick()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join(DEADLINE)
+
+
+@contextmanager
+def blocking(monkeypatch: pytest.MonkeyPatch, method: str) -> Iterator[threading.Event]:
+    """Let the sources of this process block in a method of their output; yield what is set as soon as one does."""
+    entered, released = threading.Event(), threading.Event()
+    original = getattr(SourceOutput, method)
+
+    def block(output: SourceOutput, *arguments: object) -> object:
+        entered.set()
+        released.wait(DEADLINE)
+        return original(output, *arguments)
+
+    monkeypatch.setattr(SourceOutput, method, block)
+    try:
+        yield entered
+    finally:
+        released.set()
+
+
+@pytest.mark.parametrize(
+    ("source", "method"),
+    [("sim:", "publish"), (f"mavlink:udpin:127.0.0.1:{free_port()}", "expire_stale")],
+    ids=["replay", "live"],
+)
+def test_no_watchdog_while_a_source_is_stuck(
+    systemd: Systemd, monkeypatch: pytest.MonkeyPatch, source: str, method: str
+) -> None:
+    """While the loop of a source does not go round there is no ping, though all other threads work; then there is."""
+    limit = 0.3  # s; a live source goes round every 0.25 s
+    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": str(round(2e6 * limit))}
+    daemon = publishing(source, listen=free_endpoint())
+    with running(daemon), Notifier(daemon, environment=environment) as notifier, ticking(notifier):
+        with blocking(monkeypatch, method) as entered:
+            systemd.receive_until(is_ready)
+            wait_for(entered.is_set, what="the source to block")
+            wait_for(lambda: daemon.busy > limit, what="the limit")
+            with notifier.reloading():
+                systemd.receive_until(lambda datagram: "RELOADING" in datagram)
+            wait_for(lambda: daemon.busy > 7 * limit, what="several limits")
+            with notifier.reloading():
+                stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
+            # One may have been on its way at the first reload.
+            assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
+        systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
+
+
+def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
+    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
+    daemon = publishing("sim:?speed=max&duration=1", listen=free_endpoint())
+    with running(daemon), Notifier(daemon, environment=environment) as notifier, ticking(notifier):  # noqa: SIM117
+        with blocking(monkeypatch, "publish") as entered:
+            wait_for(entered.is_set, what="the source to wait")
+            systemd.receive_until(is_ready)
+            for _ in range(10):
+                systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
+            assert daemon.busy == 0
 
 
 @pytest.mark.parametrize(

@@ -75,8 +75,9 @@ class Notifier:
     Sources that do not speak yet do not delay it; the text of the status names them.
     A client whose router does not answer counts as started after `patience` [s].
 
-    WATCHDOG is sent from a thread, which asks Zenoh for its sessions each time, and only when `tick` was called since
-    the last time: a thread, so that the main thread reacts to signals while Zenoh blocks.
+    WATCHDOG proves that all of it works: Zenoh answers how many sessions there are, the main thread has called `tick`
+    since the last time, and the loop of no source has been at one message for half of what systemd waits.
+    It is sent from a thread of its own, so that the main thread reacts to signals while Zenoh blocks.
     """
 
     def __init__(
@@ -145,12 +146,15 @@ class Notifier:
             if begins or now - self._told >= _STATUS_INTERVAL:
                 self._told = now
                 self._tell(to_text(self._status(now), MAX_TEXT), begins=begins)
-            if self._feeding is not None and self._ticked and now - self._fed >= self._feeding:
+            if self._feeding is not None and now - self._fed >= self._feeding and self._works(self._feeding):
                 self._fed, self._ticked = now, False
                 self._socket.send(WATCHDOG=1)
             pause = _STATUS_INTERVAL if self._is_ready else _START_INTERVAL
             if self._stop.wait(pause if self._feeding is None else min(pause, self._feeding / 2)):
                 return
+
+    def _works(self, limit: float) -> bool:
+        return self._ticked and self._daemon.busy < limit
 
     def _tell(self, text: str, *, begins: bool) -> None:
         with self._lock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import logging
 import os
 import socket
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,14 +13,16 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from nedbus.errors import ConfigError, NedbusError, SourceError
-from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source
+from nedbus.log_event import about
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
 from nedbus.sources import LiveSource
 from nedbus.transport import Certificate, read_router_config
 
 from .plan import plan_sources
 
+_log = logging.getLogger(__name__)
+
 _PATIENCE: Final = 2.0  # s for an endpoint to answer
-_SOON: Final = 30.0  # days before its end that a certificate should be renewed
 _STREAMS: Final = frozenset({"tcp", "tls", "ws"})  # protocols whose endpoints can be tried by connecting
 
 
@@ -49,7 +52,11 @@ def check_router_file(path: Path, *, offline: bool = False) -> list[ConfigError]
             found.append((str(file), f"{name}: {file} cannot be read: does it exist, and may this user read it?"))
         elif name.endswith("_certificate") and (reason := _judge_certificate(file)):
             found.append((str(file), f"{name}: {reason}"))
-    return [ConfigError.in_file(path, reason, **_place(text, endpoint)) for endpoint, reason in found]
+    places = [place_at(text, text.find(value)) for value, _ in found]
+    return [
+        ConfigError.in_file(path, reason, line=line, column=column)
+        for (_, reason), (line, column) in zip(found, places, strict=True)
+    ]
 
 
 def _check_settings(settings: Settings, *, offline: bool) -> Iterator[ConfigError]:
@@ -78,14 +85,18 @@ def _check_settings(settings: Settings, *, offline: bool) -> Iterator[ConfigErro
 
 
 def _judge_certificate(path: str | Path) -> str | None:
-    """Return what is wrong with a certificate: it has expired, or will within 30 days; None if nothing is."""
+    """Return what is wrong with a certificate: it has expired, or is to be renewed; None if nothing is."""
+    now = dt.datetime.now(dt.UTC)
     try:
         certificate = Certificate.read(path)
+    except ConfigError as exc:  # what is not installed is no mistake in the settings
+        _log.warning("%s is not checked for when it expires: %s", path, exc, extra=about("notice"))
+        return None
     except (ValueError, OSError) as exc:
         return f"{path} cannot be read as a certificate: {exc}"
-    days = certificate.days_left(dt.datetime.now(dt.UTC))
-    if days > _SOON:
+    if not certificate.is_due(now):
         return None
+    days = certificate.days_left(now)
     when = "has expired" if days < 0 else f"expires in {days:.0f} days"
     return f"{path} {when} ({certificate.ends:%Y-%m-%d}): 'nedbus pki renew' makes a new one"
 
@@ -107,46 +118,43 @@ def _check_tls(settings: Settings) -> Iterator[ConfigError]:
 def _try_connect(endpoints: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Yield each endpoint that does not answer, and why; those of UDP and QUIC only by name."""
     for endpoint in endpoints:
-        protocol, host, port = _split(endpoint)
         try:
+            protocol, host, port = _split(endpoint)
             if protocol in _STREAMS:
                 socket.create_connection((host, port), _PATIENCE).close()
             elif host:
                 socket.getaddrinfo(host, port)
-        except socket.gaierror:
+        except (socket.gaierror, UnicodeError):  # the latter for a name with an empty part, such as a..b
             yield endpoint, f"{endpoint}: this host finds no address of {host}"
         except OSError as exc:
             yield endpoint, f"{endpoint}: nothing answers ({(exc.strerror or str(exc)).lower()})"
+        except ValueError as exc:
+            yield endpoint, f"{endpoint} is not an endpoint: {str(exc).lower()}"
 
 
 def _try_listen(endpoints: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Yield each endpoint whose address is none of this host; a port may be taken by what is to be replaced."""
     for endpoint in endpoints:
-        _, host, _ = _split(endpoint)
-        if not host:
-            continue
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            with socket.socket(family) as probe:
-                probe.bind((host, 0))
+            _, host, _ = _split(endpoint)
+            if host:
+                with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+                    probe.bind((host, 0))
+        except UnicodeError:
+            yield endpoint, f"{endpoint}: {host} is no address of this host"
         except OSError as exc:
             yield endpoint, f"{endpoint}: {host} is no address of this host ({(exc.strerror or str(exc)).lower()})"
+        except ValueError as exc:
+            yield endpoint, f"{endpoint} is not an endpoint: {str(exc).lower()}"
 
 
 def _split(endpoint: str) -> tuple[str, str, int]:
-    """Return protocol, host and port; no host for a socket file."""
+    """Return protocol, host and port; no host for a socket file. Raises ValueError for what is no endpoint."""
     protocol, _, rest = endpoint.partition("/")
     if protocol == "unixsock-stream":
         return protocol, "", 0
     parts = urlsplit(f"//{rest.partition('#')[0].partition('?')[0]}")
     return protocol, parts.hostname or "", parts.port or 0
-
-
-def _place(text: str, value: str) -> dict[str, int]:
-    start = text.find(value)
-    if start < 0:
-        return {}
-    return {"line": text.count("\n", 0, start) + 1, "column": start - text.rfind("\n", 0, start)}
 
 
 def describe_mistakes(mistakes: Iterable[NedbusError]) -> list[str]:

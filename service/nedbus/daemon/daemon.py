@@ -40,8 +40,8 @@ class Daemon:
 
     def __init__(self, settings: Settings, *, version: str) -> None:
         self._settings = settings
-        self._version = version
-        self._started = time.time()
+        self.version = version
+        self.started = time.time()
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: Workers | None = None
@@ -66,8 +66,8 @@ class Daemon:
         return ServiceStatus(
             service=self.id,
             host=socket.gethostname(),
-            version=self._version,
-            started=self._started,
+            version=self.version,
+            started=self.started,
             now=time.time(),
             role=self.role,
             endpoints=self.endpoints,
@@ -83,6 +83,11 @@ class Daemon:
     def measures(self) -> list[SourceMeasures]:
         """What is measured of each source, for metrics."""
         return [worker.measures for worker in self._list_workers()]
+
+    @property
+    def busy(self) -> float:
+        """For how long the loop of a source has not gone round, of the slowest one [s]: for a watchdog."""
+        return max((worker.busy for worker in self._list_workers()), default=0.0)
 
     @property
     def sessions(self) -> int:

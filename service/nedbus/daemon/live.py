@@ -22,12 +22,13 @@ def listen(
     *,
     router: Session | None,
     on_state: Callable[[State], object],
+    on_turn: Callable[[], object],
     clock: Clock,
 ) -> None:
     """Publish what a live source delivers until it ends or the service is stopped.
 
     `on_state` is called with "waiting" once the source listens and when all streams are stale, with "running" when a
-    message arrives.
+    message arrives; `on_turn` for each message, and several times a second without any: the loop goes round.
 
     Raises SourceError when the source cannot be opened, or fails.
     """
@@ -36,6 +37,7 @@ def listen(
         closing.callback(getattr(items, "close", lambda: None))
         next_poll = float("-inf")
         for number, item in enumerate(items):
+            on_turn()
             if not number:
                 on_state("waiting")
             if clock.stopped:

@@ -16,7 +16,7 @@ from .clock import Clock
 from .live import listen
 from .output import SourceOutput
 from .replay import replay
-from .status import SourceMeasures, SourceStatus, State
+from .status import SourceMeasures, SourceStatus, State, StreamStatus
 
 _log = logging.getLogger(__name__)
 
@@ -57,10 +57,27 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
+        self._is_paced = isinstance(source, LiveSource) or source.speed is not None  # else it waits for its readers
+        self._turn: float | None = None  # since when the loop is at one message; None while it may take any time
+
+    @property
+    def busy(self) -> float:
+        """For how long its loop has not gone round [s]; 0 while it opens a source, or waits for what is due."""
+        since = self._turn
+        return 0.0 if since is None else self._clock.now() - since
 
     @property
     def status(self) -> SourceStatus:
         """The status of the source now."""
+        return self._status(self._output.streams(_MAX_STREAMS))
+
+    @property
+    def measures(self) -> SourceMeasures:
+        """What is measured of the source, for metrics."""
+        streams = self._output.streams()
+        return SourceMeasures(self._status(streams[:_MAX_STREAMS]), streams, self._output.durations)
+
+    def _status(self, streams: tuple[StreamStatus, ...]) -> SourceStatus:
         run, output = self._run, self._output
         return SourceStatus(
             source=self.text,
@@ -78,13 +95,8 @@ class Worker:
             summary=run.summary if run else "",
             warnings=run.warnings if run else output.warnings,
             error=self._error,
-            streams=output.streams(_MAX_STREAMS),
+            streams=streams,
         )
-
-    @property
-    def measures(self) -> SourceMeasures:
-        """What is measured of the source, for metrics."""
-        return SourceMeasures(self.status, self._output.streams(), self._output.durations)
 
     def run(self) -> None:
         """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""
@@ -133,10 +145,20 @@ class Worker:
             failures += 1
 
     def _run_once(self) -> None:
-        if isinstance(self.source, LiveSource):
-            listen(self.source, self._output, router=self._router, on_state=self._set_state, clock=self._clock)
-        else:
-            self._run_replay(self.source)
+        try:
+            if isinstance(self.source, LiveSource):
+                listen(
+                    self.source,
+                    self._output,
+                    router=self._router,
+                    on_state=self._set_state,
+                    on_turn=self._note_turn,
+                    clock=self._clock,
+                )
+            else:
+                self._run_replay(self.source)
+        finally:
+            self._turn = None
 
     def _run_replay(self, source: ReplaySource) -> None:
         run = source.open()
@@ -154,8 +176,14 @@ class Worker:
         replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
         self._error = run.damage
 
+    def _note_turn(self) -> None:
+        self._turn = self._clock.now()
+
     def _publish(self, message: SourceMessage) -> None:
+        if self._is_paced:
+            self._note_turn()
         self._output.publish(message)
+        self._turn = None
         self._done += 1
 
     def _wait_for_reader(self, run: ReplayRun) -> None:

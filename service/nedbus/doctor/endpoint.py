@@ -10,13 +10,13 @@ from contextlib import suppress
 from typing import Final
 
 from nedbus.errors import NedbusError
-from nedbus.transport import Tls, open_client
+from nedbus.transport import Certificate, Tls, open_client
 
-from .finding import Finding
+from .finding import Finding, brief
 from .handshake import look_at, verify
 from .parallel import within
 from .speaker import identify
-from .validity import judge_validity
+from .validity import explain_unread, judge_validity
 
 _ENDPOINT: Final = re.compile(r"(tcp|tls|udp|ws|quic)/(\S+):(\d+)(?:[?#]\S*)?")
 _RESOLVE: Final = 2.0  # s
@@ -141,21 +141,28 @@ def _check_tls(endpoint: str, host: str, port: int, tls: Tls | None) -> Iterator
             return
         yield _explain_no_tls(endpoint, host, port)
         return
-    certificate = shown.certificate
-    yield judge_validity("tls", endpoint, "the router shows", certificate, dt.datetime.now(dt.UTC))
+    certificate = None
+    try:
+        certificate = Certificate.decode(shown.certificate)
+    except ValueError as exc:
+        judged = explain_unread("tls", endpoint, exc)
+    else:
+        judged = judge_validity("tls", endpoint, "the router shows", certificate, dt.datetime.now(dt.UTC))
+    yield judged
     if tls is None:
         advice = "give the certificate of the authority with --tls-ca or NEDBUS_TLS_CA"
         yield Finding("tls", endpoint, "wrong", "no authority is given that could vouch for the router", advice)
         return
     reason = verify(host, port, tls)
     if reason == "host":
-        names = ", ".join(certificate.hosts[:8]) or "no host at all"
-        advice = f"connect by one of these, or make a certificate with --host {host}: 'nedbus pki cert'"
-        yield Finding("tls", endpoint, "wrong", f"the router's certificate is not for {host}, but for {names}", advice)
+        names = f", but for {', '.join(certificate.hosts[:8]) or 'no host at all'}" if certificate else ""
+        advice = f"connect by a host of it, or make a certificate with --host {host}: 'nedbus pki cert'"
+        yield Finding("tls", endpoint, "wrong", f"the router's certificate is not for {host}{names}", advice)
     elif reason == "other":
-        seen = f"the router's certificate is not signed by the authority in {tls.ca}, but by {certificate.issuer}"
-        yield Finding("tls", endpoint, "wrong", seen, "give that authority as --tls-ca, or ask whose router it is")
-    elif reason and reason not in {"expired", "early"}:
+        issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
+        seen = f"the router's certificate is not signed by the authority in {tls.ca}{issuer}"
+        yield Finding("tls", endpoint, "wrong", seen, "give its authority as --tls-ca, or ask whose router it is")
+    elif reason and judged.state != "wrong":  # not what is said of it already
         yield Finding("tls", endpoint, "wrong", f"the router's certificate cannot be trusted: {reason}")
     if shown.rejection:
         advice = "give --tls-certificate and --tls-key of a certificate that the router's authority has signed"

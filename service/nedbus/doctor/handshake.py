@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from nedbus.transport import Certificate, Tls
+from nedbus.transport import Tls
 
 _TIMEOUT: Final = 1.5  # s of a handshake
 _VERDICT: Final = 0.5  # s in which a router that rejects our certificate says so; one that accepts says nothing
@@ -23,13 +23,17 @@ _ALERTS: Final = {  # reasons of OpenSSL, by a part of their names
     "DECRYPT_ERROR": "it rejects the certificate of this client",
     "ACCESS_DENIED": "it rejects the certificate of this client",
 }
+_REASONS: Final = {  # of OpenSSL's codes
+    **dict.fromkeys((7, 18, 19, 20, 21), "other"),
+    **dict.fromkeys((62, 64), "host"),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What a server showed: its certificate (None if it spoke no TLS), and what it says of ours ("" if nothing)."""
+    """What a server showed: its certificate in DER, None if it spoke no TLS; what it says of ours, "" if nothing."""
 
-    certificate: Certificate | None
+    certificate: bytes | None
     rejection: str = ""
 
 
@@ -47,11 +51,7 @@ def look_at(host: str, port: int, tls: Tls | None) -> Shown:
         except (ssl.SSLError, OSError) as exc:
             return Shown(None, _alert(exc))
         with connection:
-            der = connection.getpeercert(binary_form=True)
-            try:
-                certificate = Certificate.parse(der or b"")
-            except ValueError:
-                certificate = None
+            certificate = connection.getpeercert(binary_form=True)
             connection.settimeout(_VERDICT)
             try:
                 connection.recv(1)  # with TLS 1.3 the verdict comes after the handshake
@@ -64,6 +64,8 @@ def look_at(host: str, port: int, tls: Tls | None) -> Shown:
 
 def verify(host: str, port: int, tls: Tls) -> str:
     """Shake hands as a client does, and return why the server's certificate is not to be trusted, "" if it is.
+
+    `other`: of another authority; `host`: for other hosts; else what OpenSSL says.
 
     Raises OSError when it cannot be reached.
     """
@@ -79,9 +81,7 @@ def verify(host: str, port: int, tls: Tls) -> str:
             with context.wrap_socket(plain, server_hostname=host):
                 return ""
         except ssl.SSLCertVerificationError as exc:
-            return {18: "other", 19: "other", 20: "other", 21: "other", 7: "other", 9: "early", 10: "expired"}.get(
-                exc.verify_code, "host" if exc.verify_code in {62, 64} else exc.verify_message
-            )
+            return _REASONS.get(exc.verify_code, exc.verify_message)
         except (ssl.SSLError, OSError):
             return ""
 

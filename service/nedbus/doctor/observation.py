@@ -33,6 +33,7 @@ _LEAST: Final = 1.0  # s of them after all questions, for what is measured at it
 _TICK: Final = 0.02  # s until what arrived is looked at: it makes a message look that much older
 _TIMEOUT: Final = 1.0  # s of a query
 _MAX_ANSWER: Final = 2**18  # bytes of a status that is read
+_MAX_TIME: Final = 1e11  # s since the epoch that a service may say it is
 _CLOCKS: Final = 2.0  # s after which no further service is asked for its clock
 _MAX_SERVICES: Final = 20  # that are looked at: any peer may claim to be a service
 
@@ -141,7 +142,7 @@ def _with_clock(session: Session, service: Service) -> Service:
     answer = next(map(_service, query(session, service.key, timeout=_TIMEOUT)), None)
     after = time.time()
     now = answer.status.get("now") if answer is not None else None
-    if answer is None or not isinstance(now, int | float):
+    if answer is None or not isinstance(now, int | float) or not abs(now) < _MAX_TIME:  # nor is NaN
         return service
     return Service(service.key, answer.status, now - (before + after) / 2, (after - before) / 2)
 

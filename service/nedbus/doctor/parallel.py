@@ -47,19 +47,20 @@ def run_together(checks: Mapping[str, Check], seconds: float) -> list[Finding]:
 
 def within(seconds: float, function: Callable[[], T]) -> T:
     """Return what a function returns that has no timeout of its own; raise TimeoutError, or what it raises."""
-    outcome: list[T | OSError] = []
+    outcome: list[T] = []
+    errors: list[Exception] = []
 
     def run() -> None:
         try:
             outcome.append(function())
-        except OSError as exc:
-            outcome.append(exc)
+        except Exception as exc:  # noqa: BLE001 - raised again below, in the caller's thread
+            errors.append(exc)
 
     thread = threading.Thread(target=run, name="nedbus-within", daemon=True)
     thread.start()
     thread.join(seconds)
+    if errors:
+        raise errors[0]
     if not outcome:
         raise TimeoutError
-    if isinstance(outcome[0], OSError):
-        raise outcome[0]
     return outcome[0]

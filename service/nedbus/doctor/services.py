@@ -47,7 +47,7 @@ def has_source(seen: Observation, kind: str) -> bool:
 
 
 def _source(source: Mapping[str, object]) -> Iterator[Finding]:
-    name, state = brief(source.get("source")), source.get("state")
+    name, state = brief(source.get("source")), str(source.get("state"))
     error = str(source.get("error") or "it does not say why")[:_MAX_REASON]
     if state in {"failed", "retrying"}:
         ends = "it has ended" if state == "failed" else "it is tried again"

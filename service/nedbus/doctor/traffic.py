@@ -45,8 +45,11 @@ class Traffic:
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
 
     def take(self) -> None:
-        """Look at what has arrived by now; its age is that of this moment."""
-        while (sample := self._handler.try_recv()) is not None:
+        """Look at what has arrived by now, and at no more than the ring holds; its age is that of this moment."""
+        for _ in range(_RING):
+            sample = self._handler.try_recv()
+            if sample is None:
+                return
             self._add(sample, time.time())
 
     def close(self) -> None:

@@ -11,8 +11,14 @@ from nedbus.transport import Certificate, Tls
 
 from .finding import Finding, brief
 
-_SOON: Final = 30.0  # days
 _RENEW: Final = "renew it: 'nedbus pki', docs/security.md"
+
+
+def explain_unread(check: str, subject: str, error: Exception) -> Finding:
+    """Return why a certificate cannot be read: it is damaged, or the package that reads it is missing."""
+    if isinstance(error, ConfigError):
+        return Finding(check, subject, "unknown", "whose certificate it is, and until when, is not read", error.reason)
+    return Finding(check, subject, "unknown", f"cannot be read as a certificate: {error}")
 
 
 def judge_validity(check: str, subject: str, whose: str, certificate: Certificate, now: dt.datetime) -> Finding:
@@ -26,7 +32,7 @@ def judge_validity(check: str, subject: str, whose: str, certificate: Certificat
         advice = f"is the clock of this host right? it says {now:%Y-%m-%d %H:%M} UTC"
         return Finding(check, subject, "wrong", f"{seen}, which is not valid yet", advice)
     seen = f"{whose} {brief(certificate)}"
-    if days <= _SOON:
+    if certificate.is_due(now):
         return Finding(check, subject, "warning", f"{seen}, {days:.0f} days from now", _RENEW)
     return Finding(check, subject, "ok", seen)
 
@@ -45,7 +51,7 @@ def check_own_files(tls: Tls) -> Iterator[Finding]:
         try:
             yield judge_validity("certificate", str(path), whose, Certificate.read(path), now)
         except (ValueError, OSError) as exc:
-            yield Finding("certificate", str(path), "unknown", f"cannot be read as a certificate: {exc}")
+            yield explain_unread("certificate", str(path), exc)
     reason = tls.explain()
     if reason is not None and "expired" not in reason:
         advice = "give a certificate that the same authority has signed as the router's"

@@ -8,30 +8,35 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from typing import Final
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from nedbus.client import Bus, Monitor
-from nedbus.errors import NoDataError
-from nedbus_msgs import Address, Selection
+from nedbus.client import Bus, Health, Monitor, Sample
+from nedbus_msgs import Address, Row, Selection
 
 from .exposition import build_info, metrics_page
-from .families import MAX_STREAMS, Stream, stream_families
+from .families import MAX_STREAMS, Stream, is_switched_off, stream_families
 from .http_server import Page
 
 _RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
-_POLL: Final = 0.5  # s
 
 
 class Exporter(Collector):
-    """Read all that a selection matches, and make pages of what was seen."""
+    """Read all that a selection matches, and make pages of what was seen; `watch` gets each sample as well."""
 
-    def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        selection: Selection,
+        *,
+        version: str,
+        watch: Callable[[Sample[Row]], object] = lambda _: None,
+    ) -> None:
         self._bus = bus
+        self._watch = watch
         self._version = version
         self._subscription = bus.subscribe(
             selection.topic, vehicle=selection.vehicle, instance=selection.instance, mode="every"
@@ -42,13 +47,17 @@ class Exporter(Collector):
 
     def run(self, stop: threading.Event) -> None:
         """Read until `stop` is set."""
-        while not stop.is_set():
-            with suppress(NoDataError):
-                sample = self._subscription.receive(_POLL)
-                with self._lock:
-                    self._monitor.add(sample)
-                    if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
-                        self._sources[sample.address] = sample.source or ""
+        reader = threading.Thread(target=self._read, name="nedbus-export", daemon=True)
+        reader.start()
+        stop.wait()
+        self._subscription.close()
+        reader.join()
+
+    @property
+    def healths(self) -> dict[Address, Health]:
+        """The health of each stream."""
+        with self._lock:
+            return self._monitor.snapshot()
 
     @property
     def pages(self) -> Mapping[str, Callable[[], Page]]:
@@ -77,18 +86,30 @@ class Exporter(Collector):
     def _streams(self) -> list[Stream]:
         """Return all streams, those that were seen first first: which ones have labels of their own does not change."""
         with self._lock:
-            return [
-                Stream(
-                    address.vehicle,
-                    str(address).partition("/")[2],
-                    self._sources.get(address, ""),
-                    health,
-                    latencies=self._monitor.latencies(address),
-                )
-                for address, health in sorted(
-                    self._monitor.snapshot().items(), key=lambda item: item[0] not in self._sources
-                )
-            ]
+            healths = sorted(self._monitor.snapshot().items(), key=lambda item: item[0] not in self._sources)
+            latencies = {address: self._monitor.latencies(address) for address, _ in healths}
+        silent = {address for address, health in healths if is_switched_off(health)}
+        if silent:  # asking may wait for the router, and the reader must not
+            silent.difference_update(*self._bus.vehicles().values())
+        return [
+            Stream(
+                address.vehicle,
+                str(address).partition("/")[2],
+                self._sources.get(address, ""),
+                health,
+                active=address not in silent,
+                latencies=latencies[address],
+            )
+            for address, health in healths
+        ]
+
+    def _read(self) -> None:
+        for sample in self._subscription.rows():
+            with self._lock:
+                self._monitor.add(sample)
+                if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
+                    self._sources[sample.address] = sample.source or ""
+            self._watch(sample)
 
     def _ready(self) -> Page:
         if self._bus.connected:

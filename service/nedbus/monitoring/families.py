@@ -18,6 +18,9 @@ from nedbus.client import Health, Histogram
 MAX_STREAMS: Final = 1000
 """Streams with labels of their own; what the rest counts is added up as vehicle "other", topic "other"."""
 
+SWITCHED_OFF: Final = 3600.0
+"""Seconds of silence after which a stream that nobody publishes any more is not active."""
+
 _OTHER: Final = ("other", "other")
 _STREAM: Final = ("vehicle", "topic", "source")
 _COUNTS: Final = {
@@ -36,7 +39,10 @@ _MEASURES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One stream as it is measured; `active` unless its source has ended: then it has counts, and no age or rate."""
+    """One stream as it is measured.
+
+    `active` unless its source has ended, or its vehicle was switched off: then it has counts, and no age or rate.
+    """
 
     vehicle: str
     topic: str
@@ -44,6 +50,11 @@ class Stream:
     health: Health
     active: bool = True
     latencies: Histogram | None = None
+
+
+def is_switched_off(health: Health) -> bool:
+    """Return whether a stream that nobody publishes any more has been silent for so long that nobody expects it."""
+    return health.age is not None and health.age >= SWITCHED_OFF
 
 
 def stream_families(streams: Sequence[Stream], *, messages: tuple[str, str]) -> Iterator[Metric]:

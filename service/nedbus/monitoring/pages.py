@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
@@ -12,12 +13,14 @@ from nedbus.extras import needs
 
 from .http_server import Page
 
+_STUCK: Final = 20.0  # s that no message takes
+
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
     """Return the pages of a daemon by path."""
     return {
         "/metrics": lambda: _metrics(daemon),
-        "/healthz": lambda: Page.text("ok"),
+        "/healthz": lambda: _health(daemon),
         "/readyz": lambda: _ready(daemon),
         "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
     }
@@ -36,6 +39,13 @@ def why_not_ready(daemon: Daemon) -> list[str]:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
     return reasons
+
+
+def _health(daemon: Daemon) -> Page:
+    stuck = daemon.busy
+    if stuck < _STUCK:
+        return Page.text("ok")
+    return Page.text(f"a source has been at one message for {stuck:.0f} s", status=503)
 
 
 def _ready(daemon: Daemon) -> Page:

@@ -5,18 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 
-from prometheus_client.core import (
-    CounterMetricFamily,
-    GaugeMetricFamily,
-    HistogramMetricFamily,
-    Metric,
-)
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from nedbus.daemon import STATES, Daemon, SourceMeasures
 
 from .exposition import build_info
-from .families import Stream, histogram, stream_families
+from .families import Stream, histogram, is_switched_off, stream_families
 
 _PUBLISHED = "nedbus_messages_published", "Messages that were validated and published"
 
@@ -34,13 +29,13 @@ class ServiceCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
         daemon = self._daemon
-        status, sources = daemon.status, _with_names(daemon.measures)
-        yield build_info(status.version)
-        yield GaugeMetricFamily("nedbus_start_time_seconds", "When the service started", value=status.started)
+        sources = _with_names(daemon.measures)
+        yield build_info(daemon.version)
+        yield GaugeMetricFamily("nedbus_start_time_seconds", "When the service started", value=daemon.started)
         sessions = GaugeMetricFamily(
             "nedbus_sessions", "Zenoh sessions at the embedded router, or routers of a client", labels=["role"]
         )
-        sessions.add_metric([status.role], daemon.sessions)
+        sessions.add_metric([daemon.role], daemon.sessions)
         yield sessions
         streams = [stream for name, source in sources for stream in _streams(name, source)]
         yield from stream_families(streams, messages=_PUBLISHED)
@@ -60,9 +55,11 @@ def _with_names(sources: Iterable[SourceMeasures]) -> list[tuple[str, SourceMeas
 
 def _streams(name: str, measures: SourceMeasures) -> Iterator[Stream]:
     status = measures.status
+    stale = frozenset(status.stale)
     for stream in measures.streams:
         vehicle, _, topic = stream.address.partition("/")
-        yield Stream(vehicle, topic, name, stream.health, active=not status.ended)
+        gone = status.ended or (stream.address in stale and is_switched_off(stream.health))
+        yield Stream(vehicle, topic, name, stream.health, active=not gone)
 
 
 def _source_families(sources: Iterable[tuple[str, SourceMeasures]]) -> Iterator[Metric]:

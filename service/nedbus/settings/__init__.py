@@ -2,5 +2,6 @@
 
 from .load import find_mistakes, load_settings, locate_setting, locate_source
 from .model import Settings, split_http
+from .toml_file import place_at
 
-__all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source", "split_http"]
+__all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source", "place_at", "split_http"]

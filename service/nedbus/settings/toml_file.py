@@ -41,7 +41,7 @@ def find_key(text: str, name: str) -> Place:
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
     if found is None:
         return None, None
-    return _place(text, found.start(1))
+    return place_at(text, found.start(1))
 
 
 def find_source(text: str, index: int, source: object, key: str = "") -> Place:
@@ -51,10 +51,13 @@ def find_source(text: str, index: int, source: object, key: str = "") -> Place:
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
         option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
-        return _place(text, start + option.start(1) if option else start)
+        return place_at(text, start + option.start(1) if option else start)
     found = text.find(source) if isinstance(source, str) else -1
-    return find_key(text, "source") if found < 0 else _place(text, found)
+    return find_key(text, "source") if found < 0 else place_at(text, found)
 
 
-def _place(text: str, start: int) -> Place:
+def place_at(text: str, start: int) -> Place:
+    """Return line and column of an index into a text; not known for a negative one, as of `str.find`."""
+    if start < 0:
+        return None, None
     return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

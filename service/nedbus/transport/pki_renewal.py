@@ -15,9 +15,10 @@ from cryptography.x509.oid import NameOID
 from nedbus.errors import PkiError
 from nedbus.whole_file import whole_file
 
+from .certificate import RENEW_WITHIN, Certificate
 from .pki import CA_DAYS, DAYS, Authority, new_key, sign_authority, write_certificate, write_pair
 
-RENEW_WITHIN: Final = 30  # days before its end in which a certificate is due
+__all__ = ["RENEW_WITHIN", "CertificateEntry", "decode_certificate", "list_certificates", "renew_certificate"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +82,31 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
     return _replace(entry.path, authority.sign(entry.name, public_key, hosts=entry.hosts, days=days or DAYS))
 
 
+def decode_certificate(data: bytes, *, pem: bool) -> Certificate:
+    """Decode a certificate that comes from anybody, in DER or PEM; raise ValueError for anything else."""
+    try:
+        found = x509.load_pem_x509_certificate(data) if pem else x509.load_der_x509_certificate(data)
+        return Certificate(
+            _common_name(found.subject) or "nobody",
+            _common_name(found.issuer) or "nobody",
+            _hosts(found),
+            found.not_valid_before_utc,
+            found.not_valid_after_utc,
+        )
+    except (x509.InvalidVersion, x509.DuplicateExtension, x509.UnsupportedGeneralNameType) as exc:
+        raise ValueError(str(exc)) from exc
+
+
 _FOREIGN: Final = "signed by another authority"
 _UNFIT: Final = "not of the key beside it"
 
 
 def _describe(path: Path, certificate: x509.Certificate, authority: x509.Certificate) -> CertificateEntry:
-    names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     hosts = _hosts(certificate)
     is_authority = path.name == "ca.crt"
     return CertificateEntry(
         path,
-        path.stem if is_authority or not names else str(names[0].value),
+        path.stem if is_authority else _common_name(certificate.subject) or path.stem,
         "authority" if is_authority else "router" if hosts else "client",
         certificate.not_valid_after_utc,
         hosts,
@@ -109,6 +124,11 @@ def _problem(path: Path, certificate: x509.Certificate, authority: x509.Certific
     except (OSError, ValueError, TypeError):
         return ""  # the key is where it is used, or is not ours to read
     return "" if key.public_key() == certificate.public_key() else _UNFIT
+
+
+def _common_name(name: x509.Name) -> str:
+    names = name.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(names[0].value) if names else ""
 
 
 def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
