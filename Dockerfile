@@ -9,7 +9,7 @@ COPY pyproject.toml LICENSE ./
 RUN mkdir -p service/nedbus schemas/nedbus_msgs \
     && echo '__version__ = "0"' > service/nedbus/__init__.py \
     && touch schemas/nedbus_msgs/__init__.py README.md \
-    && /opt/nedbus/bin/pip install --no-cache-dir ".[mavlink,mcap,metrics,pki]" \
+    && /opt/nedbus/bin/pip install --no-cache-dir ".[mavlink,mcap,metrics,pki,web]" \
     && /opt/nedbus/bin/pip uninstall -y nedbus
 
 # What changes often: nedbus itself, as files for the same virtual environment.

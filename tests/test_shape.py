@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
     "errors", "extras", "whole_file", "log_event", "transport", "settings", "client", "recording", "sources", "daemon",
-    "monitoring", "doctor", "bridges", "cli",
+    "monitoring", "doctor", "bridges", "web", "cli",
 ]  # fmt: skip
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {
@@ -38,12 +38,20 @@ ONLY: dict[str, set[str]] = {
     "numpy": {
         "nedbus_msgs/arrays", "nedbus/client/batch", "nedbus/sources/ulog",
         "nedbus/recording/ulog", "nedbus/recording/arrays", "nedbus/recording/plot",
+        "nedbus/web/stream", "nedbus/web/tracks", "nedbus/web/background", "nedbus/web/plots",
     },
+    "bokeh": {
+        "nedbus/web/background", "nedbus/web/map_plot", "nedbus/web/playback", "nedbus/web/plots", "nedbus/web/send",
+        "nedbus/web/serve", "nedbus/web/server", "nedbus/web/style", "nedbus/web/table", "nedbus/web/tracks",
+        "nedbus/web/viewer",
+    },
+    "tornado": {"nedbus/web/server"},
+    "PIL": {"nedbus/web/background"},
     "pydantic": {
         "nedbus_msgs/position", "nedbus_msgs/px4_types", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
         "nedbus/settings/model", "nedbus/settings/load", "nedbus/sources/options", "nedbus/sources/spec",
         "nedbus/daemon/output",
-        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status",
+        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status", "nedbus/web/playback",
     },
     "pydantic_core": {
         "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus/client/publisher_registry",
@@ -69,7 +77,7 @@ ONLY: dict[str, set[str]] = {
     "typer": {
         "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
         "nedbus/cli/query", "nedbus/cli/echo", "nedbus/cli/health", "nedbus/cli/serve", "nedbus/cli/run",
-        "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check", "nedbus/cli/doctor",
+        "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check", "nedbus/cli/doctor", "nedbus/cli/web",
     },
 }  # fmt: skip
 MAX_LINES = 250

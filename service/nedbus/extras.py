@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from .errors import ConfigError
 
-EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pki"})
+EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pki", "web"})
 """The extras of this package, as in `pip install "nedbus[mcap]"`."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import time
 
@@ -93,14 +94,28 @@ def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
             assert time.monotonic() - start < 1.0
 
 
+def read_page(address: str) -> bytes:
+    """Return the page of `nedbus web` as a browser gets it through the usual port; nothing while it does not answer."""
+    web = http.client.HTTPConnection(address, timeout=DEADLINE)
+    try:
+        web.request("GET", "/", headers={"Host": "127.0.0.1:8420"})
+        return web.getresponse().read()
+    except OSError:
+        return b""
+    finally:
+        web.close()
+
+
 def test_compose_up_shows_data(make_stack: StartStack) -> None:
     """The service tells what it publishes; the demo prints it; both run as nobody special, and are healthy."""
-    stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml")
+    stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml", NEDBUS_WEB="127.0.0.1:0")
     stack.compose("--profile", "demo", "up", "--detach", "--no-build")
     wait_for(lambda: " ned " in stack.compose("logs", "service"), what="a message in the service's log", seconds=60)
     wait_for(lambda: stack.compose("logs", "subscriber").count(" ned ") > 5, what="messages in the subscriber's log")
     wait_for(lambda: stack.health("service") == "healthy", what="health", seconds=60)
     assert stack.compose("exec", "--no-TTY", "service", "id", "-un").strip() == "nedbus"
+    page = stack.compose("port", "web", "8420").strip()
+    wait_for(lambda: b"static/js/bokeh" in read_page(page), what="the page", seconds=60)
     stack.compose("kill", "router")
     wait_for(lambda: stack.health("service") == "unhealthy", what="its sickness", seconds=120)
 

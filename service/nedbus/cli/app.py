@@ -22,6 +22,7 @@ from .options import command, write
 from .pki import pki
 from .query import get, info, list_, schema
 from .serve import router, serve
+from .web import web
 
 app = typer.Typer(
     name="nedbus",
@@ -45,6 +46,7 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "schema": schema,
     "ros2": ros2,
     "foxglove": foxglove,
+    "web": web,
     "record": record,
     "convert": convert,
     "plot": plot,

@@ -98,10 +98,21 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
 def on_bus(function: Callable[..., None]) -> Callable[..., None]:
     """Make a command of a function: it gets an open bus as its first argument, and the options for connecting."""
 
+    @functools.wraps(function)
+    def run(open_bus: Callable[[], Bus], **options: Any) -> None:
+        with open_bus() as bus:
+            function(bus, **options)
+
+    return lazily_on_bus(run)
+
+
+def lazily_on_bus(function: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function that opens the bus itself: its first argument is what returns one."""
+
     @command
     def run(**options: Any) -> None:
-        with _open_bus(**{name: options.pop(name) for name in _BUS_OPTIONS}) as bus:
-            function(bus, **options)
+        open_bus = functools.partial(_open_bus, **{name: options.pop(name) for name in _BUS_OPTIONS})
+        function(open_bus, **options)
 
     _, *own = inspect.signature(function, eval_str=True).parameters.values()
     parameters = [*own, *_BUS_OPTIONS.values()]

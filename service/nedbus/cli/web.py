@@ -1,0 +1,70 @@
+"""The command for the page in the browser: web."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from nedbus import __version__
+from nedbus import web as page
+from nedbus.client import Bus
+from nedbus.errors import ConfigError
+from nedbus.settings import split_http
+from nedbus_msgs import ANY
+
+from .options import InstanceOption, TopicOption, VehicleOption, choose, lazily_on_bus, write_stderr
+from .run import run_until_stopped
+
+DEFAULT_LISTEN: Final = "127.0.0.1:8420"
+
+
+@lazily_on_bus
+def web(
+    open_bus: Callable[[], Bus],
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording to look at, instead of live vehicles"),
+    ] = None,
+    *,
+    topic_option: TopicOption = None,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    listen: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where to serve the page")] = DEFAULT_LISTEN,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST:PORT", help="Another name that browsers call this page by; repeatable"),
+    ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="FILE", help="GeoJSON, or a picture with a world file, under the tracks"),
+    ] = None,
+) -> None:
+    """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
+    try:
+        host, port = split_http(listen)
+        for name in origin or ():
+            split_http(name)
+    except ValueError as exc:
+        raise ConfigError("--listen and --origin", str(exc)) from exc
+    selection = choose(None, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
+    where = page.Where(host, port, tuple(origin or ()), background)
+
+    def tell(url: str) -> None:
+        write_stderr(f"open {url} in a browser; Ctrl-C ends it")
+        if host not in {"127.0.0.1", "::1", "localhost"}:
+            write_stderr(
+                f"whoever reaches {listen} can see all vehicles, without a password; nothing can be changed there"
+            )
+
+    with ExitStack() as closing:
+        if file is not None:
+            run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
+            return
+        bus = closing.enter_context(open_bus())
+        run_until_stopped(
+            lambda stop: page.serve_live(bus, selection, where, version=__version__, stop=stop, tell=tell)
+        )

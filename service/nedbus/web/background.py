@@ -1,0 +1,114 @@
+"""What lies under the tracks: GeoJSON, or a picture with a world file beside it, both in WGS 84."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from bokeh.models import ColumnDataSource
+from bokeh.plotting import figure
+from PIL import Image
+
+from nedbus.errors import ConfigError
+from nedbus_msgs import MapProjection
+
+from .style import Style
+
+_PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
+_SIDE: Final = 2000  # pixels of a picture at most
+_PLACES: Final = 200_000  # of GeoJSON at most
+
+Ring = list[tuple[float, float]]
+
+
+class Background:
+    """A file that is read once, and drawn for each viewer when the common origin is known.
+
+    Raises ConfigError for a file that is neither, and says what to do.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.rings: list[Ring] = []  # longitude, latitude [deg]
+        self.pixels: Any = None
+        self._corners: Ring = []
+        try:
+            if path.suffix.lower() in _PICTURES:
+                self._read_picture(path)
+            else:
+                self.rings = list(_rings(json.loads(path.read_text())))
+        except OSError as exc:
+            raise ConfigError("--map", f"{path}: {exc.strerror or exc}") from exc
+        except (ValueError, TypeError, KeyError, RecursionError, Image.DecompressionBombError) as exc:
+            raise ConfigError("--map", f"{path}: {exc}: GeoJSON, or a picture with a world file, in WGS 84") from exc
+        if not self.rings and self.pixels is None:
+            raise ConfigError("--map", f"{path}: it has no lines, polygons or points")
+
+    def draw(self, plot: figure, style: Style, projection: MapProjection) -> None:
+        """Draw it once on a map whose metres are from this origin."""
+        if self.pixels is not None:
+            (west, south), (east, north) = (_place(projection, *corner) for corner in self._corners)
+            plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
+        lines = [[_place(projection, *point) for point in ring] for ring in self.rings]
+        source = ColumnDataSource(
+            {"east": [[x for x, _ in line] for line in lines], "north": [[y for _, y in line] for line in lines]}
+        )
+        plot.multi_line("east", "north", source=source, color=style.quiet, line_width=1.5, level="underlay")
+        points = [line[0] for line in lines if len(line) == 1]
+        plot.scatter(
+            [x for x, _ in points], [y for _, y in points], marker="cross", color=style.quiet, level="underlay"
+        )
+
+    def _read_picture(self, path: Path) -> None:
+        world = path.with_suffix(_PICTURES[path.suffix.lower()])
+        if not world.exists():
+            raise ValueError(f"no world file {world.name} beside it, as gdal_translate -co WORLDFILE=YES writes one")
+        width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
+        if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
+            raise ValueError("the world file is not north up in degrees: gdalwarp -t_srs EPSG:4326 makes it so")
+        with Image.open(path) as picture:
+            columns, rows = picture.size
+            picture.thumbnail((_SIDE, _SIDE))
+            pixels = np.asarray(picture.convert("RGBA"))[::-1]
+        self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
+        left, top = west - width / 2, north - height / 2  # the file names the centre of the first pixel
+        self._corners = [(left, top + rows * height), (left + columns * width, top)]
+
+
+def _rings(shape: dict[str, Any]) -> Iterator[Ring]:
+    """Yield the lines of a GeoJSON object; a point is a line of one place."""
+    kind = shape["type"]
+    if kind in {"FeatureCollection", "GeometryCollection"}:
+        for each in shape["features" if kind == "FeatureCollection" else "geometries"]:
+            yield from _rings(each)
+    elif kind == "Feature":
+        if shape["geometry"] is not None:
+            yield from _rings(shape["geometry"])
+    else:
+        yield from _lines(shape["coordinates"])
+
+
+def _lines(coordinates: Sequence[Any]) -> Iterator[Ring]:
+    """Yield the lines in coordinates, however deeply they are nested."""
+    if isinstance(coordinates[0], int | float):
+        yield [_check(coordinates)]
+    elif isinstance(coordinates[0][0], int | float):
+        yield [_check(each) for each in coordinates]
+    else:
+        for each in coordinates:
+            yield from _lines(each)
+
+
+def _check(place: Sequence[Any]) -> tuple[float, float]:
+    longitude, latitude = float(place[0]), float(place[1])
+    if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
+        raise ValueError(f"{place} is no longitude and latitude")
+    return longitude, latitude
+
+
+def _place(projection: MapProjection, longitude: float, latitude: float) -> tuple[float, float]:
+    north, east = projection.project(latitude, longitude)
+    return east, north

@@ -1,0 +1,77 @@
+"""The two pages, of live vehicles and of a recording: what each viewer gets, and what runs behind it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from bokeh.document import Document
+
+from nedbus.client import Bus
+from nedbus.monitoring import Page
+from nedbus_msgs import Selection
+
+from .background import Background
+from .live import LOOK, LiveFleet
+from .playback import Player, Recording
+from .server import WebServer
+from .viewer import TICK, Viewer
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """Where a page is served: HOST and port, further ORIGINs that browsers may call it by, and what lies under it."""
+
+    host: str
+    port: int
+    origins: tuple[str, ...] = ()
+    background: Path | None = None
+
+    def open(
+        self, open_page: Callable[[Document, Background | None], object], pages: Mapping[str, Callable[[], Page]]
+    ) -> WebServer:
+        """Return a server that listens there; raise ConfigError for a bad background, ListenError if it cannot."""
+        background = Background(self.background) if self.background else None
+        return WebServer(
+            self.host, self.port, lambda page: open_page(page, background), pages=pages, origins=self.origins
+        )
+
+
+def serve_live(
+    bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
+) -> None:
+    """Serve the page of what a selection matches until `stop` is set; `tell` gets its address when it is there."""
+    live = LiveFleet(bus, selection, version=version)
+
+    def open_page(document: Document, background: Background | None) -> None:
+        viewer = Viewer(document, live.fleet, background=background)
+        document.add_periodic_callback(viewer.update, TICK)
+
+    server = where.open(open_page, live.pages)
+    reader = threading.Thread(target=live.run, args=[stop], name="nedbus-web", daemon=True)
+    reader.start()
+    tell(server.url)
+    server.run(stop, live.look, LOOK)
+    reader.join()
+
+
+def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:
+    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has a time of its own."""
+    recording = Recording(path)
+
+    def open_page(document: Document, background: Background | None) -> None:
+        player = Player(recording)
+        viewer = Viewer(document, player.fleet, title=recording.name, background=background, controls=player.controls)
+        player.on_jump = viewer.restart
+
+        def tick() -> None:
+            player.tick()
+            viewer.update()
+
+        document.add_periodic_callback(tick, TICK)
+
+    server = where.open(open_page, {"/healthz": lambda: Page.text("ok")})
+    tell(server.url)
+    server.run(stop, lambda: None, LOOK)

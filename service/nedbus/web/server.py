@@ -1,0 +1,135 @@
+"""The server of the page: Bokeh's, which listens on this host alone unless it is told otherwise."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, Final
+
+from bokeh.application import Application
+from bokeh.application.handlers import FunctionHandler
+from bokeh.document import Document
+from bokeh.models.widgets import Div
+from bokeh.server.auth_provider import NullAuth
+from bokeh.server.server import Server
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.web import HTTPError, RequestHandler
+
+from nedbus.errors import ListenError
+from nedbus.monitoring import Page
+
+MAX_VIEWERS: Final = 32
+"""Pages that are open at the same time."""
+
+_ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
+_LOOPBACK: Final = {"127.0.0.1", "::1", "localhost"}
+_POLL: Final = 100  # ms until the end is noticed
+_UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+
+
+class WebServer:
+    """Serve a page on HOST:PORT, and pages of text by their path, until it is told to stop.
+
+    `origins`: HOST:PORT that browsers may call it by, besides the names of this host: a page of anybody else that is
+    open in the same browser gets nothing, also where that has made its own name lead here.
+
+    Raises ListenError when it cannot listen there.
+    """
+
+    def __init__(
+        self, host: str, port: int, open_page: Callable[[Document], object], *,
+        pages: Mapping[str, Callable[[], Page]], origins: Sequence[str] = (),
+    ) -> None:  # fmt: skip
+        for name in ("bokeh", "tornado.access", "tornado.general"):
+            logging.getLogger(name).setLevel(logging.ERROR)  # each tab that is closed would be a warning
+        self._loop = IOLoop()
+
+        def open_or_refuse(document: Document) -> None:
+            if len(self._server.get_sessions("/")) >= MAX_VIEWERS:
+                document.add_root(Div(text=f"{MAX_VIEWERS} pages are open, which is the limit: close one"))
+            else:
+                open_page(document)
+
+        names = frozenset([*_names_of(host, port), *origins])
+        texts = {"names": names if host in _LOOPBACK else None}
+        try:
+            self._server = Server(
+                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=port,
+                allow_websocket_origin=["*"], auth_provider=_Names(names),
+                unused_session_lifetime_milliseconds=_UNUSED, check_unused_sessions_milliseconds=_UNUSED // 3,
+                keep_alive_milliseconds=5000,
+                extra_patterns=[(path, _Text, {"make": make, **texts}) for path, make in pages.items()],
+            )  # fmt: skip
+        except OSError as exc:
+            reason = (exc.strerror or str(exc)).lower()
+            hint = "choose another address with --listen"
+            raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
+        shown = "127.0.0.1" if host in _ANY else host
+        self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
+
+    def run(self, stop: threading.Event, refresh: Callable[[], None], every: int) -> None:
+        """Serve until `stop` is set, and call `refresh` every so many milliseconds, in this thread."""
+        poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _POLL)
+        again = PeriodicCallback(refresh, every)
+
+        def begin() -> None:
+            poll.start()
+            again.start()
+            self._server.start()
+
+        self._loop.add_callback(begin)
+        self._loop.start()
+        self._server.stop()
+        self._loop.close(all_fds=True)
+
+
+class _Names(NullAuth):
+    """Answer only browsers that ask for one of these names."""
+
+    login_url = "/"  # which Bokeh asks of whoever has `get_user`; nobody is sent there
+
+    def __init__(self, names: Collection[str]) -> None:
+        self._names = names
+        super().__init__()
+
+    @property
+    def get_user(self) -> Callable[[Any], Any]:
+        """Return what checks a request; everybody is the same user."""
+        return lambda handler: _require_name(handler, self._names)
+
+
+def _require_name(handler: RequestHandler, names: Collection[str]) -> str:
+    headers = handler.request.headers
+    for name in (headers.get("Host", ""), headers.get("Origin", "//").partition("//")[2]):
+        if name and name not in names:
+            raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
+    return "viewer"
+
+
+class _Text(RequestHandler):
+    def initialize(self, make: Callable[[], Page], names: Collection[str] | None) -> None:
+        self._make, self._names = make, names
+
+    def get(self) -> None:
+        if self._names is not None:
+            _require_name(self, self._names)
+        page = self._make()
+        self.set_status(page.status)
+        self.set_header("Content-Type", page.content_type)
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.finish(page.content)
+
+
+def _names_of(host: str, port: int) -> list[str]:
+    """Return under which names a browser may ask for a page on this address."""
+    names = {"localhost", "127.0.0.1", "::1", host}
+    if host in _ANY:
+        names |= {socket.gethostname(), socket.getfqdn(), *_addresses()}
+    return [f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in sorted(names)]
+
+
+def _addresses() -> set[str]:
+    found: set[Any] = {address[4][0] for address in socket.getaddrinfo(socket.gethostname(), None)}
+    return set(map(str, found))

@@ -1,0 +1,154 @@
+"""What is kept of one stream for a page: where it was in the last minute, at ten points a second; no I/O."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from nedbus.client import Sample
+from nedbus_msgs import MapProjection, Message, ResetTracker, to_global
+
+POINTS: Final = 600
+"""Points of a history: a minute."""
+
+COLUMNS: Final = ("time", "east", "north", "height", "vx", "vy", "climb", "eph", "epv", "error", "doubtful")
+"""Of a history: ms since the epoch, m, m/s, and 1 while dead reckoning; NaN where the message was not valid.
+
+`height` is above the vehicle's own origin, `error` the distance to the ground truth of the same moment.
+"""
+
+_ERROR: Final = COLUMNS.index("error")
+_STEP: Final = 0.095  # s between two points
+_SAME: Final = 0.5  # s between an estimate and the ground truth that it is compared with
+_events = attrgetter(
+    "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "ref_timestamp", "xy_global",
+    "xy_valid", "z_valid", "dead_reckoning",
+)  # fmt: skip
+
+
+class Place(NamedTuple):
+    """Where a message is [m]: `altitude` is above mean sea level where that is known, `common`: from the common origin.
+
+    Without a common origin east, north and altitude are from the vehicle's own.
+    """
+
+    east: float
+    north: float
+    altitude: float
+    common: bool
+
+
+@dataclass(slots=True)
+class Origin:
+    """The common origin: that of the first message that has one."""
+
+    projection: MapProjection | None = None
+
+    def place(self, message: Message) -> Place:
+        """Return where a message is; NaN where it is not valid."""
+        position = to_global(message)
+        north, east = message.x, message.y
+        if position:
+            self.projection = self.projection or MapProjection(message.ref_lat, message.ref_lon)
+            north, east = self.projection.project(position.latitude, position.longitude)
+        if not message.xy_valid:
+            north = east = math.nan
+        altitude = (message.ref_alt if message.z_global else 0.0) - message.z
+        return Place(east, north, altitude if message.z_valid else math.nan, bool(position))
+
+
+class Stream:
+    """One stream: its last sample, its history, and its resets in that time.
+
+    `history`: array of shape (600, columns), a ring of which `written` points have been written so far.
+    `last`: the last sample; `valid`: the last place that was valid, None if none was; `heading` [rad], NaN if unknown.
+    """
+
+    def __init__(self, origin: Origin) -> None:
+        self.history = np.full((POINTS, len(COLUMNS)), np.nan)
+        self.written = 0
+        self.last: Sample[Message] | None = None
+        self.time = -math.inf  # of `last` [s since the epoch]
+        self.valid: Place | None = None
+        self.resets: deque[tuple[float, float, float]] = deque(maxlen=50)  # time [s], east, north
+        self.origin = origin
+        self._tracker = ResetTracker()
+        self._state: object = None
+        self._sampled = -math.inf
+
+    def add(self, sample: Sample[Message], time: float, truth: Stream | None = None) -> None:
+        """Add the next sample of the stream at this time [s], beside the ground truth of its vehicle."""
+        before, self.last, self.time = self.last, sample, time
+        state = _events(sample.message)
+        if state == self._state:
+            if time - self._sampled < _STEP:
+                return
+        elif before is not None:
+            self._tracker.add(before.message)  # so that the jump is seen between these two
+        self._state, self._sampled = state, time
+        self._add_point(sample.message, time, truth)
+
+    @property
+    def error(self) -> float:
+        """The distance to the ground truth at the last point [m], NaN without one."""
+        return float(self.history[(self.written - 1) % POINTS, _ERROR])
+
+    def points(self, begin: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """Return the points with the numbers from `begin` on, in order, shape (n, columns)."""
+        numbers = np.arange(max(begin, self.written - POINTS, 0), self.written)
+        return self.history[numbers % POINTS]
+
+    def _add_point(self, message: Message, time: float, truth: Stream | None) -> None:
+        track, place = self._tracker.add(message), self.origin.place(message)
+        if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
+            self._write([time * 1e3, *[math.nan] * (len(COLUMNS) - 1)])  # the line breaks here
+            if "xy" in track.reset and math.isfinite(place.north):
+                self.resets.append((time, place.east, place.north))
+        if math.isfinite(place.north):
+            self.valid = place
+        speed_north, speed_east = (message.vx, message.vy) if message.v_xy_valid else (math.nan, math.nan)
+        self._write(
+            [
+                time * 1e3,
+                place.east,
+                place.north,
+                -message.z if message.z_valid else math.nan,
+                speed_north,
+                speed_east,
+                -message.vz if message.v_z_valid else math.nan,
+                message.eph,
+                message.epv,
+                _distance(place, message, truth),
+                float(message.dead_reckoning),
+            ]
+        )
+
+    def _write(self, values: list[float]) -> None:
+        self.history[self.written % POINTS] = values
+        self.written += 1
+
+
+def _distance(place: Place, message: Message, truth: Stream | None) -> float:
+    """Return the distance to the ground truth of the same moment [m], NaN without one."""
+    if truth is None or truth.last is None or not math.isfinite(place.north):
+        return math.nan
+    real = truth.last.message
+    other = truth.origin.place(real)
+    seconds = (_moment(message) - _moment(real)) / 1e6
+    if other.common != place.common or abs(seconds) > _SAME:
+        return math.nan
+    offsets = [
+        other.east + real.vy * seconds - place.east,
+        other.north + real.vx * seconds - place.north,
+        other.altitude - real.vz * seconds - place.altitude,
+    ]
+    return math.hypot(*(offset for offset in offsets if math.isfinite(offset)))
+
+
+def _moment(message: Message) -> int:
+    return message.timestamp_sample or message.timestamp
