@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Final
 
-from nedbus.errors import NedbusError
+from nedbus.errors import ConnectError, NedbusError
 from nedbus.transport import Certificate, Tls, open_client
 
 from .finding import Finding, brief
@@ -35,9 +35,9 @@ _KINDS: Final = {  # what listens there, and what to do
     ),
     "closes": (
         "it closes the connection without an answer",
-        f"is it a router that is full (max_sessions), or none of Zenoh's? {_OTHER}",
+        f"is it none of Zenoh's? {_OTHER}",
     ),
-    "no session": ("no session opens", "is it full, or of another version of Zenoh? the log of the router says more"),
+    "no session": ("no session opens", "is it of another version of Zenoh? the log of the router says more"),
 }
 
 
@@ -100,6 +100,9 @@ def _open(endpoint: str, tls: Tls | None, where: tuple[str, str, int] | None) ->
         with open_client([endpoint], timeout=_OPEN, tls=tls):
             return Finding(_NAME, endpoint, "ok", "a Zenoh router answers")
     except NedbusError as exc:
+        if isinstance(exc, ConnectError) and exc.full:
+            advice = "raise max_sessions in the router's configuration, or name another router: docs/fleet.md"
+            return Finding(_NAME, endpoint, "wrong", "the router has no room for more sessions", advice)
         if where is None or where[0] not in {"tcp", "tls"}:
             return Finding(_NAME, endpoint, "wrong", str(exc), "start a Zenoh router there")
     return _explain(endpoint, *where)

@@ -17,6 +17,7 @@ import zenoh
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 
 from .endpoints import check_endpoints, explain_endpoints
+from .full_router import full_router
 from .tls import Tls
 
 Session = zenoh.Session
@@ -112,6 +113,9 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # Of most failures Zenoh says no more than that there is no connection.
+    full = full_router(endpoints, tls)
+    if full is not None:
+        raise ConnectError(endpoints, timeout, full=full)
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 
