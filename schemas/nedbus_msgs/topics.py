@@ -17,6 +17,7 @@ ENCODING: Final = "application/msgpack;px4_msgs/VehicleLocalPosition"
 
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
+_RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is thinned
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -89,6 +90,18 @@ class Address:
         """Return the key expression where rejected messages of this address are reported."""
         return f"{prefix}/@rejected/{self.vehicle}/{self.stream}"
 
+    @classmethod
+    def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
+        """Return the address in the key of a thinned stream; raise AddressError for any other key."""
+        whole, rate, _ = key.rpartition(_RATE)
+        if not rate:
+            raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]{_RATE}<messages a second>")
+        return cls.from_key(whole, prefix=prefix)
+
+    def rate_key(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key expression of this stream, thinned to so many messages a second; "*" stands for any rate."""
+        return f"{self.key(prefix=prefix)}{_RATE}{rate}"
+
     @property
     def stream(self) -> str:
         """The topic, with its instance where it has one: the part of the key after the vehicle."""
@@ -133,6 +146,14 @@ class Selection:
         if get_topic(self.topic).instances:
             return f"{prefix}/{self.vehicle}/{self.topic}/{ANY if self.instance is None else self.instance}"
         return f"{prefix}/{self.vehicle}/{self.topic}"
+
+    def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key expression that matches the liveliness tokens of these addresses."""
+        return f"{prefix}/{self.vehicle}/@alive/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
+
+    def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key expression of these streams, thinned to so many messages a second; "*" is any rate."""
+        return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
 
 
 def alive_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:

@@ -17,7 +17,7 @@ from tests.conftest import Process, free_endpoint
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = dict(os.environ)  # as it was before any test: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE
 STAND_IN = "nedbus-router"  # the router image that is made here, where the official one cannot be pulled
-DEADLINE = 120.0  # s that one command of Docker may take
+DEADLINE = 300.0  # s that one command of Docker may take
 
 
 def find_compose() -> list[str]:

@@ -18,7 +18,7 @@ from .conftest import StartStack
 from .recorder import Recorder
 from .stack import ROOT, Stack
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 VLP = "vehicle_local_position"
 RESTART = "docker compose -f docker-compose.yml -f docker-compose.secure.yml restart router"

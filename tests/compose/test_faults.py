@@ -16,7 +16,7 @@ from .flight import Flight, is_whole, missing
 from .recorder import Recorder, indices
 from .stack import docker
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 VLP = "vehicle_local_position"
 BACK = 10.0  # s within which both sides are back once the network is; measured: 0.5 to 2, and 3.4 on a busy machine

@@ -17,7 +17,7 @@ from .conftest import StartStack
 from .flight import Flight, is_whole
 from .recorder import Recorder, indices
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 VLP = "vehicle_local_position"
 BLOCK = zenoh.CongestionControl.BLOCK

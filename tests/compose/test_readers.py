@@ -16,7 +16,7 @@ from tests.conftest import DEADLINE, Process, wait_for
 from .conftest import StartStack
 from .flight import Flight, is_whole
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 VLP = "vehicle_local_position"
 STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in TOPICS.items()}

@@ -18,7 +18,7 @@ from .flight import Flight, is_whole
 from .recorder import Recorder, indices
 from .stack import Stack
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 VLP = "vehicle_local_position"
 MINE = Address("1", VLP)

@@ -14,7 +14,7 @@ from tests.conftest import wait_for
 from .machine import Machine, build_machine, documented_commands
 from .stack import ROOT
 
-pytestmark = [pytest.mark.compose, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
 NEDBUS = "/opt/nedbus/bin/nedbus"
 CONFIG = "/etc/nedbus/nedbus.toml"

@@ -13,8 +13,12 @@ import pytest
 import nedbus
 from nedbus.client.acknowledgement import WINDOW
 from nedbus.transport import make_authority, make_certificate, open_router
+from nedbus_msgs import Address, encode
 from nedbus_msgs.arrays import to_array
 from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+from tests.service.test_max_rate import Clock, clock, publish, take, wait_for_demand
+
+__all__ = ["clock"]
 
 CONFIG = Path(__file__).parents[2] / "config"
 VLP = "vehicle_local_position"
@@ -282,3 +286,18 @@ def test_open_router_file_works() -> None:
         bus.publisher(VLP, vehicle="1").publish(message(1))
         wait_for(bus.latest, what="the message")
     session.close()
+
+
+def test_thinned_stream_flows_as_the_stream_does(join: Join, clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """A reader with a maximum rate gets what the vehicle thins, and its cache; nobody else writes it."""
+    publisher = join("vehicle-1").publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    stranger, reader = join("vehicle-2"), join("reader")
+    with reader.subscribe(mode="every", max_rate=5) as subscription:
+        assert take(subscription, 1) == [1]
+        wait_for_demand(publisher)
+        stranger._session.put(Address("1", VLP).rate_key(5), encode(message(666)))
+        publish(publisher, clock, 2, 1000)
+        assert take(subscription, 50) == list(range(2, 1002, 20))
+        assert subscription.counts.lost == 0
+        assert "nobody" not in caplog.text

@@ -30,6 +30,8 @@ def subscribe(bus: nedbus.Bus) -> None:
             assert_type(batch, nedbus.Batch)
             assert_type(batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray)
         assert_type(subscription.receive(1.0), nedbus.Sample)
+    assert_type(bus.subscribe(max_rate=5), nedbus.Subscription)
+    bus.subscribe(max_rate="5")  # type: ignore[arg-type] # a number
     bus.subscribe(mode="newest")  # type: ignore[arg-type] # latest or every
     bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-arg] # the vehicle by name only
 
@@ -64,6 +66,7 @@ async def read_and_publish() -> None:
             assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
         async for row in bus.subscribe().rows():
             assert_type(row, nedbus.Sample[nedbus.Row])
+        assert_type(bus.subscribe(max_rate=0.5), nedbus.AsyncSubscription)
         for sample in bus.subscribe():  # type: ignore[attr-defined] # async for
             pass
         publisher = await bus.publisher("external_ins_local_position", vehicle="mine")

@@ -57,6 +57,14 @@ def echo(
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
+    max_rate: Annotated[
+        float | None,
+        typer.Option(
+            "--max-rate",
+            metavar="HZ",
+            help="Messages a second of each stream, thinned by its publisher: for links that carry no more",
+        ),
+    ] = None,
     once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,
     count: CountOption = None,
     duration: DurationOption = None,
@@ -79,7 +87,7 @@ def echo(
         return True
 
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
-    with bus.subscribe_to(selection, mode="every" if every else "latest") as subscription:
+    with bus.subscribe_to(selection, mode="every" if every else "latest", max_rate=max_rate) as subscription:
         try:
             if csv_output:
                 write(to_csv_head(fields))

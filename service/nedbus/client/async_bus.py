@@ -48,17 +48,20 @@ class AsyncBus:
         vehicle: str | int = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
+        max_rate: float | None = None,
     ) -> AsyncSubscription:
         """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
         self._opened()
-        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode)
+        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
-    def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> AsyncSubscription:
+    def subscribe_to(
+        self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
+    ) -> AsyncSubscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
         bus = self._opened()
-        key_expr = selection.key_expr(prefix=bus.prefix)
-        receive_queue = bus._make_queue(mode, name=key_expr)
-        return AsyncSubscription(lambda: bus._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr)
+        receive_queue = bus._make_queue(selection, mode, max_rate)
+        name = selection.key_expr(prefix=bus.prefix)
+        return AsyncSubscription(lambda: bus._open_subscriber(selection, receive_queue), receive_queue, name=name)
 
     async def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0

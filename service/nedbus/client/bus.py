@@ -23,6 +23,8 @@ from .receive_queue import ReceiveQueue
 from .rejections import Rejections
 from .sample import Mode, Sample
 from .subscription import Subscription
+from .thinned_queue import ThinnedQueue
+from .thinned_subscriber import ThinnedSubscriber
 from .vehicle_directory import VehicleDirectory
 from .zenoh_subscriber import ZenohSubscriber
 
@@ -58,6 +60,7 @@ class Bus:
         vehicle: str | int = ANY,
         instance: int | None = None,
         mode: Mode = "latest",
+        max_rate: float | None = None,
     ) -> Subscription:
         """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
 
@@ -66,15 +69,22 @@ class Bus:
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
         Either way `counts` has what was lost, dropped or invalid, and nobody else has to wait.
+        `max_rate`: at most so many messages a second of each stream, thinned by its publisher, for links that carry no
+        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is thinned
+        here. What is left out is neither lost nor dropped.
+
+        Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
         self._require_open()
-        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode)
+        return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
-    def subscribe_to(self, selection: Selection, *, mode: Mode = "latest") -> Subscription:
+    def subscribe_to(
+        self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
+    ) -> Subscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
-        key_expr = selection.key_expr(prefix=self.prefix)
-        receive_queue = self._make_queue(mode, name=key_expr)
-        return Subscription(self._open_subscriber(key_expr, receive_queue), receive_queue, name=key_expr, owner=self)
+        receive_queue = self._make_queue(selection, mode, max_rate)
+        subscriber = self._open_subscriber(selection, receive_queue)
+        return Subscription(subscriber, receive_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
 
     def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
@@ -168,15 +178,21 @@ class Bus:
         if not self._finalizer.alive:
             raise ClosedError
 
-    def _make_queue(self, mode: Mode, *, name: str) -> ReceiveQueue:
+    def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> ReceiveQueue:
         """Return the queue of a new subscription; AsyncBus uses it too."""
         self._require_open()
-        return ReceiveQueue(mode, self._make_decoder(), name=name)
+        decoder, name = self._make_decoder(), selection.key_expr(prefix=self.prefix)
+        if max_rate is None:
+            return ReceiveQueue(mode, decoder, name=name)
+        return ThinnedQueue(mode, decoder, max_rate=max_rate, name=name)
 
-    def _open_subscriber(self, key_expr: str, receive_queue: ReceiveQueue) -> ZenohSubscriber:
+    def _open_subscriber(self, selection: Selection, receive_queue: ReceiveQueue) -> ZenohSubscriber:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
         self._require_open()
-        subscriber = ZenohSubscriber(self._session, key_expr, receive_queue)
+        if isinstance(receive_queue, ThinnedQueue):
+            subscriber: ZenohSubscriber = ThinnedSubscriber(self._session, selection, receive_queue, prefix=self.prefix)
+        else:
+            subscriber = ZenohSubscriber(self._session, selection.key_expr(prefix=self.prefix), receive_queue)
         self._subscribers.add(subscriber)
         if not self._finalizer.alive:  # closed meanwhile, by another thread
             subscriber.close()

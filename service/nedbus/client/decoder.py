@@ -39,10 +39,14 @@ _UNKNOWN: Final = Provenance()
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """What is derived from a key once, and the provenance of its last encoding."""
+    """What is derived from a key once, and the provenance of its last encoding.
+
+    `key`: that of the whole stream. `thinned`: messages come on the key of a thinned copy of it.
+    """
 
     key: str
     address: Address
+    thinned: bool = False
     last: tuple[zenoh.Encoding | None, Provenance] = None, _UNKNOWN  # in one piece: two threads look and change it
 
 
@@ -145,7 +149,9 @@ class Decoder:
         self._layouts.check(payload)
 
     def _remember(self, key: str) -> Stream:
-        stream = Stream(key, Address.from_key(key, prefix=self._prefix))
+        thinned = "/@" in key  # only who asks for thinned streams gets such keys
+        address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
+        stream = Stream(address.key(prefix=self._prefix), address, thinned)
         if len(self._streams) < MAX_KEYS:
             self._streams[key] = stream
         return stream

@@ -24,7 +24,9 @@ from nedbus_msgs import (
 )
 
 from .acknowledgement import KEPT, Acknowledgement
+from .demand import Demand
 from .qos import TOPIC_QOS
+from .thinned_streams import ThinnedStreams
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
@@ -51,6 +53,7 @@ class Publisher:
         prefix: str,
         lossless: bool,
         source: str | None,
+        thinned_demand: Demand,
         on_close: Callable[[], object],
         owner: object,
     ) -> None:
@@ -82,6 +85,7 @@ class Publisher:
                 publisher_detection=True,
             )
         self._acknowledgement = Acknowledgement(session, self.key, self._publisher, priority=qos.priority)
+        self._thinned = ThinnedStreams(session, address, prefix=prefix, vehicle=thinned_demand)
 
     def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
         """Validate a message, or the fields of one by name, and publish it.
@@ -120,11 +124,13 @@ class Publisher:
         require_unforked()
         payloads = encode_array(messages)
         put, new_timestamp = self._publisher.put, self._session.new_timestamp
-        lossless, pace = self.lossless, self._acknowledgement.pace
+        lossless, pace, thinned = self.lossless, self._acknowledgement.pace, self._thinned
         with while_open():
             for start in range(0, len(payloads), PAYLOAD_SIZE):
                 payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
                 put(payload, timestamp=stamp)
+                if thinned.vehicle.wanted or thinned.opened:
+                    thinned.put(payload, stamp, self._encoding)
                 self.last = payload, stamp, self._encoding
                 self.published += 1
                 if lossless:
@@ -156,6 +162,7 @@ class Publisher:
             with suppress(NedbusError):
                 self.flush()
         self._on_close()
+        self._thinned.close()
         with suppress(zenoh.ZError):  # closed already with the session
             self._publisher.undeclare()
             self._token.undeclare()
@@ -181,6 +188,8 @@ class Publisher:
                     self._partial_encoding = encoding_of(self.source, self._provided)
                 encoding = self._partial_encoding
                 self._publisher.put(payload, timestamp=stamp, encoding=encoding)
+            if self._thinned.vehicle.wanted or self._thinned.opened:
+                self._thinned.put(payload, stamp, encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
         self.last = payload, stamp, encoding

@@ -15,9 +15,10 @@ from pydantic_core import to_json
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
-from nedbus_msgs import Address, json_schema, layout_table, schema_key
+from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table, schema_key
 
 from .acknowledgement import WINDOW
+from .demand import Demand
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
 
@@ -40,6 +41,7 @@ class PublisherRegistry:
         self._queries = queries
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
+        self._thinned_demands: dict[str, Demand] = {}  # by vehicle, for any thinned stream of it
         self._lock = threading.Lock()
 
     @property
@@ -54,12 +56,17 @@ class PublisherRegistry:
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
+            demand = self._thinned_demands.get(address.vehicle)
+            if demand is None:
+                key_expr = Selection(vehicle=address.vehicle).rate_key_expr(ANY, prefix=self.prefix)
+                demand = self._thinned_demands[address.vehicle] = Demand(self._session, key_expr)
             publisher = Publisher(
                 self._session,
                 address,
                 prefix=self.prefix,
                 lossless=lossless,
                 source=source,
+                thinned_demand=demand,
                 on_close=lambda: self._forget(address),
                 owner=owner,
             )
@@ -113,7 +120,12 @@ class PublisherRegistry:
                 logged = True
 
     def _forget(self, address: Address) -> None:
-        self._publishers.pop(address, None)
+        with self._lock:
+            self._publishers.pop(address, None)
+            demand = self._thinned_demands.get(address.vehicle)
+            if demand is not None and not any(each.vehicle == address.vehicle for each in self._publishers):
+                del self._thinned_demands[address.vehicle]
+                demand.close()
         self._share_window()
 
     def _share_window(self) -> None:

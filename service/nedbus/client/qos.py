@@ -1,4 +1,4 @@
-"""Zenoh's quality of service for each topic: priority on a congested link, and size of the publisher's cache."""
+"""Zenoh's quality of service for each topic: priority on a congested link, size of the publisher's cache, thinning."""
 
 from __future__ import annotations
 
@@ -27,3 +27,6 @@ TOPIC_QOS: Final[Mapping[str, TopicQos]] = {
     "external_ins_local_position": TopicQos(Priority.DATA, 2000),
     "estimator_local_position": TopicQos(Priority.DATA, 400),
 }
+
+RATES: Final = (1, 2, 5, 10, 20, 50, 100)
+"""Messages a second to which a publisher thins a stream where readers ask for it, each on a key of its own."""

@@ -37,9 +37,10 @@ class ZenohSubscriber:
     """Declare an advanced subscriber, and put what it receives into a ReceiveQueue until it is closed.
 
     A subscriber of mode `every` answers publishers that ask whether it has what they sent.
+    One of `thinned` streams does not, as these do not wait for it, and it begins with what is published from now on.
     """
 
-    def __init__(self, session: Session, key_expr: str, receive_queue: ReceiveQueue) -> None:
+    def __init__(self, session: Session, key_expr: str, receive_queue: ReceiveQueue, *, thinned: bool = False) -> None:
         every = not receive_queue.newest_only
         self._queue = receive_queue
         self._name = key_expr
@@ -52,7 +53,7 @@ class ZenohSubscriber:
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
         recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None) if every else None
         # No late-publisher detection: after a router's restart its history query would win over recovery.
-        history = zenoh.ext.HistoryConfig(max_samples=1)
+        history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
         with while_open():
             self._subscriber = zenoh.ext.declare_advanced_subscriber(
                 session, key_expr, channel, history=history, recovery=recovery
@@ -62,7 +63,8 @@ class ZenohSubscriber:
             )
             asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
             self._catch_up = CatchUp(session, receive_queue) if every else None
-            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every else None
+            answers = every and not thinned
+            self._asked = session.declare_queryable(ack_key(key_expr), asked) if answers else None
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
         self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)

@@ -27,13 +27,15 @@ _BLOCK: Final = re.compile(
     rf"(?P<begin>^(?P<indent>[ \t]*){_BEGIN}[^\n]*\n)(?P<content>.*?)(?P<end>^[ \t]*{_END})", re.DOTALL | re.MULTILINE
 )
 _NAMED: Final = re.compile(rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE)
-# What a vehicle sends: data, last values, recovery (@adv), liveliness, probes of `nedbus doctor`, reports of what was
-# rejected, and a status.
+# What a vehicle sends: data, last values, recovery (@adv), thinned copies (@rate), liveliness, probes of
+# `nedbus doctor`, reports of what was rejected, and a status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (
     "{p}/{v}/**",
     "{p}/{v}/@alive/**",
     "{p}/{v}/**/@adv/**",
+    "{p}/{v}/**/@rate/*",
+    "{p}/{v}/**/@rate/*/@adv/**",
     "{p}/{v}/@doctor/*",
     "{p}/@rejected/{v}/**",
     "{p}/@service/*/status",
