@@ -42,7 +42,7 @@ class Background:
                 self.rings = list(_rings(json.loads(path.read_text())))
         except OSError as exc:
             raise ConfigError("--map", f"{path}: {exc.strerror or exc}") from exc
-        except (ValueError, TypeError, KeyError, RecursionError, Image.DecompressionBombError) as exc:
+        except (ValueError, TypeError, LookupError, RecursionError, Image.DecompressionBombError) as exc:
             raise ConfigError("--map", f"{path}: {exc}: GeoJSON, or a picture with a world file, in WGS 84") from exc
         if not self.rings and self.pixels is None:
             raise ConfigError("--map", f"{path}: it has no lines, polygons or points")
@@ -63,9 +63,12 @@ class Background:
         )
 
     def _read_picture(self, path: Path) -> None:
-        world = path.with_suffix(_PICTURES[path.suffix.lower()])
-        if not world.exists():
-            raise ValueError(f"no world file {world.name} beside it, as gdal_translate -co WORLDFILE=YES writes one")
+        worlds = [path.with_suffix(suffix) for suffix in (_PICTURES[path.suffix.lower()], ".wld")]  # GDAL's is .wld
+        world = next((each for each in worlds if each.exists()), None)
+        if world is None:
+            raise ValueError(
+                f"no world file {worlds[0].name} beside it, as gdal_translate -co WORLDFILE=YES writes one"
+            )
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
             raise ValueError("the world file is not north up in degrees: gdalwarp -t_srs EPSG:4326 makes it so")

@@ -37,7 +37,6 @@ class LiveFleet:
     def run(self, stop: threading.Event) -> None:
         """Read until `stop` is set."""
         self._exporter.run(stop)
-        self._rejections.close()
 
     def look(self) -> None:
         """Make the picture of now."""

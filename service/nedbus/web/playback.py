@@ -26,7 +26,9 @@ from .fleet import Fleet
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s that are shown before the time that is chosen
-_SPEEDS: Final[tuple[str | tuple[Any, str], ...]] = ("0.5", "1", "2", "5", "10", "50")
+_SPEEDS: Final[Mapping[str | tuple[Any, str], float]] = {
+    "0.5": 0.5, "1": 1.0, "2": 2.0, "5": 5.0, "10": 10.0, "50": 50.0,
+}  # fmt: skip
 
 
 class Recording:
@@ -92,7 +94,7 @@ class Player:
         now = time.monotonic()
         elapsed, self._ticked = now - self._ticked, now
         if self._play.active:
-            self._time = min(self._time + elapsed * float(self._speed.value or 1), self._recording.length)
+            self._time = min(self._time + elapsed * _SPEEDS.get(str(self._speed.value), 1.0), self._recording.length)
         if not self._dragged:
             self._shown = round(self._time, 1)
             self._slider.update(end=max(1.0, self._recording.length), value=self._shown)
@@ -104,8 +106,10 @@ class Player:
     def _jump(self, seconds: float) -> None:
         self._dragged = False
         self.fleet.clear()
-        self._monitor, self._time = Monitor(), seconds
-        self._next = bisect_left(self._recording.dues, seconds - _MINUTE)
+        self._monitor, self._time = Monitor(), min(max(0.0, seconds), self._recording.length)
+        self._next = bisect_left(self._recording.dues, self._time - _MINUTE)
+        for halves in range(round(2 * _MINUTE)):  # so that it is known since when a condition holds
+            self._feed(max(0.0, self._time - _MINUTE + halves / 2))
         self.on_jump()
 
     def _feed(self, seconds: float) -> None:

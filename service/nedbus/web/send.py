@@ -16,7 +16,11 @@ def replace(source: ColumnDataSource, rows: Mapping[str, list[Any]]) -> bool:
         source.data = dict(rows)
         return True
     patches = {
-        name: [(index, new) for index, (was, new) in enumerate(zip(old[name], values, strict=True)) if was != new]
+        name: [
+            (index, new)
+            for index, (was, new) in enumerate(zip(old[name], values, strict=True))
+            if was != new and repr(was) != repr(new)  # NaN is different from itself
+        ]
         for name, values in rows.items()
     }
     patches = {name: patch for name, patch in patches.items() if patch}

@@ -102,8 +102,9 @@ class _Names(NullAuth):
 
 def _require_name(handler: RequestHandler, names: Collection[str]) -> str:
     headers = handler.request.headers
-    for name in (headers.get("Host", ""), headers.get("Origin", "//").partition("//")[2]):
-        if name and name not in names:
+    host = headers.get("Host", "")
+    for name in (host, headers.get("Origin", f"//{host}").partition("//")[2]):  # Origin: null has no name
+        if name not in names:
             raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
     return "viewer"
 

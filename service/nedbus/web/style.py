@@ -102,5 +102,6 @@ def badge(condition: Condition, count: int | None = None) -> str:
 def to_clock(seconds: float) -> str:
     """Return a time of this host without its date, or the minutes and seconds since the start of a recording."""
     if seconds < _YEARS:
+        seconds = round(seconds, 1)
         return f"{seconds // 60:.0f}:{seconds % 60:04.1f}"
     return time.strftime("%H:%M:%S", time.localtime(seconds))

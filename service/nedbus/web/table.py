@@ -28,7 +28,7 @@ _FLAGS: Final = {
     "dead_reckoning": "DR",
 }  # fmt: skip
 _WIDTHS: Final = {
-    "vehicle": 66, "topic": 84, "state": 90, "what is wrong": 158, "since": 56, "Hz": 34, "age": 46, "latency": 50,
+    "vehicle": 62, "topic": 86, "state": 98, "what is wrong": 150, "since": 58, "Hz": 34, "age": 46, "latency": 50,
     "lost": 34, "rejected": 52, **dict.fromkeys(_FLAGS.values(), 26), "off truth": 58, "source": 48,
 }  # fmt: skip
 _SET, _CLEAR = "●", "○"

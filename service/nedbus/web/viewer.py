@@ -113,7 +113,7 @@ class Viewer:
         self._ticks = 0
 
     def _choose(self, rows: list[int], addresses: list[Address]) -> None:
-        if rows and rows[0] < len(addresses):
+        if rows and 0 <= rows[0] < len(addresses):
             self.chosen = addresses[rows[0]]
             self._ticks = 0  # at once
 
