@@ -87,7 +87,7 @@ def sky() -> Sky:
 
 
 def column(stream: Stream, name: str) -> list[float]:
-    values: list[float] = stream.points(0)[:, COLUMNS.index(name)].tolist()
+    values: list[float] = stream.points(0, stream.written)[:, COLUMNS.index(name)].tolist()
     return values
 
 
@@ -248,7 +248,7 @@ def test_history_is_of_ten_points_a_second(sky: Sky) -> None:
     sky.fly(0.01, rate=100)
     assert sky.stream().written == before + 2
     sky.fly(70, rate=20)
-    points = sky.stream().points(0)
+    points = sky.stream().points(0, sky.stream().written)
     assert len(points) == POINTS
     assert 58 <= (points[-1, 0] - points[0, 0]) / 1e3 <= 70
 
@@ -774,7 +774,7 @@ def shown(player: Player) -> object:
     end = picture.time * 1e3
     found = []
     for line in picture.lines:
-        points = line.stream.points(0)
+        points = line.stream.points(0, line.stream.written)
         recent = points[points[:, 0] > end - 50_000]
         found.append((line.address, line.condition, line.words, line.where, len(line.stream.resets), recent.tolist()))
     return repr(found)

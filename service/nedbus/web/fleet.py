@@ -6,7 +6,7 @@ import math
 import threading
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 from nedbus.client import Health, RejectionReport, Sample, StreamState, describe_stream, health_of_last, stream_state
@@ -24,6 +24,7 @@ TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
 """Streams that a page shows; more are counted."""
 
+_OVER: Final = 600.0  # s after which nobody needs to look for what has gone
 _SILENT: Final = 60.0  # s after which a stream makes room for another
 _REPORTS: Final = 100  # rejected messages that are shown
 _VALIDITY: Final = tuple(name for name, flag in FLAGS.items() if flag.label and not flag.inverted)
@@ -31,7 +32,10 @@ _VALIDITY: Final = tuple(name for name, flag in FLAGS.items() if flag.label and 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One stream at one moment: its condition, what is wrong in words, and since when [s since the epoch]."""
+    """One stream at one moment: its condition, what is wrong in words, and since when [s since the epoch].
+
+    `rank`: its place among the others, 0 for the worst; what was switched off long ago comes last.
+    """
 
     address: Address
     stream: Stream
@@ -40,6 +44,7 @@ class Line:
     words: str
     since: float
     rejected: int
+    rank: int
 
     @property
     def where(self) -> str:
@@ -73,7 +78,7 @@ class Picture:
 
     def worst_first(self) -> list[Line]:
         """Return the lines, those of the worst condition first."""
-        return sorted(self.lines, key=lambda line: (CONDITIONS.index(line.condition), line.address))
+        return sorted(self.lines, key=lambda line: (line.rank, line.address))
 
 
 @dataclass(slots=True)
@@ -136,13 +141,15 @@ class Fleet:
         for address, stream in streams:
             if stream.last is None:
                 continue
-            health = healths.get(address) or health_of_last(stream.last)
+            health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
             is_alive = None if alive is None else address in alive
             state = stream_state(health, alive=is_alive, connected=not link)
             condition = _condition(health, state)
             words = describe_stream(health, state).removeprefix(f"{state.name}").removeprefix(": ")
             begin = self._begin(address, condition, time, health)
-            lines.append(Line(address, stream, health, condition, words, begin, self._rejected[address]))
+            is_over = condition == "gone" and time - begin > _OVER
+            rank = len(CONDITIONS) if is_over else CONDITIONS.index(condition)
+            lines.append(Line(address, stream, health, condition, words, begin, self._rejected[address], rank))
         rejected = self._rejected.total()
         self.picture = Picture(time, lines, tuple(self._reports), rejected, len(self._left_out), link)
         return self.picture

@@ -106,7 +106,7 @@ def _mark(line: Line, style: Style) -> dict[str, Any]:
     """Return the marker of a vehicle: a filled circle where it is now, or an open square where it was last."""
     place, last = line.stream.valid, line.stream.last
     heading = last.message.heading if last is not None else math.nan
-    is_here = last is not None and last.message.xy_valid and line.condition in {"ok", "slow", "dead reckoning"}
+    is_here = last is not None and last.message.xy_valid and line.condition not in {"disconnected", "gone", "stale"}
     colour = style.lines[0] if line.condition == "ok" else COLOURS[line.condition]
     return {
         "east": round(place.east, 3) if place else math.nan,

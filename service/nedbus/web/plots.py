@@ -40,14 +40,15 @@ class Plots:
             stream = fleet.streams.get(address) if address is not None else None
             shown, seen = self._shown.get(source, (None, 0))
             begin = seen if shown == address else 0
-            points = stream.points(begin) if stream is not None else _NOTHING
+            end = stream.written if stream is not None else 0  # once: another thread adds points
+            points = stream.points(begin, end) if stream is not None else _NOTHING
             columns: dict[str, Any] = {name: points[:, index] for index, name in enumerate(COLUMNS)}
             columns["time"] = columns["time"] + self._offset
             if shown != address:
                 source.data = columns
             elif len(points):
                 source.stream(columns, rollover=POINTS)
-            self._shown[source] = address, stream.written if stream is not None else 0
+            self._shown[source] = address, end
 
     def move(self, time: float) -> None:
         """Move the time axis to its end [s since the epoch]."""

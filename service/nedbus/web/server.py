@@ -88,16 +88,20 @@ class WebServer:
 class _Names(NullAuth):
     """Answer only browsers that ask for one of these names."""
 
-    login_url = "/"  # which Bokeh asks of whoever has `get_user`; nobody is sent there
+    login_url = "/"  # which Bokeh asks of whoever checks users; nobody is sent there
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = names
         super().__init__()
 
     @property
-    def get_user(self) -> Callable[[Any], Any]:
-        """Return what checks a request; everybody is the same user."""
-        return lambda handler: _require_name(handler, self._names)
+    def get_user_async(self) -> Callable[[Any], Any]:
+        """Return what checks a request before anything is answered; everybody is the same user."""
+
+        async def check(handler: RequestHandler) -> str:
+            return _require_name(handler, self._names)
+
+        return check
 
 
 def _require_name(handler: RequestHandler, names: Collection[str]) -> str:

@@ -98,10 +98,9 @@ class Stream:
         """The distance to the ground truth at the last point [m], NaN without one."""
         return float(self.history[(self.written - 1) % POINTS, _ERROR])
 
-    def points(self, begin: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        """Return the points with the numbers from `begin` on, in order, shape (n, columns)."""
-        numbers = np.arange(max(begin, self.written - POINTS, 0), self.written)
-        return self.history[numbers % POINTS]
+    def points(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """Return the points with these numbers that are still there, in order, shape (n, columns)."""
+        return self.history[np.arange(max(begin, end - POINTS, 0), end) % POINTS]
 
     def _add_point(self, message: Message, time: float, truth: Stream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)

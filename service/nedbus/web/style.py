@@ -74,10 +74,10 @@ class Style:
         return (
             f":host {{ border: 1px solid {self.line}; }}"
             f".slick-header, .slick-header-columns, .slick-header-column {{ background: {self.panel} !important; "
-            f"color: {self.quiet}; border-color: {self.line} !important; font: 12px system-ui, sans-serif; }}"
+            f"color: {self.quiet}; border-color: {self.line} !important; font: 11px system-ui, sans-serif; }}"
             f".slick-row, .slick-row.even, .slick-row.odd {{ background: {self.ground} !important; "
             f"color: {self.text}; }} .grid-canvas, .slick-viewport {{ background: {self.ground} !important; }}"
-            f".slick-cell {{ border-color: {self.line} !important; font: 12px/20px system-ui, sans-serif; }}"
+            f".slick-cell {{ border-color: {self.line} !important; font: 11px/20px system-ui, sans-serif; }}"
             f".slick-row:hover .slick-cell {{ background: {self.panel}; }}"
             f".slick-cell.selected {{ background: {self.chosen} !important; }}"
         )

@@ -28,8 +28,8 @@ _FLAGS: Final = {
     "dead_reckoning": "DR",
 }  # fmt: skip
 _WIDTHS: Final = {
-    "vehicle": 62, "topic": 86, "state": 98, "what is wrong": 150, "since": 58, "Hz": 34, "age": 46, "latency": 50,
-    "lost": 34, "rejected": 52, **dict.fromkeys(_FLAGS.values(), 26), "off truth": 58, "source": 48,
+    "vehicle": 60, "topic": 80, "state": 90, "what is wrong": 150, "since": 54, "age": 44, "Hz": 32, "off truth": 54,
+    "lost": 32, "rejected": 50, "latency": 46, **dict.fromkeys(_FLAGS.values(), 25), "source": 44,
 }  # fmt: skip
 _SET, _CLEAR = "●", "○"
 

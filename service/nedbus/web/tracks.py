@@ -31,7 +31,7 @@ class Tracks:
 
     def __init__(self) -> None:
         self.source = ColumnDataSource({name: [] for name in _NAMES})
-        self._addresses: tuple[Address, ...] = ()
+        self._addresses: tuple[Address, ...] | None = None
         self._seen: list[int] = []
         self._step = self._slots = 1
 
@@ -41,17 +41,15 @@ class Tracks:
             self._begin(streams)
         patches: dict[str, list[tuple[int, float]]] = {name: [] for name in _NAMES}
         for index, (address, stream) in enumerate(streams.items()):
-            if stream.written > self._seen[index]:
-                for slot, values in self._points(index, address, stream):
-                    for name, value in zip(patches, values, strict=True):
-                        patches[name].append((slot, value))
-                self._seen[index] = stream.written
+            for slot, values in self._points(index, address, stream):
+                for name, value in zip(patches, values, strict=True):
+                    patches[name].append((slot, value))
         if patches["east"]:
             self.source.patch(patches)
 
     def clear(self) -> None:
         """Forget all, so that the next update sends everything again."""
-        self._addresses = ()
+        self._addresses = None
 
     def _begin(self, streams: Mapping[Address, Stream]) -> None:
         self._addresses = tuple(streams)
@@ -64,7 +62,6 @@ class Tracks:
             for slot, values in self._points(index, address, stream):
                 for name, value in zip(filled, values, strict=True):
                     filled[name][slot] = value
-            self._seen[index] = stream.written
         self.source.data = filled
 
     def _points(
@@ -72,15 +69,19 @@ class Tracks:
     ) -> Iterator[tuple[int, tuple[float, float, float, float]]]:
         """Yield the slots that change, with their values."""
         step, ring = self._step, self._slots
-        rows = stream.points(self._seen[index] // step * step)
+        seen, end = self._seen[index], stream.written  # once: another thread adds points
+        if end == seen:
+            return
+        self._seen[index] = end
+        rows = stream.points(seen // step * step, end)
         changed: dict[int, tuple[float, float, float, float]] = {}
         broken = False
-        for number, row in enumerate(rows.tolist(), stream.written - len(rows)):
+        for number, row in enumerate(rows.tolist(), end - len(rows)):
             east, north, doubtful = row[_EAST], row[_NORTH], row[_DOUBTFUL]
             broken = math.isnan(east) or (broken and number % step > 0)
             point = round(east, 2), math.nan if broken else round(north, 2)
             changed[number // step % ring] = _columns(*point, truth=address.topic == TRUTH, doubtful=doubtful > 0)
-        changed[((stream.written - 1) // step + 1) % ring] = _GAP
+        changed[((end - 1) // step + 1) % ring] = _GAP
         if 0 in changed:
             changed[ring] = changed[0]  # so that the line goes on from the last slot to the first
         for slot, values in changed.items():

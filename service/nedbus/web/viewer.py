@@ -12,8 +12,9 @@ from bokeh.document import Document
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
 from bokeh.models import CustomJS, GlobalInlineStyleSheet, LayoutDOM, Row
-from bokeh.models.widgets import Div, Toggle
+from bokeh.models.widgets import Div, TextInput, Toggle
 
+from nedbus.client import to_age
 from nedbus_msgs import Address
 
 from .background import Background
@@ -28,6 +29,8 @@ TICK: Final = 100
 
 _LOOK: Final = 5  # ticks between two updates of text, tables and plots
 _AXIS: Final = 10  # ticks between two moves of the time axis
+_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the first of them
+_SLOW: Final = 1.0  # s between two pictures from which on the page says so
 _WORST: Final = 3  # vehicles that are told of in sentences
 # What Bokeh does not do: tell whether the pointer is over a table, and begin anew when the server is back.
 _POINTING: Final = """
@@ -37,6 +40,7 @@ window.addEventListener("mousemove", event => {
 })
 document.documentElement.addEventListener("mouseleave", () => { flag.active = false })
 """
+_DRAWN: Final = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
 _LOST: Final = """
 if (window.nedbusLost) return
 window.nedbusLost = document.createElement("div")
@@ -77,6 +81,9 @@ class Viewer:
         self._streams.source.selected.on_change("indices", lambda _, __, rows: self._choose(rows, self._streams.order))
         self._map.marks.selected.on_change("indices", lambda _, __, rows: self._choose(rows, self._map.shown))
         self._other = "?theme=dark" if light else "?theme=light"
+        self._sent, self._updated, self._slow = 0, time.monotonic(), 0.0
+        self._beat, self._drawn = TextInput(visible=False), TextInput(visible=False)  # "" until a browser has drawn
+        self._beat.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=_DRAWN))
         pointing = Toggle(visible=False)
         pointing.on_change("active", lambda _, __, active: setattr(self._streams, "pointing", active))
         document.title = self._name = title
@@ -84,16 +91,21 @@ class Viewer:
         document.config.update(reconnect_session=False, notify_connection_status=False)
         document.js_on_event(ConnectionLost, CustomJS(code=_LOST))
         document.js_on_event(DocumentReady, CustomJS(args={"flag": pointing}, code=_POINTING))
-        document.add_root(self._lay_out(controls, pointing))
+        document.add_root(self._lay_out(controls, pointing, self._beat, self._drawn))
 
     def update(self) -> None:
-        """Send what is new: the map each time, the rest twice a second."""
+        """Send what is new, as soon as the browser has drawn the last: the map each time, the rest twice a second."""
+        now = time.monotonic()
+        if self._sent - int(self._drawn.value or self._sent) >= _AHEAD:
+            return
+        self._slow = now - self._updated if now - self._updated > _SLOW else 0.0
+        self._sent, self._updated = self._sent + 1, now
         picture = self._fleet.picture
         vehicles: dict[str, list[Line]] = {}
         for line in picture.lines:
             vehicles.setdefault(line.address.vehicle, []).append(line)
         mains = [main_line(lines) for lines in vehicles.values()]
-        worst = sorted(map(_worst_of, vehicles.values()), key=lambda line: CONDITIONS.index(line.condition))
+        worst = sorted(map(_worst_of, vehicles.values()), key=lambda line: line.rank)
         if self.chosen is None and worst:
             self.chosen = main_line(vehicles[worst[0].address.vehicle]).address
         self._map.update(picture, mains, self.chosen, self._fleet.origin.projection)
@@ -105,6 +117,7 @@ class Viewer:
         if self._ticks % _AXIS == 0:
             self._plots.move(picture.time)
         self._ticks += 1
+        self._beat.value = str(self._sent)
 
     def restart(self) -> None:
         """Send everything again: the time has jumped."""
@@ -129,12 +142,13 @@ class Viewer:
         ]
         facts += [f"{sum(line.health.lost for line in picture.lines)} lost"]
         facts += [f"{picture.left_out} streams beyond {MAX_STREAMS} are left out"] if picture.left_out else []
+        facts += [f"this browser takes {to_age(self._slow)} for a picture"] if self._slow else []
         link = f'<span class="bad">{escape(picture.link)}</span>' if picture.link else ""
         theme = f'<a href="{self._other}">{self._other.partition("=")[2]}</a>'
         self._head.text = (
             f"<b>{escape(self._name)}</b> &ensp; {counts} {link} &ensp; {' · '.join(facts)} &ensp; {theme}"
         )
-        bad = [line for line in worst if line.condition != "ok"]
+        bad = [line for line in worst if line.rank < CONDITIONS.index("ok")]
         told = [
             f"<div>{badge(line.condition)} {_sentence(line, vehicles[line.address.vehicle])}</div>"
             for line in bad[:_WORST]
@@ -146,7 +160,7 @@ class Viewer:
         self._title.text = f'<b>{escape(str(self.chosen or ""))}</b> <span class="quiet">{escape(where)}</span>'
         self._note.text = f'<span class="quiet">{escape(_frame(self._fleet, mains))}</span>'
 
-    def _lay_out(self, controls: Row | None, hidden: LayoutDOM) -> LayoutDOM:
+    def _lay_out(self, controls: Row | None, *hidden: LayoutDOM) -> LayoutDOM:
         grid = [row(*self._plots.figures[index : index + 2], sizing_mode="stretch_both") for index in (0, 2)]
         self._streams.table.css_classes = ["nedbus-streams"]
         self._streams.table.styles = {"flex": "5 1 0"}
@@ -161,7 +175,7 @@ class Viewer:
             control.stylesheets = [self._style.text_css]
         body = row(left, right, sizing_mode="stretch_both", spacing=8)
         return column(
-            *([self._head, self._worst] + ([controls] if controls else []) + [body, hidden]),
+            *([self._head, self._worst] + ([controls] if controls else []) + [body, *hidden]),
             sizing_mode="stretch_both", stylesheets=[GlobalInlineStyleSheet(css=self._style.page_css)],
             styles={"padding": "8px", "height": "100vh", "box-sizing": "border-box"},
         )  # fmt: skip
@@ -169,8 +183,8 @@ class Viewer:
 
 def _worst_of(lines: Sequence[Line]) -> Line:
     """Return the line that speaks for a vehicle: of its worst condition, and the main one if that is as bad."""
-    worst = min(CONDITIONS.index(line.condition) for line in lines)
-    return main_line([line for line in lines if CONDITIONS.index(line.condition) == worst])
+    worst = min(line.rank for line in lines)
+    return main_line([line for line in lines if line.rank == worst])
 
 
 def _sentence(line: Line, lines: Sequence[Line]) -> str:

@@ -1,0 +1,64 @@
+"""A fleet at 100 Hz in one process: python -m benchmarks.fleet_at_once VEHICLES SECONDS ENDPOINT [noise].
+
+It prints "ready", waits for a line, publishes, and prints by how many seconds it was late at most.
+With noise no two messages are alike, so that a file of them is not compressed better than that of a real flight.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any, Final
+
+import numpy as np
+
+import nedbus
+from nedbus_msgs import FIELD_TYPES, PAYLOAD_SIZE
+from nedbus_msgs.arrays import encode_array
+
+from .forms.fields import FIELDS
+from .forms.nedbus_ends import TOPIC
+
+RATE: Final = 100  # Hz
+NOISY: Final = (
+    "x", "y", "z", "vx", "vy", "vz", "z_deriv", "ax", "ay", "az", "unaided_heading", "heading_var", "eph", "epv",
+)  # fmt: skip
+
+
+def main() -> None:
+    """Publish as the arguments say."""
+    vehicles, seconds, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
+    noise = sys.argv[4:] == ["noise"]
+    messages = np.repeat(nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles if noise else 1)
+    random = np.random.default_rng(1)
+    with nedbus.connect(endpoint) as bus:
+        publishers = [bus.publisher(TOPIC, vehicle=f"v{number}") for number in range(vehicles)]
+        print("ready", flush=True)
+        sys.stdin.readline()
+        start, late = time.monotonic(), 0.0
+        for tick in range(int(seconds * RATE)):
+            payloads = _encode(messages, tick, random if noise else None)
+            wait = start + tick / RATE - time.monotonic()
+            late = max(late, -wait)
+            if wait > 0:
+                time.sleep(wait)
+            # This process stands for as many hosts as there are vehicles: what each would encode is encoded at once.
+            for publisher, payload in zip(publishers, payloads * (vehicles // len(payloads)), strict=True):
+                publisher._put(payload, FIELD_TYPES.keys())  # noqa: SLF001 - what `publish` does with it
+        print(f"{late:.3f}", flush=True)
+        sys.stdin.readline()
+
+
+def _encode(messages: Any, tick: int, random: np.random.Generator | None) -> list[bytes]:
+    """Return the payloads of a tick; all vehicles send the same one without noise."""
+    messages["timestamp"] = 10_000_000 + tick * 10_000
+    messages["timestamp_sample"] = messages["timestamp"] - 5_000
+    if random is not None:
+        for name in NOISY:
+            messages[name] = random.random(len(messages), np.float32)
+    payloads = encode_array(messages)
+    return [payloads[start : start + PAYLOAD_SIZE] for start in range(0, len(payloads), PAYLOAD_SIZE)]
+
+
+if __name__ == "__main__":
+    main()
