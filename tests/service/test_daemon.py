@@ -502,7 +502,7 @@ def test_status_tells_everything(run_nedbus: Start, raw: Session, endpoint: str)
     def ask() -> bool:
         replies = raw.get("nedbus/@service/*/status")
         found[:] = [json.loads(reply.ok.payload.to_bytes()) for reply in replies if reply.ok]
-        return bool(found) and source_of(found[0])["published"] != 0
+        return bool(found and found[0]["sources"]) and source_of(found[0])["published"] != 0
 
     wait_for(ask, what="a status with messages")
     assert {"service", "host", "version", "started", "now", "role", "endpoints", "sources"} == set(found[0])

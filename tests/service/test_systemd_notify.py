@@ -85,7 +85,7 @@ def publishing(source: str, *, listen: str | None = None, connect: str | None = 
     return Daemon(settings, version="0")
 
 
-@pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True)
+@pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
 def test_ready_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
     """READY comes once, when the router accepts connections, with a status; after SIGTERM comes STOPPING."""
     endpoint = free_endpoint()
@@ -256,7 +256,7 @@ def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypat
     ("limit", "process", "interval"),
     [
         ("20000000", None, 10.0),
-        ("20000000", str(os.getpid()), 10.0),
+        pytest.param("20000000", str(os.getpid()), 10.0, id="own"),
         ("20000000", "1", None),  # it is another process that systemd watches
         ("0", None, None),
         ("soon", None, None),

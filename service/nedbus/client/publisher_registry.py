@@ -24,6 +24,7 @@ from .query_server import JSON, Answer, QueryServer, Reply
 
 _log = logging.getLogger(__name__)
 
+_PATIENCE: Final = 2.0  # s for a router that is slow to say which publishers it knows; it answers within milliseconds
 _MIN_WINDOW: Final = 100  # messages
 _ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 
@@ -92,7 +93,7 @@ class PublisherRegistry:
 
     def is_alive(self, address: Address) -> bool:
         """Return whether this address is published already, by this process or another."""
-        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=0.5))
+        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_PATIENCE))
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether there is a subscriber for any of these addresses."""
