@@ -14,7 +14,7 @@ from nedbus_msgs import Address
 from .fleet import TRUTH
 from .stream import COLUMNS, POINTS, Stream
 
-_BUDGET: Final = 12_000  # points of all tracks together: what a browser draws ten times a second
+_BUDGET: Final = 6_000  # points of all tracks together: what a browser draws ten times a second
 _FEWEST: Final = 60  # of a track
 _KINDS: Final = ("valid", "doubtful", "truth")
 _NAMES: Final = ("east", *_KINDS)
