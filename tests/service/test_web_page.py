@@ -400,10 +400,10 @@ def test_recording_is_played(web: Web, tab: Open, flight: Path) -> None:
     pause.click()
     page.page.get_by_text("play", exact=True).wait_for()
     until(lambda: len(page.marks) == 1, "the vehicle")
-    bar = page.page.locator(".noUi-base").bounding_box()
-    assert bar is not None
 
     def jump(share: float) -> None:
+        bar = page.page.locator(".noUi-base").bounding_box()  # now: what is told above it has more or fewer lines
+        assert bar is not None
         page.page.mouse.click(bar["x"] + bar["width"] * share, bar["y"] + bar["height"] / 2)
 
     jump(0.75)
