@@ -8,9 +8,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol, Self, cast
 
@@ -72,6 +73,24 @@ def wait_for_reader(raw: Session, key: str) -> None:
     probe = raw.declare_publisher(key)
     wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
     probe.undeclare()
+
+
+@contextmanager
+def repeating(action: Callable[[], object]) -> Iterator[None]:
+    """Do something fifty times a second, as a vehicle does."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.02):
+            action()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(DEADLINE)
 
 
 def free_endpoint() -> str:

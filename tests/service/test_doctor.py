@@ -33,7 +33,7 @@ from nedbus.transport import (
     publisher_token,
 )
 from nedbus_msgs import ROS2_TYPE, dds_type, encode, status_key
-from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, message, repeating, wait_for
 
 CONFIG = Path(__file__).parents[2] / "config"
 VLP = "vehicle_local_position"
@@ -58,24 +58,6 @@ def found(findings: list[Finding], check: str, state: State, text: str) -> Findi
 
 def is_well(findings: list[Finding]) -> bool:
     return all(each.state != "wrong" for each in findings)
-
-
-@contextmanager
-def repeating(action: Callable[[], object]) -> Iterator[None]:
-    """Do something fifty times a second, as a vehicle does."""
-    stop = threading.Event()
-
-    def run() -> None:
-        while not stop.wait(0.02):
-            action()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(DEADLINE)
 
 
 @contextmanager

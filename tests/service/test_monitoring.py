@@ -450,6 +450,18 @@ def ages(page: Page) -> set[str]:
     return {sample.labels["vehicle"] for sample in families["nedbus_stream_age_seconds"].samples}
 
 
+def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
+    """Pages that stand still would look like vehicles that are silent: the error is raised instead."""
+
+    def fail(_: object) -> None:
+        raise ArithmeticError
+
+    exporter = Exporter(bus, nedbus.Selection(), version="0", watch=fail)
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    with pytest.raises(ArithmeticError):
+        exporter.run(threading.Event())
+
+
 def test_vehicle_that_was_switched_off_has_no_age(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

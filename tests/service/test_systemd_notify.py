@@ -18,7 +18,7 @@ from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.transport import open_router
-from tests.conftest import DEADLINE, Start, free_endpoint, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, repeating, wait_for
 from tests.prometheus import free_port
 
 Datagram = dict[str, str]
@@ -177,24 +177,6 @@ def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
 
 
 @contextmanager
-def ticking(notifier: Notifier) -> Iterator[None]:
-    """Call `tick` again and again, as the main thread of a service does."""
-    end = threading.Event()
-
-    def run() -> None:
-        while not end.wait(0.01):
-            notifier.tick()
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join(DEADLINE)
-
-
-@contextmanager
 def blocking(monkeypatch: pytest.MonkeyPatch, method: str) -> Iterator[threading.Event]:
     """Let the sources of this process block in a method of their output; yield what is set as soon as one does."""
     entered, released = threading.Event(), threading.Event()
@@ -224,7 +206,7 @@ def test_no_watchdog_while_a_source_is_stuck(
     limit = 0.3  # s; a live source goes round every 0.25 s
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": str(round(2e6 * limit))}
     daemon = publishing(source, listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment=environment) as notifier, ticking(notifier):
+    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):
         with blocking(monkeypatch, method) as entered:
             systemd.receive_until(is_ready)
             wait_for(entered.is_set, what="the source to block")
@@ -243,7 +225,7 @@ def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypat
     """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
     daemon = publishing("sim:?speed=max&duration=1", listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment=environment) as notifier, ticking(notifier):  # noqa: SIM117
+    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):  # noqa: SIM117
         with blocking(monkeypatch, "publish") as entered:
             wait_for(entered.is_set, what="the source to wait")
             systemd.receive_until(is_ready)

@@ -172,6 +172,7 @@ def test_only_so_many_streams_are_shown(sky: Sky) -> None:
     picture = sky.look()
     assert (len(picture.lines), picture.left_out) == (MAX_STREAMS, 1)
     assert f"v{MAX_STREAMS}" in {line.address.vehicle for line in picture.lines}
+    assert len(sky.fleet._since) == MAX_STREAMS
 
 
 def test_last_valid_place_is_told(sky: Sky) -> None:
@@ -653,9 +654,10 @@ def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (None, "No such file"),
+        (None, "no such file"),
         ("no JSON", "GeoJSON, or a picture with a world file"),
         ("[]", "GeoJSON, or a picture with a world file"),
+        ('{"type": "Nonsense"}', "'coordinates' is missing"),
         ('{"type": "Nonsense"}', "GeoJSON, or a picture with a world file"),
         ('{"type": "Topology", "objects": {}}', "GeoJSON, or a picture with a world file"),
         ('{"type": "LineString", "coordinates": []}', "GeoJSON, or a picture with a world file"),

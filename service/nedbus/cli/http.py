@@ -13,7 +13,7 @@ import typer
 from nedbus import __version__
 from nedbus.client import Bus
 from nedbus.log_event import about
-from nedbus.settings import split_http
+from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY
 
 from .options import InstanceOption, TopicArgument, TopicOption, VehicleOption, choose, on_bus
@@ -35,7 +35,7 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
     server = HttpServer(where, pages)
     host, _ = split_http(where)
     _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where, extra=about("http"))
-    if host not in {"127.0.0.1", "::1", "localhost"}:
+    if not is_loopback(host):
         _log.warning("whoever reaches %s can read them; nothing can be changed there", where, extra=about("http"))
     try:
         yield

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -13,7 +12,7 @@ from nedbus import __version__
 from nedbus import web as page
 from nedbus.client import Bus
 from nedbus.errors import ConfigError
-from nedbus.settings import split_http
+from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY
 
 from .options import InstanceOption, TopicOption, VehicleOption, choose, lazily_on_bus, write_stderr
@@ -44,27 +43,30 @@ def web(
     ] = None,
 ) -> None:
     """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
-    try:
-        host, port = split_http(listen)
-        for name in origin or ():
-            split_http(name)
-    except ValueError as exc:
-        raise ConfigError("--listen and --origin", str(exc)) from exc
+    host, port = _split("--listen", listen)
+    for name in origin or ():
+        _split("--origin", name)
     selection = choose(None, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
     where = page.Where(host, port, tuple(origin or ()), background)
 
     def tell(url: str) -> None:
         write_stderr(f"open {url} in a browser; Ctrl-C ends it")
-        if host not in {"127.0.0.1", "::1", "localhost"}:
+        if not is_loopback(host):
             write_stderr(
                 f"whoever reaches {listen} can see all vehicles, without a password; nothing can be changed there"
             )
 
-    with ExitStack() as closing:
-        if file is not None:
-            run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
-            return
-        bus = closing.enter_context(open_bus())
+    if file is not None:
+        run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
+        return
+    with open_bus() as bus:
         run_until_stopped(
             lambda stop: page.serve_live(bus, selection, where, version=__version__, stop=stop, tell=tell)
         )
+
+
+def _split(option: str, where: str) -> tuple[str, int]:
+    try:
+        return split_http(where)
+    except ValueError as exc:
+        raise ConfigError(option, str(exc)) from exc

@@ -23,7 +23,7 @@ from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key, get_
 from .publisher_registry import LIVE
 from .thinned_queue import ThinnedQueue
 from .unthinned import Unthinned
-from .zenoh_subscriber import ZenohSubscriber
+from .zenoh_subscriber import ZenohSubscriber, declare_reader, take_all
 
 _log = logging.getLogger(__name__)
 
@@ -130,21 +130,13 @@ class _WholeStream:
     """A stream that nobody thins; a ring, so that Zenoh never waits for it."""
 
     def __init__(self, session: Session, key: str, queue: ThinnedQueue) -> None:
-        every = not queue.newest_only
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None) if every else None
         with while_open():
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key, channel, recovery=recovery)
-            self._misses = self._subscriber.sample_miss_listener(
-                zenoh.handlers.Callback(queue.announce_loss, indirect=False)
-            )
+            self._subscriber, self._misses = declare_reader(session, key, channel, queue)
 
     def take(self) -> list[zenoh.Sample]:
         """Return what has arrived."""
-        batch: list[zenoh.Sample] = []
-        while len(batch) < _CHANNEL and (sample := self._subscriber.handler.try_recv()) is not None:
-            batch.append(sample)
-        return batch
+        return take_all(self._subscriber.handler, [])
 
     def close(self) -> None:
         self._misses.undeclare()

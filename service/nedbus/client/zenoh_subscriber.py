@@ -51,16 +51,10 @@ class ZenohSubscriber:
         self._busy = False
         self._needed = threading.Event()  # the pump is
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None) if every else None
         # No late-publisher detection: after a router's restart its history query would win over recovery.
         history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
         with while_open():
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(
-                session, key_expr, channel, history=history, recovery=recovery
-            )
-            self._misses = self._subscriber.sample_miss_listener(
-                zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False)
-            )
+            self._subscriber, self._misses = declare_reader(session, key_expr, channel, receive_queue, history=history)
             asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
             self._catch_up = CatchUp(session, receive_queue) if every else None
             answers = every and not thinned
@@ -77,7 +71,7 @@ class ZenohSubscriber:
         self._by_reader = True
         if self._receiving.acquire(blocking=False):
             try:
-                if batch := _take(self._handler, []):
+                if batch := take_all(self._handler, []):
                     self._put(batch)
             finally:
                 self._receiving.release()
@@ -144,7 +138,7 @@ class ZenohSubscriber:
             item = handler.try_recv()
             if item is not None:
                 batch.append(item)
-                _take(handler, batch)
+                take_all(handler, batch)
         except zenoh.ZError:
             receive_queue.end()
             return
@@ -186,7 +180,22 @@ class ZenohSubscriber:
         self._queue.ask(Question(*parameters, reply))
 
 
-def _take(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+def declare_reader(
+    session: Session,
+    key_expr: str,
+    channel: zenoh.handlers.RingChannel[zenoh.Sample],
+    receive_queue: ReceiveQueue,
+    *,
+    history: zenoh.ext.HistoryConfig | None = None,
+) -> tuple[zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]], zenoh.ext.SampleMissListener[None]]:
+    """Declare a subscriber that recovers what it missed, unless its queue wants the newest only, and its losses."""
+    recovery = None if receive_queue.newest_only else zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+    subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, channel, history=history, recovery=recovery)
+    misses = subscriber.sample_miss_listener(zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False))
+    return subscriber, misses
+
+
+def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
     """Add all that is there to a batch, up to a full channel, and return it."""
     try:
         while len(batch) < _CHANNEL and (item := handler.try_recv()) is not None:

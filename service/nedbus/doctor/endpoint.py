@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import datetime as dt
-import re
 import socket
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Final
 
 from nedbus.errors import ConnectError, NedbusError
-from nedbus.transport import Certificate, Tls, open_client
+from nedbus.transport import Certificate, Tls, open_client, split_endpoint
 
 from .finding import Finding, brief
 from .handshake import look_at, verify
@@ -18,7 +17,6 @@ from .parallel import within
 from .speaker import identify
 from .validity import explain_unread, judge_validity
 
-_ENDPOINT: Final = re.compile(r"(tcp|tls|udp|ws|quic)/(\S+):(\d+)(?:[?#]\S*)?")
 _RESOLVE: Final = 2.0  # s
 _CONNECT: Final = 2.0  # s
 _OPEN: Final = 1.5  # s
@@ -43,17 +41,17 @@ _KINDS: Final = {  # what listens there, and what to do
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> list[Finding]:
     """Return what is found on the way to one router, up to the first thing that is wrong."""
-    found = _ENDPOINT.fullmatch(endpoint)
-    if found is None:  # a socket in the file system
+    parts = split_endpoint(endpoint)
+    if parts is None:  # a socket in the file system
         return [_open(endpoint, tls, None)]
-    protocol, host, port = found[1], found[2].strip("[]"), int(found[3])
+    protocol, host, port = parts
     wrong = _reach(endpoint, protocol, host, port)
     if wrong is not None:
         return [wrong]
     findings = list(_check_tls(endpoint, host, port, tls)) if protocol == "tls" else []
     if any(finding.state == "wrong" for finding in findings):
         return findings
-    return [*findings, _open(endpoint, tls, (protocol, host, port))]
+    return [*findings, _open(endpoint, tls, parts)]
 
 
 def answers(endpoint: str, findings: list[Finding]) -> bool:
@@ -101,7 +99,7 @@ def _open(endpoint: str, tls: Tls | None, where: tuple[str, str, int] | None) ->
             return Finding(_NAME, endpoint, "ok", "a Zenoh router answers")
     except NedbusError as exc:
         if isinstance(exc, ConnectError) and exc.full:
-            advice = "raise max_sessions in the router's configuration, or name another router: docs/fleet.md"
+            advice = "raise max_sessions in the router's configuration, or name another router: docs/hosts.md"
             return Finding(_NAME, endpoint, "wrong", "the router has no room for more sessions", advice)
         if where is None or where[0] not in {"tcp", "tls"}:
             return Finding(_NAME, endpoint, "wrong", str(exc), "start a Zenoh router there")

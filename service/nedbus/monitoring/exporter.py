@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from typing import Final
 
@@ -46,12 +47,13 @@ class Exporter(Collector):
         self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
     def run(self, stop: threading.Event) -> None:
-        """Read until `stop` is set."""
-        reader = threading.Thread(target=self._read, name="nedbus-export", daemon=True)
-        reader.start()
-        stop.wait()
-        self._subscription.close()
-        reader.join()
+        """Read until `stop` is set; raise what ends the reader before."""
+        with ThreadPoolExecutor(1, thread_name_prefix="nedbus-export") as pool:
+            reading = pool.submit(self._read)
+            reading.add_done_callback(lambda _: stop.set())
+            stop.wait()
+            self._subscription.close()
+            reading.result()
 
     @property
     def healths(self) -> dict[Address, Health]:

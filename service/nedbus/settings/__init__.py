@@ -1,7 +1,16 @@
 """Settings from `nedbus.toml`, the environment and flags; nothing else reads them."""
 
 from .load import find_mistakes, load_settings, locate_setting, locate_source
-from .model import Settings, split_http
+from .model import Settings, is_loopback, split_http
 from .toml_file import place_at
 
-__all__ = ["Settings", "find_mistakes", "load_settings", "locate_setting", "locate_source", "place_at", "split_http"]
+__all__ = [
+    "Settings",
+    "find_mistakes",
+    "is_loopback",
+    "load_settings",
+    "locate_setting",
+    "locate_source",
+    "place_at",
+    "split_http",
+]

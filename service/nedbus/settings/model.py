@@ -45,6 +45,11 @@ def split_http(where: str) -> tuple[str, int]:
     return bare, int(port)
 
 
+def is_loopback(host: str) -> bool:
+    """Return whether only this host reaches what listens on this address."""
+    return host in {"127.0.0.1", "::1", "localhost"}
+
+
 def _http(value: str) -> str:
     split_http(value)
     return value

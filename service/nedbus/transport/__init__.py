@@ -6,7 +6,7 @@ from nedbus.extras import lazy_exports
 
 from .access_rules import CERTIFICATE_PREFIX, RulesChange, certificate_name, read_access_rules, write_access_rules
 from .certificate import Certificate
-from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint
+from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
 from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query, query_kept
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
@@ -101,6 +101,7 @@ __all__ = [
     "renew_certificate",
     "require_unforked",
     "router_endpoints",
+    "split_endpoint",
     "subscription_token",
     "translate_error",
     "while_open",

@@ -13,7 +13,9 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where `nedbus serve` listens, and what clients join, unless something else is set."""
 
 _MAX_PORT: Final = 65_535
-_ENDPOINT = re.compile(r"(?:tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+")
+_ENDPOINT = re.compile(
+    r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
+)
 
 
 def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
@@ -28,14 +30,22 @@ def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
             raise ConfigError(where, f"{endpoint!r} has port {found['port']}: ports are 0 to {_MAX_PORT}")
 
 
+def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
+    """Return protocol, host (without brackets) and port of an endpoint; None for a socket in the file system."""
+    found = _ENDPOINT.fullmatch(endpoint)
+    if found is None or found["host"] is None:
+        return None
+    return found["protocol"], found["host"].strip("[]"), int(found["port"])
+
+
 def explain_endpoints(endpoints: Sequence[str]) -> str | None:
     """Return why none of these can be reached, as far as this host knows: names without an address; else None."""
     unknown = []
     for endpoint in endpoints:
-        found = _ENDPOINT.fullmatch(endpoint)
-        if found is None or found["host"] is None:
+        parts = split_endpoint(endpoint)
+        if parts is None:
             return None
-        host = found["host"].strip("[]")
+        host = parts[1]
         try:
             socket.getaddrinfo(host, None)
         except OSError:

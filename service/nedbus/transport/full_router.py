@@ -8,16 +8,15 @@ Source: what zenohd 1.10.2 sends, and zenoh-protocol's `transport` module.
 from __future__ import annotations
 
 import os
-import re
 import socket
 import ssl
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Final
 
+from .endpoints import split_endpoint
 from .tls import Tls
 
-_ENDPOINT: Final = re.compile(r"(tcp|tls)/(\S+):(\d+)(?:[?#]\S*)?")
 _PATIENCE: Final = 1.0  # s for each step
 _CLIENT: Final = 2  # what InitSyn says of who asks
 _VERSION: Final = 9
@@ -30,10 +29,10 @@ _LARGEST: Final = 4096  # bytes of an answer that are read
 def full_router(endpoints: Sequence[str], tls: Tls | None) -> str | None:
     """Return the first of these endpoints whose router speaks Zenoh and has no room for a session, else None."""
     for endpoint in endpoints:
-        found = _ENDPOINT.fullmatch(endpoint)
-        if found is not None:
+        parts = split_endpoint(endpoint)
+        if parts is not None and parts[0] in {"tcp", "tls"}:
             with suppress(OSError, ValueError, IndexError):
-                if _is_full(found[1], found[2].strip("[]"), int(found[3]), tls):
+                if _is_full(*parts, tls):
                     return endpoint
     return None
 

@@ -113,7 +113,7 @@ def open_client(
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # Of most failures Zenoh says no more than that there is no connection.
-    full = full_router(endpoints, tls)
+    full = None if stop.is_set() else full_router(endpoints, tls)
     if full is not None:
         raise ConnectError(endpoints, timeout, full=full)
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)

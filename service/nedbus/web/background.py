@@ -41,9 +41,11 @@ class Background:
             else:
                 self.rings = list(_rings(json.loads(path.read_text())))
         except OSError as exc:
-            raise ConfigError("--map", f"{path}: {exc.strerror or exc}") from exc
+            raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
         except (ValueError, TypeError, LookupError, RecursionError, Image.DecompressionBombError) as exc:
-            raise ConfigError("--map", f"{path}: {exc}: GeoJSON, or a picture with a world file, in WGS 84") from exc
+            reason = f"{exc} is missing" if isinstance(exc, KeyError) else str(exc)
+            wanted = "GeoJSON, or a picture with a world file, in WGS 84, is expected"
+            raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {wanted}") from exc
         if not self.rings and self.pixels is None:
             raise ConfigError("--map", f"{path}: it has no lines, polygons or points")
 

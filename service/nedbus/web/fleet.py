@@ -120,11 +120,10 @@ class Fleet:
                 self._rejected[report.address] += 1
 
     def clear(self) -> None:
-        """Forget all: the time has jumped."""
+        """Forget all but the common origin: the time has jumped."""
         with self._lock:
             for part in (self.streams, self._truths, self._left_out, self._since, self._rejected, self._reports):
                 part.clear()
-        self.origin.projection = None
 
     def look(
         self,
@@ -145,7 +144,7 @@ class Fleet:
             is_alive = None if alive is None else address in alive
             state = stream_state(health, alive=is_alive, connected=not link)
             condition = _condition(health, state)
-            words = describe_stream(health, state).removeprefix(f"{state.name}").removeprefix(": ")
+            words = describe_stream(health, state).removeprefix(state.name).removeprefix(": ")
             begin = self._begin(address, condition, time, health)
             is_over = condition == "gone" and time - begin > _OVER
             rank = len(CONDITIONS) if is_over else CONDITIONS.index(condition)
@@ -161,6 +160,7 @@ class Fleet:
             if time - self.streams[address].time < _SILENT:
                 return False
             del self.streams[address]
+            self._since.pop(address, None)
             if address.topic == TRUTH:
                 del self._truths[address.vehicle]
         return True

@@ -12,6 +12,7 @@ from nedbus.monitoring import Exporter, Page
 from nedbus_msgs import Selection
 
 from .fleet import Fleet
+from .style import to_clock
 
 LOOK: Final = 500
 """Milliseconds between two pictures of the states."""
@@ -42,8 +43,8 @@ class LiveFleet:
         """Make the picture of now."""
         now = time.time()
         self._broken = None if self._bus.connected else self._broken or now
-        clock = time.strftime("%H:%M:%S", time.localtime(self._broken))
-        link = f"no link to {' or '.join(self._bus.routers)} since {clock}: waiting for it" if self._broken else ""
+        routers = " or ".join(self._bus.routers)
+        link = f"no link to {routers} since {to_clock(self._broken)}: waiting for it" if self._broken else ""
         self.fleet.reject([report for report in self._rejections.take() if self._selection.matches(report.address)])
         alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
         self.fleet.look(now, self._exporter.healths, alive=alive, link=link)

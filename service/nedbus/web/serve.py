@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,11 +51,11 @@ def serve_live(
         document.add_periodic_callback(viewer.update, TICK)
 
     server = where.open(open_page, live.pages)
-    reader = threading.Thread(target=live.run, args=[stop], name="nedbus-web", daemon=True)
-    reader.start()
-    tell(server.url)
-    server.run(stop, live.look, LOOK)
-    reader.join()
+    with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
+        reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
+        tell(server.url)
+        server.run(stop, live.look, LOOK)
+        reading.result()
 
 
 def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:

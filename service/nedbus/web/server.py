@@ -6,6 +6,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 from bokeh.application import Application
@@ -19,12 +20,12 @@ from tornado.web import HTTPError, RequestHandler
 
 from nedbus.errors import ListenError
 from nedbus.monitoring import Page
+from nedbus.settings import is_loopback
 
 MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
-_LOOPBACK: Final = {"127.0.0.1", "::1", "localhost"}
 _POLL: Final = 100  # ms until the end is noticed
 _UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
 
@@ -52,8 +53,8 @@ class WebServer:
             else:
                 open_page(document)
 
-        names = frozenset([*_names_of(host, port), *origins])
-        texts = {"names": names if host in _LOOPBACK else None}
+        names = set(origins)
+        texts = {"names": names if is_loopback(host) else None}
         try:
             self._server = Server(
                 {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=port,
@@ -66,6 +67,7 @@ class WebServer:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --listen"
             raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
+        names |= _names_of(host, self._server.port or port)
         shown = "127.0.0.1" if host in _ANY else host
         self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
 
@@ -127,14 +129,11 @@ class _Text(RequestHandler):
         self.finish(page.content)
 
 
-def _names_of(host: str, port: int) -> list[str]:
+def _names_of(host: str, port: int) -> set[str]:
     """Return under which names a browser may ask for a page on this address."""
     names = {"localhost", "127.0.0.1", "::1", host}
     if host in _ANY:
-        names |= {socket.gethostname(), socket.getfqdn(), *_addresses()}
-    return [f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in sorted(names)]
-
-
-def _addresses() -> set[str]:
-    found: set[Any] = {address[4][0] for address in socket.getaddrinfo(socket.gethostname(), None)}
-    return set(map(str, found))
+        names |= {socket.gethostname(), socket.getfqdn()}
+        with suppress(OSError):  # a host that does not find itself: --origin names it
+            names |= {str(address[4][0]) for address in socket.getaddrinfo(socket.gethostname(), None)}
+    return {f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in names}

@@ -56,7 +56,8 @@ class StreamTable:
         lines = {line.address: line for line in picture.worst_first()}
         if self.pointing:
             order = [address for address in self.order if address in lines]
-            order += [address for address in lines if address not in set(order)]
+            known = set(order)
+            order += [address for address in lines if address not in known]
         else:
             order = list(lines)
         rows = [_cells(lines[address]) for address in order]

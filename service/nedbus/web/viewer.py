@@ -112,7 +112,7 @@ class Viewer:
         if self._ticks % _LOOK == 0:
             self._streams.update(picture, self.chosen)
             self._rejections.update(picture)
-            self._tell(picture, worst, vehicles)
+            self._tell(picture, mains, worst, vehicles)
             self._plots.update(self._fleet, self.chosen, Address(self.chosen.vehicle, TRUTH) if self.chosen else None)
         if self._ticks % _AXIS == 0:
             self._plots.move(picture.time)
@@ -130,9 +130,10 @@ class Viewer:
             self.chosen = addresses[rows[0]]
             self._ticks = 0  # at once
 
-    def _tell(self, picture: Picture, worst: Sequence[Line], vehicles: Mapping[str, Sequence[Line]]) -> None:
+    def _tell(
+        self, picture: Picture, mains: Sequence[Line], worst: Sequence[Line], vehicles: Mapping[str, Sequence[Line]]
+    ) -> None:
         """Write the header, and sentences about the vehicles that are worst."""
-        mains = list(map(main_line, vehicles.values()))
         counted = Counter(line.condition for line in worst)
         counts = "".join(badge(name, counted[name]) for name in CONDITIONS if counted[name])
         facts = [
