@@ -19,9 +19,9 @@ check: $(DEV)  ## lint and types
 quick: $(DEV)  ## the tests that start no process: under a minute
 	$(BIN)/pytest -q -m "not process and not compose"
 
-test: check  ## lint, types, and the tests that need no containers, with branch coverage
+test: check  ## lint, types, and the tests that need no containers in two processes, with branch coverage
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest -q -m "not compose" --junitxml=build/tests.xml
+	$(BIN)/coverage run -m pytest -q -n 2 --dist loadfile -m "not compose" --junitxml=build/tests.xml
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
