@@ -26,9 +26,9 @@ FLOORS = [
 ONLY: dict[str, set[str]] = {
     "zenoh": {
         "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries",
-        "nedbus/client/zenoh_subscriber", "nedbus/client/receive_queue", "nedbus/client/decoder",
+        "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
-        "nedbus/client/acknowledgement", "nedbus/client/catch_up", "nedbus/client/rejections",
+        "nedbus/client/acknowledgement", "nedbus/client/recovery", "nedbus/client/rejections",
         "nedbus/client/query_server", "nedbus/client/qos", "nedbus/client/demand",
         "nedbus/client/thinned_streams", "nedbus/client/thinned_subscriber",
         "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",

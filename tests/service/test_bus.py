@@ -800,7 +800,7 @@ def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> N
 def test_unexpected_error_in_the_pump_is_counted(
     bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A bug that one sample triggers costs that sample, is logged, and the reader goes on."""
+    """A bug that one sample triggers is logged and counted; the sample is asked for again, and the reader goes on."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     subscription = bus.subscribe(mode="every")
@@ -810,7 +810,7 @@ def test_unexpected_error_in_the_pump_is_counted(
         publisher.publish(message(2))
         wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
     publisher.publish(message(3))
-    assert subscription.receive(DEADLINE).message.timestamp == 3
+    assert [subscription.receive(DEADLINE).message.timestamp for _ in range(2)] == [2, 3]
     assert any("left out after an unexpected error" in text for text in caplog.messages)
 
 

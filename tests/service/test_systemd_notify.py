@@ -224,7 +224,7 @@ def test_no_watchdog_while_a_source_is_stuck(
 def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
-    daemon = publishing("sim:?speed=max&duration=1", listen=free_endpoint())
+    daemon = publishing("sim:?speed=max&duration=3600", listen=free_endpoint())
     with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):  # noqa: SIM117
         with blocking(monkeypatch, "publish") as entered:
             wait_for(entered.is_set, what="the source to wait")

@@ -31,6 +31,12 @@ _log = logging.getLogger(__name__)
 MAX_KEYS: Final = 10_000
 """Keys that a reader remembers; no peer can make it remember more."""
 
+REJECTED: Final = b""
+"""The payload of what is not worth queueing."""
+
+WAKE_UP: Final = "nedbus/wake-up"
+"""The encoding of what a session sends to itself so that its reader looks again; nobody reads it."""
+
 Decode = Callable[..., M_co]
 """`nedbus_msgs.decode` or `decode_row`: a payload, and `newer` layouts, to a message."""
 
@@ -41,10 +47,11 @@ _UNKNOWN: Final = Provenance()
 class Stream:
     """What is derived from a key once, and the provenance of its last encoding.
 
-    `key`: that of the whole stream. `thinned`: messages come on the key of a thinned copy of it.
+    `key`: that of the whole stream. `heard`: that on which messages come. `thinned`: these are those of a thinned copy.
     """
 
     key: str
+    heard: str
     address: Address
     thinned: bool = False
     last: tuple[zenoh.Encoding | None, Provenance] = None, _UNKNOWN  # in one piece: two threads look and change it
@@ -74,7 +81,7 @@ class Decoder:
         self._counting = threading.Lock()  # whoever receives and whoever reads both reject
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
-        """Return what is worth queueing, with no losses so far.
+        """Return what is worth queueing, with no losses so far; what is rejected, without its payload, for its number.
 
         A payload of the size that `encode` writes is admitted, and decoded when it is read.
         Any other is decoded here: it must neither displace a valid sample nor take up much memory. For a layout that is
@@ -87,12 +94,18 @@ class Decoder:
             stream = known(key)
             payload = raw.payload.to_bytes()
             if stream is None or len(payload) != PAYLOAD_SIZE:
+                if raw.encoding == WAKE_UP:
+                    continue
                 try:
                     stream = stream or self._remember(key)
-                    self._inspect(payload, raw.kind)
-                except (AddressError, DecodeError) as exc:
+                except AddressError as exc:
                     self.reject(key, exc)
                     continue
+                try:
+                    self._inspect(payload, raw.kind)
+                except DecodeError as exc:
+                    self.reject(key, exc)
+                    payload = REJECTED
             admitted.append((stream, payload, raw, 0))
         return admitted
 
@@ -151,7 +164,7 @@ class Decoder:
     def _remember(self, key: str) -> Stream:
         thinned = "/@" in key  # only who asks for thinned streams gets such keys
         address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
-        stream = Stream(address.key(prefix=self._prefix), address, thinned)
+        stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
         if len(self._streams) < MAX_KEYS:
             self._streams[key] = stream
         return stream

@@ -14,18 +14,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final, get_args
 
 from nedbus.log_event import about
-from nedbus.transport import RawSample, entity_name
+from nedbus.transport import RawSample
 from nedbus_msgs import AddressError
 
 from .decoder import MAX_KEYS, Arrival, Decode, Decoder
+from .follower import Follower
 from .questions import Question, Questions
 from .sample import Counts, M_co, Mode, Sample
-from .sequence_tracker import SequenceTracker
+from .sequence_tracker import Hole
 from .wakeups import Wakeups
 
 if TYPE_CHECKING:
-    from zenoh.ext import Miss
-
     from .batch import Batch
 
 _log = logging.getLogger(__name__)
@@ -35,7 +34,6 @@ CAPACITY: Final = 65_536
 
 _MAX_BATCH: Final = 4096  # messages of a batch
 _FRESH: Final = 1024  # samples that are queued as they are; further ones are going to wait
-_MANY: Final = 8  # samples of one key for which a look at all of them together pays
 
 
 class ReceiveQueue:
@@ -57,37 +55,56 @@ class ReceiveQueue:
         self._lock = threading.Lock()
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
-        self._unreported: dict[str, int] = {}  # losses before a sample that was invalid, by key
-        self._tracker = SequenceTracker()
-        self._announcements: deque[Miss] = deque()
-        self._questions = Questions(self._tracker)
+        self._follower = Follower(decoder)
+        self._questions = Questions(self._follower.tracker)
+        self.announce_loss, self.recover = self._follower.announce, self._follower.recover
         self._arrived = self._dropped = self._received = 0
 
     @property
     def counts(self) -> Counts:
         """What became of the messages so far."""
         with self._lock:
-            self._apply_announcements()
-            dropped = self._dropped + self._tracker.dropped
-            return Counts(self._received, self._tracker.lost, dropped, self._decoder.invalid)
+            self._follower.apply_announcements()
+            tracker = self._follower.tracker
+            return Counts(self._received, tracker.lost, self._dropped + tracker.dropped, self._decoder.invalid)
 
     @property
     def waiting(self) -> int:
         """How many messages wait to be read."""
         return len(self._every) or len(self._newest)
 
-    def announce_loss(self, miss: Miss) -> None:
-        """Note that messages were lost in transit; called on Zenoh's thread, before the next sample."""
-        self._announcements.append(miss)
-
     def count_invalid(self, count: int) -> None:
         """Count samples that could not be queued."""
         self._decoder.count_invalid(count)
 
-    def knows(self, publisher: str) -> bool:
-        """Return whether anything of this publisher has arrived."""
+    @property
+    def held(self) -> int:
+        """How many messages wait for those before them."""
+        return self._follower.held
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether something is missing that may still come."""
+        return self._follower.incomplete
+
+    @property
+    def holes(self) -> list[Hole]:
+        """What is missing, and may still come."""
         with self._lock:
-            return self._tracker.has(publisher, 0) is not None
+            return self._follower.holes
+
+    def beat(self, stream: str, publisher: str, number: int, *, begins: bool) -> None:
+        """Note that a publisher has sent a message that should have arrived by now; see Follower."""
+        unsettled = time.monotonic() < self.unsettled_until
+        with self._lock:
+            self._follower.beat(stream, publisher, number, begins=begins, unsettled=unsettled)
+
+    def fill(self, hole: Hole, found: Sequence[RawSample]) -> None:
+        """Queue what was found of a hole, and what waited for it; what is still missing is lost."""
+        arrivals = self._decoder.admit(found)
+        with self._lock:
+            dropping = self._queue(self._follower.fill(hole, arrivals))
+        self._after_put(dropping=dropping, drained=False)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue all that has arrived, in its order, and reject what is not worth queueing.
@@ -96,27 +113,15 @@ class ReceiveQueue:
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
-            if self._announcements:
-                self._apply_announcements()
-            self._tracker.queue_drops = overflowed
-            self._follow(arrivals)
-            self._arrived += len(arrivals)
-            if self.newest_only:
-                for arrival in arrivals:
-                    self._supersede(arrival)
-            else:
-                overflowed |= self._append(arrivals)
-        if overflowed and not self.newest_only and not self._warned:
-            self._warned = True
-            extra = about("dropped")
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
-        if self._questions:
-            self._answer(drained=True)
+            unsettled = time.monotonic() < self.unsettled_until
+            self._follower.follow(arrivals, overflowed=overflowed, unsettled=unsettled)
+            overflowed |= self._queue(arrivals)
+        self._after_put(dropping=overflowed, drained=True)
 
     def ask(self, question: Question) -> None:
         """Answer a publisher's question as soon as it can be answered; called in a thread of its own."""
         with self._lock:
-            self._apply_announcements()  # of a stream that has ended nothing else does
+            self._follower.apply_announcements()  # of a stream that has ended nothing else does
             self._questions.add(question)
         self._answer(drained=self.idle)
 
@@ -142,15 +147,15 @@ class ReceiveQueue:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while (arrival := self._take()) is not None:
             lost = arrival[3]
-            if self._unreported:
+            if self._follower.unreported:
                 with self._lock:
-                    lost += self._unreported.pop(arrival[0].key, 0)
+                    lost += self._follower.unreported.pop(arrival[0].key, 0)
             sample = self._decoder.decode(arrival, decode, lost=lost)
             if sample is not None:
                 self._received += 1
                 return sample
             with self._lock:
-                self._report_later(arrival[0].key, lost)
+                self._follower.report_later(arrival[0].key, lost)
         return None
 
     def pop_batch(self) -> Batch | None:
@@ -164,8 +169,8 @@ class ReceiveQueue:
             else:
                 taken = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
             lost = sum(lost for _, _, _, lost in taken)
-            if self._unreported:
-                lost += sum(self._unreported.pop(key, 0) for key in {stream.key for stream, _, _, _ in taken})
+            if unreported := self._follower.unreported:
+                lost += sum(unreported.pop(key, 0) for key in {stream.key for stream, _, _, _ in taken})
         if self._questions:
             self._answer(drained=False)
         if not taken:
@@ -173,7 +178,7 @@ class ReceiveQueue:
         batch = make_batch(taken, self._decoder, lost=lost)
         if not len(batch):
             with self._lock:
-                self._report_later(taken[0][0].key, lost)
+                self._follower.report_later(taken[0][0].key, lost)
             return None
         self._received += len(batch)
         return batch
@@ -191,18 +196,22 @@ class ReceiveQueue:
             self._answer(drained=False)
         return taken
 
-    def _follow(self, arrivals: list[Arrival]) -> None:
-        """Note in each arrival how many messages were lost just before it."""
-        tracker = self._tracker
-        if len(arrivals) >= _MANY and len({stream for stream, _, _, _ in arrivals}) == 1:
-            infos = [raw.source_info for _, _, raw, _ in arrivals]
-            numbers = [info.source_sn for info in infos if info is not None]
-            if len(numbers) == len(arrivals) and tracker.arrived_in_order(arrivals[0][0].key, numbers):
-                return
-        for index, (stream, payload, raw, _) in enumerate(arrivals):
-            info = raw.source_info
-            if info is not None and (lost := tracker.arrived(stream.key, info)):
-                arrivals[index] = stream, payload, raw, lost
+    def _queue(self, arrivals: list[Arrival]) -> bool:
+        """Queue all, and return whether older ones had to be dropped."""
+        self._arrived += len(arrivals)
+        if not self.newest_only:
+            return self._append(arrivals)
+        for arrival in arrivals:
+            self._supersede(arrival)
+        return False
+
+    def _after_put(self, *, dropping: bool, drained: bool) -> None:
+        if dropping and not self.newest_only and not self._warned:
+            self._warned = True
+            extra = about("dropped")
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
+        if self._questions:
+            self._answer(drained=drained)
 
     def _append(self, arrivals: list[Arrival]) -> bool:
         """Queue all, and return whether older ones had to be dropped."""
@@ -212,7 +221,7 @@ class ReceiveQueue:
         for _ in range(drops):
             stream, _, _, lost = every.popleft()
             self._dropped += 1
-            self._report_later(stream.key, lost)
+            self._follower.report_later(stream.key, lost)
         return drops > 0
 
     def _supersede(self, arrival: Arrival) -> None:
@@ -226,10 +235,6 @@ class ReceiveQueue:
             return
         self._newest[key] = arrival
 
-    def _report_later(self, key: str, lost: int) -> None:
-        if lost and len(self._unreported) < MAX_KEYS:
-            self._unreported[key] = self._unreported.get(key, 0) + lost
-
     def _answer(self, *, drained: bool) -> None:
         drained = drained and time.monotonic() >= self.unsettled_until
         with self._lock:
@@ -240,8 +245,3 @@ class ReceiveQueue:
                 ready = self._questions.settle(arrived=self._arrived, taken=taken, drained=drained)
         for question in ready:
             question.reply()
-
-    def _apply_announcements(self) -> None:
-        while self._announcements:
-            miss = self._announcements.popleft()
-            self._tracker.announce(entity_name(miss.source), miss.nb)

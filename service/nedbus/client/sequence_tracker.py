@@ -16,14 +16,41 @@ _MAX_PUBLISHERS: Final = 10_000
 SETTLED: Final = 1000
 """Messages of one publisher in a row after which a stream is followed by number alone."""
 
+HELD: Final = -1
+"""In place of a count of losses: the message comes after a hole, `SequenceTracker.hole`, and has to wait for it."""
+
+LATE: Final = -2
+"""In place of a count of losses: the message was here already, or was given up."""
+
+
+@dataclass(slots=True, eq=False)
+class Hole:
+    """Messages `start` to `stop` - 1 of a publisher, which may still be got from it.
+
+    `exact`: all of them were sent for this reader. Of another hole what its publisher does not keep is not lost.
+    """
+
+    stream: str
+    publisher: str
+    start: int
+    stop: int
+    exact: bool
+
 
 @dataclass(slots=True, eq=False)
 class _Sequence:
-    """The sequence of one publisher: the number that comes next, and losses that were announced before their gap."""
+    """The sequence of one publisher.
+
+    `expected` is the number that comes next. `announced` are losses that were announced before their gap.
+    `stream` is the key on which it is heard, None if these are several: then nothing is asked for, so that nobody who
+    publishes under another's name holds up what that one sends.
+    """
 
     publisher: str
+    stream: str | None
     expected: int
     announced: int = 0
+    hole: Hole | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -44,6 +71,10 @@ class SequenceTracker:
     While `queue_drops` is set, a queue before this tracker has perhaps dropped what its reader was too slow for: then
     only announced losses are lost in transit, and the rest of a gap was dropped.
 
+    While `recovering` is set, what is missing is not lost yet: with `asks`, each gap becomes a Hole in `dug`, and what
+    comes after it is held until somebody fills it. Announcements then only tell how much of a gap was lost in transit.
+    `unsettled`: a publisher that is heard for the first time has perhaps sent something before, for this reader.
+
     Memory is bounded: the least recently heard of more than `max_publishers` is forgotten, with what was announced for
     it counted as lost.
     Not thread-safe.
@@ -52,6 +83,9 @@ class SequenceTracker:
     def __init__(self, *, queue_drops: bool = False, max_publishers: int = _MAX_PUBLISHERS) -> None:
         self.dropped = 0
         self.queue_drops = queue_drops
+        self.recovering = self.asks = self.unsettled = False
+        self.hole: Hole | None = None
+        self.dug: list[Hole] = []
         self._max = max_publishers
         self._lost = 0
         self._announced = 0  # the sum of what is announced and not yet seen as a gap
@@ -61,19 +95,19 @@ class SequenceTracker:
     @property
     def lost(self) -> int:
         """Messages that were lost in transit, all publishers together."""
-        return self._lost + self._announced
+        return self._lost if self.recovering else self._lost + self._announced
 
     def announce(self, publisher: str, count: int) -> None:
         """Note that messages of a publisher are lost; the gap in its sequence may follow."""
         sequence = self._publishers.get(publisher)
         if sequence is None:
-            self._lost += count
+            self._lost += 0 if self.recovering else count
         else:
             sequence.announced += count
             self._announced += count
 
     def arrived(self, stream: str, info: SourceInfo) -> int:
-        """Note a message of a stream with its publisher and number; return how many were lost just before it.
+        """Note a message of a stream; return how many of its publisher were lost just before it, or HELD, or LATE.
 
         The publisher's name costs more than all the rest: a stream of which 1,000 messages in a row came from one
         publisher is followed without it, for as long as each number is the expected one.
@@ -105,14 +139,51 @@ class SequenceTracker:
         sequence = self._publishers.get(publisher)
         if sequence is None:
             return None
-        return (sequence.expected + sequence.announced - 1 - number) % _NUMBERS <= _LARGEST_GAP
+        announced = 0 if self.recovering else sequence.announced
+        return (sequence.expected + announced - 1 - number) % _NUMBERS <= _LARGEST_GAP
+
+    def beat(self, stream: str, publisher: str, number: int, *, begins: bool) -> None:
+        """Note that a publisher has sent a message, `number`, that should have arrived by now.
+
+        `begins`: of a publisher that is new here this one is missing.
+        """
+        sequence = self._publishers.get(publisher)
+        if sequence is None:
+            if not self.unsettled and not begins:
+                return
+            first = 0 if self.unsettled else number
+            sequence = self._remember(publisher, stream, first)
+            sequence.hole = Hole(stream, publisher, first, number + 1, exact=False)
+            self.dug.append(sequence.hole)
+        elif (number - sequence.expected) % _NUMBERS <= _LARGEST_GAP:
+            self._dig(sequence, stream, number + 1)
+
+    def fill(self, hole: Hole, first: int) -> None:
+        """Hold no more for a hole of which, from number `first` on, something is here; its stop if nothing is."""
+        sequence = self._publishers.get(hole.publisher) or self._remember(hole.publisher, hole.stream, hole.start)
+        sequence.hole = None
+        if not hole.exact:
+            sequence.expected = first
+
+    def skip(self, hole: Hole) -> int:
+        """Give up what is still missing before the stop of a hole; return how many messages are lost by that."""
+        sequence = self._publishers.get(hole.publisher)
+        step = 0 if sequence is None else (hole.stop - sequence.expected) % _NUMBERS
+        if sequence is None or step > _LARGEST_GAP:
+            return 0
+        sequence.expected = hole.stop % _NUMBERS
+        return self._close_gap(sequence, step)
 
     def _identify(self, stream: str, number: int, publisher: str) -> int:
         sequence = self._publishers.get(publisher)
         if sequence is None:
-            sequence = self._publishers[publisher] = _Sequence(publisher, number)
-            if len(self._publishers) > self._max:
-                self._forget_oldest()
+            late = self.asks and self.unsettled
+            sequence = self._remember(publisher, stream, 0 if late else number)
+            if late and number:
+                sequence.hole = Hole(stream, publisher, 0, number, exact=False)
+                self.dug.append(sequence.hole)
+        elif sequence.stream != stream:
+            sequence.stream = None
         self._publishers.move_to_end(publisher)
         known = self._streams.get(stream)
         if known is None:
@@ -122,23 +193,50 @@ class SequenceTracker:
         step = (number - sequence.expected) % _NUMBERS
         expected = known.sequence is sequence and step == 0
         known.sequence, known.run = sequence, known.run + 1 if expected else 0
+        if step and self._dig(sequence, stream, number):
+            return HELD
         if step <= _LARGEST_GAP:
             sequence.expected = (number + 1) % _NUMBERS
             return self._close_gap(sequence, step)
         if _NUMBERS - step > _REORDERED:
             sequence.expected = (number + 1) % _NUMBERS
-        return 0
+            return 0
+        return LATE if self.recovering and sequence.stream == stream else 0
+
+    def _remember(self, publisher: str, stream: str, expected: int) -> _Sequence:
+        sequence = self._publishers[publisher] = _Sequence(publisher, stream, expected)
+        if len(self._publishers) > self._max:
+            self._forget_oldest()
+        return sequence
+
+    def _dig(self, sequence: _Sequence, stream: str, stop: int) -> bool:
+        """Return whether what is from number `stop` on has to wait for a hole before it."""
+        if sequence.stream != stream:
+            return False
+        if sequence.hole is None:
+            # Across the wrap no question can ask.
+            if not self.asks or not 0 < stop - sequence.expected <= _LARGEST_GAP:
+                return False
+            self._close_announced(sequence, stop - sequence.expected)
+            sequence.hole = Hole(stream, sequence.publisher, sequence.expected, stop, exact=True)
+            self.dug.append(sequence.hole)
+        self.hole = sequence.hole
+        return True
 
     def _close_gap(self, sequence: _Sequence, gap: int) -> int:
-        announced = min(gap, sequence.announced)
+        announced = self._close_announced(sequence, gap)
         lost = announced if self.queue_drops else gap
-        sequence.announced -= announced
-        self._announced -= announced
         self._lost += lost
         self.dropped += gap - lost
         return lost
 
+    def _close_announced(self, sequence: _Sequence, gap: int) -> int:
+        announced = min(gap, sequence.announced)
+        sequence.announced -= announced
+        self._announced -= announced
+        return announced
+
     def _forget_oldest(self) -> None:
         _, oldest = self._publishers.popitem(last=False)
-        self._lost += oldest.announced
+        self._lost += 0 if self.recovering else oldest.announced
         self._announced -= oldest.announced

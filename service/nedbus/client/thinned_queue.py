@@ -56,15 +56,14 @@ class ThinnedQueue(ReceiveQueue):
         self.put(batch)
         self._last = frozenset()
 
-    def _follow(self, arrivals: list[Arrival]) -> None:
-        super()._follow(arrivals)
+    def _queue(self, arrivals: list[Arrival]) -> bool:
         passed = []
         for arrival in arrivals:
             if self._passes(arrival):
                 passed.append(arrival)
             else:
-                self._report_later(arrival[0].key, arrival[3])
-        arrivals[:] = passed
+                self._follower.report_later(arrival[0].key, arrival[3])
+        return super()._queue(passed)
 
     def _passes(self, arrival: Arrival) -> bool:
         stream, _, raw, _ = arrival

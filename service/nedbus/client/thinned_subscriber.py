@@ -21,6 +21,7 @@ from nedbus.transport import Session, alive_keys, follow_alive_keys, query, whil
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key, get_topic
 
 from .publisher_registry import LIVE
+from .recovery import Recovery
 from .thinned_queue import ThinnedQueue
 from .unthinned import Unthinned
 from .zenoh_subscriber import ZenohSubscriber, declare_reader, take_all
@@ -102,7 +103,7 @@ class ThinnedSubscriber(ZenohSubscriber):
         for key in self._wholes.keys() - needed:
             self._wholes.pop(key).close()
         for key in needed - self._wholes.keys():
-            self._wholes[key] = _WholeStream(self._session, key, self._thinned_queue)
+            self._wholes[key] = _WholeStream(self._session, key, self._thinned_queue, self._recovery)
         for key, whole in self._wholes.items():
             batch = whole.take()
             if batch:
@@ -129,16 +130,19 @@ class ThinnedSubscriber(ZenohSubscriber):
 class _WholeStream:
     """A stream that nobody thins; a ring, so that Zenoh never waits for it."""
 
-    def __init__(self, session: Session, key: str, queue: ThinnedQueue) -> None:
+    def __init__(self, session: Session, key: str, queue: ThinnedQueue, recovery: Recovery | None) -> None:
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
         with while_open():
             self._subscriber, self._misses = declare_reader(session, key, channel, queue)
+        self._unwatch = recovery.watch(key) if recovery is not None else None
 
     def take(self) -> list[zenoh.Sample]:
         """Return what has arrived."""
         return take_all(self._subscriber.handler, [])
 
     def close(self) -> None:
+        if self._unwatch is not None:
+            self._unwatch()
         self._misses.undeclare()
         self._subscriber.undeclare()
 

@@ -19,9 +19,10 @@ from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
-from .catch_up import CatchUp
+from .decoder import WAKE_UP
 from .questions import CLOSED, MAX_PENDING, Question, read_parameters
 from .receive_queue import ReceiveQueue
+from .recovery import Recovery
 
 _log = logging.getLogger(__name__)
 
@@ -42,25 +43,30 @@ class ZenohSubscriber:
 
     def __init__(self, session: Session, key_expr: str, receive_queue: ReceiveQueue, *, thinned: bool = False) -> None:
         every = not receive_queue.newest_only
+        self._session = session
         self._queue = receive_queue
         self._name = key_expr
         self._closing = threading.Lock()
         self._closed = False
         self._receiving = threading.Lock()  # whoever has it empties the channel
         self._by_reader = False  # the reader has waited by itself since the pump looked
+        self._reader_waits = False  # for the channel
         self._busy = False
         self._needed = threading.Event()  # the pump is
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
-        # No late-publisher detection: after a router's restart its history query would win over recovery.
+        # No late-publisher detection: after a router's restart it would ask for what recovery asks for.
         history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
         with while_open():
             self._subscriber, self._misses = declare_reader(session, key_expr, channel, receive_queue, history=history)
             asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
-            self._catch_up = CatchUp(session, receive_queue) if every else None
             answers = every and not thinned
             self._asked = session.declare_queryable(ack_key(key_expr), asked) if answers else None
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
+        self._recovery: Recovery | None = None
+        if every:
+            self._recovery = Recovery(session, receive_queue, name=key_expr, begins=not thinned, on_fill=self._wake)
+            self._unwatch = self._recovery.watch(key_expr)
         self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
         self._pump.start()
         if self._asked is not None:
@@ -82,12 +88,19 @@ class ZenohSubscriber:
             self._by_reader = False
             self._needed.set()
             return self._queue.wait(timeout)
+        if self._queue.incomplete:  # what comes next does not come through the channel, perhaps
+            self._by_reader = False
+            self._needed.set()
+            return self._queue.wait(None)
         self._by_reader = True
         if not self._receiving.acquire(blocking=False):
             return self._queue.wait(None)
         try:
-            self._receive()
+            self._reader_waits = True
+            if not self._queue.waiting:  # nothing was recovered since the caller looked
+                self._receive()
         finally:
+            self._reader_waits = False
             self._receiving.release()
         self._queue.wakeups.wake()  # another thread, that could not receive
         return True
@@ -102,8 +115,9 @@ class ZenohSubscriber:
         self._misses.undeclare()
         if self._asked is not None:
             self._asked.undeclare()
-        if self._catch_up is not None:
-            self._catch_up.close()
+        if self._recovery is not None:
+            self._unwatch()
+            self._recovery.close()
         self._subscriber.undeclare()
         self._needed.set()
         self._pump.join(1.0)
@@ -152,11 +166,19 @@ class ZenohSubscriber:
             return
         try:
             overflowed = len(batch) >= _CHANNEL
-            self._queue.put(self._catch_up.complete(batch) if self._catch_up else batch, overflowed=overflowed)
+            self._queue.put(batch, overflowed=overflowed)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             extra = about("bug")
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
             self._queue.count_invalid(len(batch))
+
+    def _wake(self, key: str) -> None:
+        """Let the reader look into the queue, even one that waits for the channel, by something on one of its keys."""
+        self._queue.wakeups.wake()
+        if self._reader_waits:
+            with suppress(zenoh.ZError):  # the session is closed
+                here = zenoh.Locality.SESSION_LOCAL
+                self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
 
     def _listen(self, asked: zenoh.Handler[zenoh.Query]) -> None:
         """Take the questions of publishers, in a thread of its own: Zenoh's would wait for the interpreter's lock."""
@@ -188,9 +210,8 @@ def declare_reader(
     *,
     history: zenoh.ext.HistoryConfig | None = None,
 ) -> tuple[zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]], zenoh.ext.SampleMissListener[None]]:
-    """Declare a subscriber that recovers what it missed, unless its queue wants the newest only, and its losses."""
-    recovery = None if receive_queue.newest_only else zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-    subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, channel, history=history, recovery=recovery)
+    """Declare a subscriber, and let a queue know what is missing."""
+    subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, channel, history=history)
     misses = subscriber.sample_miss_listener(zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False))
     return subscriber, misses
 

@@ -7,7 +7,16 @@ from nedbus.extras import lazy_exports
 from .access_rules import CERTIFICATE_PREFIX, RulesChange, certificate_name, read_access_rules, write_access_rules
 from .certificate import Certificate
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
-from .queries import MAX_ANSWERS, alive_keys, ask_alive_keys, follow_alive_keys, query, query_kept
+from .queries import (
+    MAX_ANSWERS,
+    Heartbeats,
+    alive_keys,
+    ask_alive_keys,
+    ask_kept,
+    follow_alive_keys,
+    follow_heartbeats,
+    query,
+)
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -66,6 +75,7 @@ __all__ = [
     "Attachment",
     "Certificate",
     "CertificateEntry",
+    "Heartbeats",
     "PublisherToken",
     "RawSample",
     "RouterConfig",
@@ -77,11 +87,13 @@ __all__ = [
     "Uplinks",
     "alive_keys",
     "ask_alive_keys",
+    "ask_kept",
     "certificate_name",
     "check_endpoints",
     "dial_endpoint",
     "entity_name",
     "follow_alive_keys",
+    "follow_heartbeats",
     "gid_of_token",
     "is_forked",
     "list_certificates",
@@ -95,7 +107,6 @@ __all__ = [
     "publishers_key_expr",
     "publishers_of_type_key_expr",
     "query",
-    "query_kept",
     "read_access_rules",
     "read_router_config",
     "renew_certificate",

@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final
 
 import zenoh
 
 from .session import RawSample, Session, entity_name, while_open
 
+Heartbeats = dict[str, tuple[str, int]]
+"""By the name of a publisher, the key of its stream and the number of its newest message."""
+
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
+_HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
+_NUMBER: Final = 4  # bytes of a heartbeat
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
 
 
@@ -35,29 +41,62 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
     return [reply.ok for reply in collector.wait(timeout) if reply.ok is not None]
 
 
-def query_kept(session: Session, key: str, publisher: str, *, end: int, timeout: float) -> list[RawSample]:
-    """Return what an advanced publisher still keeps of its messages before number `end`, in order; at most 10,000.
+def ask_kept(
+    session: Session,
+    key: str,
+    publisher: str,
+    numbers: range,
+    *,
+    on_sample: Callable[[int, RawSample], object],
+    on_end: Callable[[], object],
+    timeout: float,
+) -> None:
+    """Ask an advanced publisher for messages that it still keeps, by their numbers, and return at once.
 
-    `publisher` is its name as `entity_name` returns it.
+    `publisher` is its name as `entity_name` returns it. The key is that of its cache, without wildcards: a router finds
+    it at once, while a key expression is compared with the queryables of all publishers.
+    `on_sample` is called with the number of each message, and `on_end` last, on threads of Zenoh's.
     """
-    collector = _Collector()
+
+    def on_reply(reply: zenoh.Reply) -> None:
+        sample, info = reply.ok, reply.ok and reply.ok.source_info
+        if sample is None or info is None or info.source_sn not in numbers:
+            return
+        if str(sample.key_expr) == key and entity_name(info.source_id) == publisher:  # else another's answer
+            on_sample(info.source_sn, sample)
+
     with while_open():
         session.get(
-            f"{key}/@adv/*/{publisher.replace(':', '/')}/**?_sn=..{end - 1}",
-            collector.handler,
+            f"{key}/@adv/pub/{publisher.replace(':', '/')}/_?_sn={numbers.start}..{numbers.stop - 1}",
+            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=_zenoh_timeout(timeout),
         )
-    kept: dict[int, RawSample] = {}
-    for reply in collector.wait(timeout):
-        sample, info = reply.ok, reply.ok and reply.ok.source_info
-        if sample is None or info is None or str(sample.key_expr) != key or entity_name(info.source_id) != publisher:
-            continue  # an error, or another's answer
-        if info.source_sn < end:
-            kept[info.source_sn] = sample
-    return [kept[number] for number in sorted(kept)]
+
+
+def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
+    """Follow the heartbeats of advanced publishers; return a function that takes what came, and one that ends it."""
+    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_HEARTBEATS)
+    with while_open():
+        subscriber = session.declare_subscriber(f"{key_expr}/@adv/pub/**", channel)
+
+    def take() -> Heartbeats:
+        newest: Heartbeats = {}
+        with suppress(zenoh.ZError):  # ended meanwhile
+            for _ in range(_HEARTBEATS):
+                beat = subscriber.handler.try_recv()
+                if beat is None:
+                    break
+                key, _, entity = str(beat.key_expr).partition("/@adv/pub/")
+                publisher = entity.rpartition("/")[0].replace("/", ":")
+                payload = beat.payload.to_bytes()
+                if len(payload) == _NUMBER:
+                    newest[publisher] = key, int.from_bytes(payload, "little")
+        return newest
+
+    return take, subscriber.undeclare
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:

@@ -16,7 +16,7 @@ from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
-from .session import COMMON_SETTINGS, RETRY, Session, error_reason, insert_settings, open_session
+from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
 from .tls import Tls
 
 _log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ def open_router(
             "scouting/delay": 0,  # scouting is off: there are no answers to wait 0.5 s for
             "listen/endpoints": list(router_endpoints(listen)),
             "connect/endpoints": list(connect),
-            "connect/retry": RETRY,
+            "connect/retry": draw_retry(),
             "adminspace/enabled": True,
             "transport/unicast/accept_pending": 1000,
             "transport/link/rx/max_message_size": 2**20,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 import threading
 import time
@@ -24,7 +25,6 @@ Session = zenoh.Session
 RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
 
-RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 _CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
@@ -94,7 +94,7 @@ def open_client(
         "mode": "client",
         "connect/endpoints": list(endpoints),
         "connect/timeout_ms": 0,
-        "connect/retry": RETRY,
+        "connect/retry": draw_retry(),
         "listen/endpoints": [],
         # No peer on the network is trusted: the largest answer that is expected is a status of many sources.
         "transport/link/rx/max_message_size": 2**18,
@@ -102,9 +102,10 @@ def open_client(
     start, reason = time.monotonic(), ""
     stop = stop or threading.Event()
     for pause in chain(_PAUSES, repeat(1.0)):
-        # An endpoint that accepts and then sends nothing may not use up more than the time that there is.
+        # An endpoint that accepts and then sends nothing may not use up much more than the time that there is; but the
+        # session will reconnect with the same timeout, over a slow link perhaps.
         left = start + timeout - time.monotonic()
-        settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(0.2, left)))
+        settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(1.0, left)))
         try:
             return open_session(insert_settings(zenoh.Config(), settings, where="connect"))
         except zenoh.ZError as exc:
@@ -118,6 +119,12 @@ def open_client(
         raise ConnectError(endpoints, timeout, full=full)
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
+
+
+def draw_retry() -> dict[str, float]:
+    """Return when a session tries again to connect; a fleet whose router is back does not come all at once."""
+    first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - nobody is to be surprised
+    return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
 
 
 def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:

@@ -1,0 +1,221 @@
+"""Ask publishers for what is missing in a subscription of mode `every`: each by its exact key, and again.
+
+Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
+all publishers: the restart of a router with 1,000 of them became a storm in which questions went unanswered. Here at
+most 64 questions are open, whatever there is to ask, and one without an answer is asked again for 10 s. Meanwhile only
+what comes after it from the same publisher waits.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+
+from nedbus.errors import NedbusError
+from nedbus.log_event import about
+from nedbus.transport import Heartbeats, RawSample, Session, ask_kept, follow_heartbeats, while_open
+
+from .receive_queue import CAPACITY, ReceiveQueue
+from .sequence_tracker import Hole
+
+_log = logging.getLogger(__name__)
+
+_OPEN: Final = 64  # questions at a time
+_TIMEOUT: Final = 3.0  # s until a question is given up
+_PATIENCE: Final = 10.0  # s after which what is still missing is lost
+_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
+_MOST: Final = 10_000  # messages of one answer; no publisher of nedbus keeps more
+_MAX_SILENT: Final = 1000
+_LOOK: Final = 0.25  # s between two looks at heartbeats
+_UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
+
+
+@dataclass(slots=True, eq=False)
+class _Search:
+    """The questions for one hole; times in monotonic seconds."""
+
+    hole: Hole
+    until: float
+    due: float = 0.0
+    tries: int = 0
+    found: dict[int, RawSample] = field(default_factory=dict)
+    ended: bool = False
+
+    @property
+    def complete(self) -> bool:
+        """Whether its publisher has answered: one that sends the last message has all that it still keeps."""
+        return self.hole.stop - 1 in self.found or len(self.found) >= _MOST
+
+    def add(self, number: int, sample: RawSample) -> None:
+        """Keep an answer; called on a thread of Zenoh's."""
+        if len(self.found) < _MOST:
+            self.found[number] = sample
+
+
+class Recovery:
+    """Fill the holes of a queue; it has a thread that asks, and calls `on_fill` with the key of each that was filled.
+
+    `begins`: of a publisher that is heard for the first time by a heartbeat the newest message is asked for.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        receive_queue: ReceiveQueue,
+        *,
+        name: str,
+        begins: bool,
+        on_fill: Callable[[str], object],
+    ) -> None:
+        self._session = session
+        self._queue = receive_queue
+        self._name = name
+        self._begins = begins
+        self._on_fill = on_fill
+        self._waiting: deque[_Search] = deque()
+        self._searching: dict[Hole, _Search] = {}
+        self._open = 0
+        self._silent: dict[str, None] = {}  # publishers that were asked in vain
+        self._events: queue.SimpleQueue[Hole | _Search | None] = queue.SimpleQueue()
+        self._closed = False
+        self._watched: dict[str, Callable[[], Heartbeats]] = {}
+        self._behind: Heartbeats = {}
+        with while_open():
+            self._links = session.info.declare_transport_events_listener(
+                zenoh.handlers.Callback(self._on_link, indirect=False), history=False
+            )
+        receive_queue.recover(self._events.put)
+        self._thread = threading.Thread(target=self._run, name="nedbus-recovery", daemon=True)
+        self._thread.start()
+
+    def watch(self, key_expr: str) -> Callable[[], object]:
+        """Notice by heartbeats that the newest messages on these keys are missing; return what ends it."""
+        take, undeclare = follow_heartbeats(self._session, key_expr)
+        self._watched = {**self._watched, key_expr: take}  # the thread may be iterating over the other
+
+        def end() -> None:
+            self._watched = {key: each for key, each in self._watched.items() if key != key_expr}
+            undeclare()
+
+        return end
+
+    def close(self) -> None:
+        """Ask no more: what is missing now is lost."""
+        self._closed = True
+        self._events.put(None)
+        with suppress(zenoh.ZError):  # closed already with the session
+            self._links.undeclare()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(_TIMEOUT)
+
+    def _run(self) -> None:
+        try:
+            next_look = time.monotonic() + _LOOK
+            while not self._closed:
+                self._take_events()
+                now = time.monotonic()
+                if now >= next_look:
+                    next_look = now + _LOOK
+                    self._look()
+                with suppress(NedbusError):  # the session is closed
+                    self._ask(now)
+                if self._queue.held > CAPACITY:
+                    self._give_up()
+        except BaseException:
+            _log.exception("%s: recovery ends after an unexpected error", self._name, extra=about("error"))
+            raise
+        finally:
+            self._give_up()
+
+    def _take_events(self) -> None:
+        """Wait for holes and ends of questions, at most until something is due, and note them."""
+        with suppress(queue.Empty):
+            event = self._events.get(timeout=_PAUSES[0] if self._waiting else _LOOK)
+            while True:
+                if isinstance(event, _Search):
+                    self._open -= 1
+                    self._judge(event)
+                elif event is not None:
+                    patience = 0.0 if event.publisher in self._silent else _PATIENCE
+                    self._searching[event] = search = _Search(event, time.monotonic() + patience)
+                    self._waiting.append(search)
+                event = self._events.get_nowait()
+
+    def _ask(self, now: float) -> None:
+        for _ in range(len(self._waiting)):
+            if self._open >= _OPEN:
+                return
+            search = self._waiting.popleft()
+            if search.ended:
+                continue
+            if search.due > now:
+                self._waiting.append(search)
+                continue
+            hole = search.hole
+            search.tries += 1
+            ask_kept(
+                self._session,
+                hole.stream,
+                hole.publisher,
+                range(hole.start, hole.stop),
+                on_sample=search.add,
+                on_end=lambda search=search: self._events.put(search),  # type: ignore[misc]
+                timeout=_TIMEOUT,
+            )
+            self._open += 1
+
+    def _judge(self, search: _Search) -> None:
+        """Decide what follows from the end of a question."""
+        if search.ended:
+            return
+        now = time.monotonic()
+        publisher = search.hole.publisher
+        if search.complete:
+            self._silent.pop(publisher, None)
+            self._fill(search)
+        elif now < search.until:
+            search.due = now + _PAUSES[min(search.tries, len(_PAUSES)) - 1]
+            self._waiting.append(search)
+        else:
+            # Perhaps it keeps nothing. The next hole is asked for once, and nothing waits for that.
+            if not search.found and len(self._silent) < _MAX_SILENT:
+                self._silent[publisher] = None
+            self._fill(search)
+
+    def _fill(self, search: _Search) -> None:
+        search.ended = True
+        self._searching.pop(search.hole, None)
+        try:
+            self._queue.fill(search.hole, list(search.found.values()))
+        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
+            _log.exception(
+                "%s: what was recovered is left out after an unexpected error", self._name, extra=about("bug")
+            )
+            self._queue.fill(search.hole, [])
+        self._on_fill(search.hole.stream)
+
+    def _give_up(self) -> None:
+        """Fill all holes with what was found so far: too much waits, or the subscription ends."""
+        for hole in self._queue.holes:
+            self._fill(self._searching.get(hole) or _Search(hole, 0.0))
+
+    def _look(self) -> None:
+        """Ask for the newest messages that heartbeats of the look before told of, if they have not come since."""
+        for publisher, (key, number) in self._behind.items():
+            self._queue.beat(key, publisher, number, begins=self._begins)
+        newest: Heartbeats = {}
+        for take in self._watched.values():
+            newest |= take()
+        self._behind = newest
+
+    def _on_link(self, _: zenoh.TransportEvent) -> None:
+        self._queue.unsettled_until = time.monotonic() + _UNSETTLED

@@ -1,0 +1,266 @@
+"""What a reader of mode `every` makes of holes: held, filled, given up; without Zenoh."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+
+from nedbus import Counts
+from nedbus.client.questions import Question
+from nedbus.client.receive_queue import ReceiveQueue
+from nedbus.client.sequence_tracker import Hole
+
+from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, drain, junk, make_queue, miss, name_of, raw, timestamps
+
+
+class Recovering:
+    """A queue of mode `every` and the holes that it wants to be filled."""
+
+    def __init__(self) -> None:
+        self.queue: ReceiveQueue = make_queue("every")
+        self.holes: list[Hole] = []
+        self.queue.recover(self.holes.append)
+
+    def put(self, *numbers: int, publisher: str = "a", key: str = KEY, overflowed: bool = False) -> None:
+        self.queue.put([raw(n, timestamp=n + 1, publisher=publisher, key=key) for n in numbers], overflowed=overflowed)
+
+    def fill(self, *numbers: int, hole: int = 0) -> None:
+        """Fill a hole with these messages."""
+        found = self.holes.pop(hole)
+        name = found.publisher.partition(":")[0]
+        self.queue.fill(found, [raw(n, timestamp=n + 1, publisher=name, key=found.stream) for n in numbers])
+
+    @property
+    def numbers(self) -> list[int]:
+        """Take all that is queued."""
+        return [timestamp - 1 for timestamp in timestamps(self.queue)]
+
+    @property
+    def asked(self) -> list[tuple[int, int, bool]]:
+        return [(hole.start, hole.stop, hole.exact) for hole in self.holes]
+
+
+@pytest.fixture
+def recovering() -> Recovering:
+    return Recovering()
+
+
+def test_what_comes_after_a_hole_waits_for_it(recovering: Recovering) -> None:
+    """The reader gets all in order, and nothing is lost."""
+    recovering.put(0, 1, 4, 5)
+    assert recovering.asked == [(2, 4, True)]
+    recovering.put(6)
+    assert recovering.numbers == [0, 1]
+    assert recovering.queue.held == 3
+    recovering.fill(3, 2)
+    assert recovering.numbers == [2, 3, 4, 5, 6]
+    assert recovering.queue.counts == Counts(received=7)
+    assert (recovering.queue.held, recovering.queue.incomplete) == (0, False)
+
+
+def test_others_do_not_wait(recovering: Recovering) -> None:
+    """A hole holds up its own publisher only."""
+    recovering.put(0, 5)
+    recovering.put(0, 1, publisher="b", key=OTHER_KEY)
+    assert len(drain(recovering.queue)) == 3
+
+
+def test_what_is_given_up_is_lost_before_the_next(recovering: Recovering) -> None:
+    """Its publisher kept a part of it: the rest is lost, and told at its place."""
+    recovering.put(0, 6, 7)
+    recovering.fill(4, 5)
+    assert [(sample.message.timestamp - 1, sample.lost) for sample in drain(recovering.queue)] == [
+        (0, 0), (4, 3), (5, 0), (6, 0), (7, 0),
+    ]  # fmt: skip
+    assert recovering.queue.counts == Counts(received=5, lost=3)
+
+
+def test_nothing_found_is_lost(recovering: Recovering) -> None:
+    """The next message tells it."""
+    recovering.put(0, 3)
+    recovering.fill()
+    assert [sample.lost for sample in drain(recovering.queue)] == [0, 2]
+
+
+def test_hole_after_a_hole(recovering: Recovering) -> None:
+    """What waits may have a hole of its own, which is asked for once the first is filled."""
+    recovering.put(0, 2, 4)
+    assert recovering.asked == [(1, 2, True)]
+    recovering.fill(1)
+    assert recovering.asked == [(3, 4, True)]
+    assert recovering.numbers == [0, 1, 2]
+    recovering.fill(3)
+    assert recovering.numbers == [3, 4]
+
+
+def test_newest_messages_are_missed_by_heartbeat(recovering: Recovering) -> None:
+    """Nothing comes after them: the heartbeat tells that they were sent."""
+    recovering.put(0)
+    recovering.queue.beat(KEY, name_of("a"), 0, begins=True)
+    assert not recovering.holes
+    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
+    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
+    assert recovering.asked == [(1, 3, True)]
+    recovering.fill(1, 2)
+    assert recovering.numbers == [0, 1, 2]
+
+
+def test_newest_messages_that_nobody_keeps_are_lost(recovering: Recovering) -> None:
+    """Though no message follows; the next one tells it, whenever it comes."""
+    recovering.put(0)
+    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
+    recovering.fill()
+    assert recovering.queue.counts.lost == 2
+    recovering.put(3)
+    assert [sample.lost for sample in drain(recovering.queue)] == [0, 2]
+    assert recovering.queue.counts.lost == 2
+
+
+def test_message_that_was_on_its_way_is_not_doubled(recovering: Recovering) -> None:
+    """A heartbeat overtook it: it comes by itself, and again as the answer."""
+    recovering.put(0)
+    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
+    recovering.put(1)
+    recovering.fill(1, 2)
+    recovering.put(2, 3)
+    assert recovering.numbers == [0, 1, 2, 3]
+    assert recovering.queue.counts == Counts(received=4)
+
+
+def test_publisher_that_is_new_begins_with_its_newest_message(recovering: Recovering) -> None:
+    """A reader that joins late has missed nothing of what was sent before; what it cannot have is not lost."""
+    recovering.queue.beat(KEY, name_of("a"), 7, begins=False)
+    assert not recovering.holes
+    recovering.queue.beat(KEY, name_of("a"), 7, begins=True)
+    assert recovering.asked == [(7, 8, False)]
+    recovering.fill()
+    recovering.put(8)
+    assert recovering.numbers == [8]
+    assert recovering.queue.counts.lost == 0
+
+
+def test_publisher_that_is_new_after_a_break_is_asked_for_all(recovering: Recovering) -> None:
+    """It began while the link was broken: what it keeps no more is not lost, as nobody knows for whom it was."""
+    recovering.queue.unsettled_until = float("inf")
+    recovering.put(5, 6)
+    recovering.put(0, 1, publisher="b")
+    assert recovering.asked == [(0, 5, False)]
+    recovering.fill(2, 3, 4)
+    assert recovering.numbers == [0, 1, 2, 3, 4, 5, 6]
+    assert recovering.queue.counts == Counts(received=7)
+
+
+def test_full_channel_is_not_asked_for(recovering: Recovering) -> None:
+    """A reader that is too slow for the data is not sent it twice; of that only what was announced was lost."""
+    recovering.put(0)
+    recovering.queue.announce_loss(miss(3))
+    recovering.put(10, overflowed=True)
+    assert not recovering.holes
+    assert recovering.queue.counts == Counts(lost=3, dropped=6)
+
+
+def test_announced_hole_is_no_loss_yet(recovering: Recovering) -> None:
+    """Zenoh announces each gap at once; whether it is a loss is decided here, and once."""
+    recovering.put(0)
+    recovering.queue.announce_loss(miss(3))
+    assert recovering.queue.counts.lost == 0
+    recovering.put(4)
+    recovering.fill(1, 2)
+    assert recovering.queue.counts.lost == 1
+    recovering.queue.announce_loss(miss(3))
+    recovering.put(20, overflowed=True)
+    assert recovering.queue.counts == Counts(lost=4, dropped=12)
+
+
+def test_message_that_comes_too_late_is_left_out(recovering: Recovering) -> None:
+    """It was given up before, and counted: the order that a reader sees is never broken."""
+    recovering.put(0, 3)
+    recovering.fill()
+    recovering.put(1, 4)
+    assert recovering.numbers == [0, 3, 4]
+    assert recovering.queue.counts == Counts(received=3, lost=2)
+
+
+def test_hole_is_filled_once(recovering: Recovering) -> None:
+    """Whoever comes second changes nothing, not even a hole that was found since."""
+    recovering.put(0, 2)
+    hole = recovering.holes[0]
+    recovering.fill(1)
+    recovering.put(5)
+    recovering.queue.fill(hole, [raw(1, timestamp=2)])
+    assert recovering.numbers == [0, 1, 2]
+    assert recovering.asked == [(3, 5, True)]
+
+
+def test_rejected_messages_leave_no_hole(recovering: Recovering) -> None:
+    """They came: they are counted as what they are, and not asked for."""
+    recovering.put(0)
+    recovering.queue.put([raw(1, payload=Payload(b"junk")), raw(2, timestamp=3), junk(b"junk")])
+    assert not recovering.holes
+    assert recovering.numbers == [0, 2]
+    assert recovering.queue.counts == Counts(received=2, invalid=2)
+
+
+def test_rejected_messages_that_wait_are_left_out(recovering: Recovering) -> None:
+    """A hole before them changes nothing in what they are."""
+    recovering.put(0)
+    recovering.queue.put([raw(2, payload=Payload(b"junk")), raw(3, timestamp=4), raw(4, payload=INVALID)])
+    recovering.fill(1)
+    assert recovering.numbers == [0, 1, 3]
+    assert recovering.queue.counts == Counts(received=3, invalid=2)
+
+
+def test_nobody_holds_up_another_by_using_its_name(recovering: Recovering) -> None:
+    """A peer may publish on its own key only, but under any name: then that one's messages wait for nothing."""
+    recovering.put(0)
+    recovering.put(900, key=OTHER_KEY)
+    recovering.put(1, 2)
+    assert not recovering.holes
+    assert sum(sample.vehicle == "1" for sample in drain(recovering.queue)) == 3
+
+
+def test_question_waits_for_a_hole(recovering: Recovering) -> None:
+    """A publisher that asks whether its message was read is answered when the reader has it."""
+    answered: list[int] = []
+    recovering.put(0, 2)
+    recovering.queue.ask(Question(name_of("a"), 2, False, lambda: answered.append(2)))
+    assert not answered
+    recovering.fill(1)
+    assert answered == [2]
+
+
+def test_filling_a_hole_tells_nothing_of_publishers_that_are_unknown(recovering: Recovering) -> None:
+    """What they sent may still be in the channel: only who empties it knows that nothing is left there."""
+    answered: list[str] = []
+    recovering.put(0, 2)
+    recovering.queue.ask(Question(name_of("b"), 7, False, lambda: answered.append("b")))
+    recovering.fill(1)
+    assert not answered
+    recovering.put(3)
+    assert answered == ["b"]
+
+
+@given(st.data(), st.integers(1, 60))
+def test_every_message_is_read_once_or_counted(data: st.DataObject, total: int) -> None:
+    """Whatever arrives, whatever is found of what does not, whenever: in order, once, and the rest is counted."""
+    recovering = Recovering()
+    recovering.put(0)
+    kept = data.draw(st.sets(st.integers(1, total)), label="kept")
+    arriving = sorted(data.draw(st.sets(st.integers(1, total)), label="arriving"))
+    for number in arriving:
+        recovering.put(number)
+        fills = data.draw(st.booleans())
+        if recovering.holes and fills:
+            first = recovering.holes[0]
+            recovering.fill(*(kept & set(range(first.start, first.stop))))
+        if data.draw(st.booleans()):
+            recovering.queue.beat(KEY, name_of("a"), data.draw(st.integers(0, number)), begins=True)
+    recovering.queue.beat(KEY, name_of("a"), total, begins=True)
+    while recovering.holes:
+        hole = recovering.holes[0]
+        recovering.fill(*(kept & set(range(hole.start, hole.stop))))
+        recovering.queue.beat(KEY, name_of("a"), total, begins=True)
+    numbers = recovering.numbers
+    assert numbers == sorted({0, *arriving} | kept)
+    assert recovering.queue.counts == Counts(received=len(numbers), lost=total + 1 - len(numbers))
