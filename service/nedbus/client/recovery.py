@@ -2,7 +2,7 @@
 
 Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
 all publishers: the restart of a router with 1,000 of them became a storm in which questions went unanswered. Here at
-most 64 questions are open, whatever there is to ask, and one without an answer is asked again for 10 s. Meanwhile only
+most 64 questions are open, whatever there is to ask, and one without an answer is asked again for 20 s. Meanwhile only
 what comes after it from the same publisher waits.
 """
 
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 _OPEN: Final = 64  # questions at a time
 _TIMEOUT: Final = 3.0  # s until a question is given up
-_PATIENCE: Final = 10.0  # s after which what is still missing is lost
+_PATIENCE: Final = 20.0  # s of questions after which what is still missing is lost: so long publishers keep it
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
 _MOST: Final = 10_000  # messages of one answer; no publisher of nedbus keeps more
 _MAX_SILENT: Final = 1000
@@ -41,10 +41,11 @@ _UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new pub
 
 @dataclass(slots=True, eq=False)
 class _Search:
-    """The questions for one hole; times in monotonic seconds."""
+    """The questions for one hole, for `patience` seconds from the first on; times in monotonic seconds."""
 
     hole: Hole
-    until: float
+    patience: float
+    until: float | None = None
     due: float = 0.0
     tries: int = 0
     found: dict[int, RawSample] = field(default_factory=dict)
@@ -146,7 +147,7 @@ class Recovery:
                     self._judge(event)
                 elif event is not None:
                     patience = 0.0 if event.publisher in self._silent else _PATIENCE
-                    self._searching[event] = search = _Search(event, time.monotonic() + patience)
+                    self._searching[event] = search = _Search(event, patience)
                     self._waiting.append(search)
                 event = self._events.get_nowait()
 
@@ -162,6 +163,7 @@ class Recovery:
                 continue
             hole = search.hole
             search.tries += 1
+            search.until = search.until or now + search.patience  # not while others were asked before
             ask_kept(
                 self._session,
                 hole.stream,
@@ -182,7 +184,7 @@ class Recovery:
         if search.complete:
             self._silent.pop(publisher, None)
             self._fill(search)
-        elif now < search.until:
+        elif search.until is not None and now < search.until:
             search.due = now + _PAUSES[min(search.tries, len(_PAUSES)) - 1]
             self._waiting.append(search)
         else:
