@@ -306,7 +306,6 @@ def test_newest_messages_survive_a_restart_of_the_router(rest: int) -> None:
         thread = threading.Thread(target=lambda: received.extend(sample.message.timestamp for sample in subscription))
         thread.start()
         publish(publisher, 0)
-        print("X", received)
         wait_for(lambda: received == [0], what="the first message")
         router.close()
         publish(publisher, *range(1, 50))

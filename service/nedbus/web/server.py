@@ -13,8 +13,10 @@ from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
+from bokeh.resources import Component, Resources
 from bokeh.server.auth_provider import NullAuth
 from bokeh.server.server import Server
+from bokeh.server.views.static_handler import StaticHandler
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
@@ -26,6 +28,7 @@ MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
+_PARTS: Final[list[Component]] = ["bokeh", "bokeh-widgets", "bokeh-tables"]
 _POLL: Final = 100  # ms until the end is noticed
 _UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
 
@@ -67,6 +70,9 @@ class WebServer:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --listen"
             raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
+        # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
+        parts = Resources(mode="server", root_url="/", path_versioner=StaticHandler.append_version, components=_PARTS)
+        self._server._tornado.resources = lambda *_: parts  # type: ignore[method-assign]  # noqa: SLF001
         names |= _names_of(host, self._server.port or port)
         shown = "127.0.0.1" if host in _ANY else host
         self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
