@@ -7,7 +7,7 @@ import re
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -112,8 +112,8 @@ def test_every_alert_fires_and_clears(
     rules = shorten(ALERTS.read_text())
     silent, lossy = free_udp_port(), free_udp_port()
     second, missing = free_endpoint(), tmp_path / "flight.ulg"
-    addresses = [f"127.0.0.1:{free_port()}" for _ in range(5)]
-    service, exporter, lonely, lonely_exporter, ended = addresses
+    addresses = [f"127.0.0.1:{free_port()}" for _ in range(7)]
+    service, exporter, lonely, lonely_exporter, ended, full, full_exporter = addresses
     values = tmp_path / "values.json"
     values.write_text(json.dumps([ROW]))
 
@@ -137,15 +137,17 @@ def test_every_alert_fires_and_clears(
     run_nedbus("serve", "-c", second, "--http", lonely, "-s", "sim:?speed=0.3&vehicle=lonely")
     run_nedbus("export", "-c", second, "--http", lonely_exporter)
     to_end = export_ended()
+    small = start_small_router(run_nedbus, tmp_path, full, full_exporter)
     vehicle = fly(lossy, "--drop", "0.3")
     run_nedbus("serve", "-c", endpoint, "--http", service, *configured)
     prometheus = Prometheus(start, tmp_path, rules, {"nedbus": addresses})
-    wait_for(lambda: len(prometheus.query("up == 1")) == 5, what="all five to be scraped", seconds=PATIENCE)
+    wait_for(lambda: len(prometheus.query("up == 1")) == 7, what="all seven to be scraped", seconds=PATIENCE)
     traffic = Traffic(bus, silent)
 
     expected: dict[str, list[dict[str, str]]] = {
         "NedbusDown": [{"instance": ended}],
         "NedbusNoRouter": [{"instance": lonely}, {"instance": lonely_exporter}],
+        "NedbusRouterFull": [{"instance": full, "role": "router"}, {"instance": full_exporter}],
         "NedbusSourceDown": [{"source": sources["missing"], "state": "retrying"}],
         "NedbusSourceSilent": [{"source": sources["silent"]}],
         "NedbusStreamStale": [{"vehicle": "gone", "topic": VLP, "instance": exporter}],
@@ -158,10 +160,12 @@ def test_every_alert_fires_and_clears(
     }
     assert expected.keys() == names_of(rules)
 
-    with traffic.running():
+    with traffic.running(), ExitStack() as crowd:
         of_gone = f'nedbus_messages_received_total{{instance="{exporter}", vehicle="gone"}} > 10'
         wait_for(lambda: prometheus.query(of_gone), what="the vehicle that will be gone", seconds=PATIENCE)
         traffic.bad = True
+        for _ in range(6):  # with the two of the exporter eight of ten
+            crowd.enter_context(nedbus.connect(small))
         router.kill()
         to_end.kill()
         for name, causes in expected.items():
@@ -170,6 +174,7 @@ def test_every_alert_fires_and_clears(
         assert not [text for text in prometheus.annotations() if "<" in text]  # <no value>, <error expanding template>
 
         traffic.bad = False
+        crowd.close()
         route()
         export_ended()
         vehicle.kill()
@@ -180,6 +185,18 @@ def test_every_alert_fires_and_clears(
             wait_for(partial(is_quiet, prometheus, name), what=f"the end of {name}", seconds=PATIENCE)
     assert not any(prometheus.scrape_errors().values())
     assert not prometheus.process.err
+
+
+def start_small_router(run_nedbus: Start, folder: Path, service: str, exporter: str) -> str:
+    """Start a service that is a router with room for ten sessions, and an exporter, which has two; return where."""
+    where, file = free_endpoint(), folder / "small.json5"
+    shipped = (PACKAGING.parent / "config" / "router.json5").read_text()
+    file.write_text(shipped.replace("max_sessions: 1000", "max_sessions: 10"))
+    run_nedbus(
+        "serve", "--router-config", str(file), "-l", where, "--http", service, "-s", "sim:?speed=0.3&vehicle=small"
+    )
+    run_nedbus("export", "--wait", "-c", where, "--http", exporter)
+    return where
 
 
 def is_quiet(prometheus: Prometheus, name: str) -> bool:
@@ -214,6 +231,16 @@ def fires(prometheus: Prometheus, name: str, cause: dict[str, str]) -> Callable[
             "NedbusSourceSilent",
             'nedbus_source_state{state="waiting"} 1x100; nedbus_source_addresses 5x100',
             {"1m30s": False},
+        ),
+        (  # from four fifths on, and not for those who connect for a moment
+            "NedbusRouterFull",
+            'nedbus_sessions{role="router"} 799x100 800x100; nedbus_sessions_max{role="router"} 1000x300',
+            {"1m40s": False, "2m30s": False, "2m50s": True},
+        ),
+        (  # by an exporter, for each router
+            "NedbusRouterFull",
+            'nedbus_router_sessions{router="a"} 10x30 9x10 10x80; nedbus_router_sessions_max{router="a"} 12x300',
+            {"59s": False, "1m20s": False, "1m45s": True},
         ),
     ],
 )
@@ -256,8 +283,9 @@ def test_dashboard_and_rules_use_what_exists(run_nedbus: Start, start: Start, en
     dashboard = json.loads((PACKAGING / "grafana" / "nedbus.json").read_text())
     assert {each["name"] for each in dashboard["templating"]["list"]} == {"datasource", "vehicle", "topic"}
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
-    addresses = [f"127.0.0.1:{free_port()}" for _ in range(2)]
+    addresses = [f"127.0.0.1:{free_port()}" for _ in range(3)]
     run_nedbus("serve", "-c", endpoint, "-s", "sim:", "--http", addresses[0])
+    run_nedbus("serve", "-l", free_endpoint(), "-s", "sim:", "--http", addresses[2])
     run_nedbus("export", "-c", endpoint, "--http", addresses[1])
     prometheus = Prometheus(start, tmp_path, ALERTS.read_text(), {"nedbus": addresses})
     for query in queries:

@@ -16,7 +16,7 @@ from nedbus.errors import ConnectError
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
-from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router
+from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, router_max_sessions
 from nedbus_msgs import decode, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
@@ -50,6 +50,7 @@ class Daemon:
         self._session: Session | None = None
         # In containers every service may be process 1 of the same host name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
+        self.max_sessions: int | None = None  # of the embedded router, when it is open
         self.ready = threading.Event()
         self.role: Role = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
@@ -184,12 +185,14 @@ class Daemon:
         """Open the session; a client waits for its router for as long as it takes."""
         if self.role == "router":
             settings = self._settings
-            return open_router(
+            session = open_router(
                 listen=settings.listen,
                 connect=settings.connect,
                 config_file=settings.router_config,
                 tls=settings.tls if settings.connect else None,
             )
+            self.max_sessions = router_max_sessions(settings.router_config)
+            return session
         logged = False
         while not self._stop.is_set():
             try:

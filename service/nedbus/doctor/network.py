@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from nedbus.transport import Tls, open_client
+from nedbus.transport import RouterState, Tls, open_client
 
 from .clocks import check_clocks
 from .finding import Finding, limit_findings
@@ -16,6 +16,7 @@ from .vehicles import check_vehicles
 from .write_probe import probe_write
 
 _OPEN = 1.5  # s
+_NEARLY_FULL = 0.8  # of the sessions that a router accepts
 
 
 def check_network(
@@ -29,7 +30,7 @@ def check_network(
                 verdict = probe_write(session, writer, vehicle, prefix=prefix)
         seen = observe(session, prefix=prefix, listen=listen)
     groups = (
-        [_count(seen)],
+        _count(seen),
         check_permissions(seen, vehicle, verdict),
         check_services(seen, version=version),
         check_vehicles(seen, vehicle, writes_only=verdict == "allowed" and tls is not None),
@@ -39,7 +40,19 @@ def check_network(
     return [finding for group in groups for finding in limit_findings(list(group))]
 
 
-def _count(seen: Observation) -> Finding:
-    if seen.sessions is None:
-        return Finding("router", "", "ok", "joined; who else is connected this client is not told")
-    return Finding("router", "", "ok", f"joined; sessions that are connected, with this one: {seen.sessions}")
+def _count(seen: Observation) -> list[Finding]:
+    if not seen.routers:
+        return [Finding("router", "", "ok", "joined; who else is connected this client is not told")]
+    return [_judge(router) for router in seen.routers]
+
+
+def _judge(router: RouterState) -> Finding:
+    if router.load is None:
+        return Finding("router", router.zid, "ok", f"sessions that are connected: {router.sessions:,}")
+    seen = f"{router.sessions:,} of {router.max_sessions:,} sessions"
+    if router.load < _NEARLY_FULL:
+        return Finding("router", router.zid, "ok", seen)
+    advice = (
+        "raise max_sessions in its configuration, and how many files it may open, or run a second router: docs/hosts.md"
+    )
+    return Finding("router", router.zid, "warning", seen, advice)

@@ -9,7 +9,16 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Final
 
-from nedbus.transport import PublisherToken, RawSample, Session, alive_keys, publishers_of_type_key_expr, query
+from nedbus.transport import (
+    PublisherToken,
+    RawSample,
+    RouterState,
+    Session,
+    alive_keys,
+    ask_routers,
+    publishers_of_type_key_expr,
+    query,
+)
 from nedbus_msgs import (
     ANY,
     DEFAULT_TOPIC,
@@ -66,7 +75,7 @@ class Observation:
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
     `streams`: what arrived, by key; `publishers`: who declares to publish, by key.
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
-    `sessions`: how many the routers have, None if they do not say; `listened`: for how long streams were [s].
+    `routers`: those that tell this client of their sessions; `listened`: for how long streams were [s].
     """
 
     prefix: str
@@ -77,7 +86,7 @@ class Observation:
     publishers: dict[str, set[str]] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
     ros2: list[PublisherToken] = field(default_factory=list)
-    sessions: int | None = None
+    routers: list[RouterState] = field(default_factory=list)
     listened: float = 0.0
 
 
@@ -92,7 +101,7 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
         )
         closing.callback(here.close)
         closing.callback(anywhere.close)
-        seen.sessions = _count_sessions(session)
+        seen.routers = ask_routers(session, timeout=_TIMEOUT)
         for service in _services(session, prefix):
             in_time = time.monotonic() < start + _CLOCKS
             seen.services.append(_with_clock(session, service) if in_time else service)
@@ -190,17 +199,3 @@ def _ages(session: Session, prefix: str) -> dict[Address, float | None]:
         stamp = answer.timestamp
         ages[address] = None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
     return ages
-
-
-def _count_sessions(session: Session) -> int | None:
-    """Return how many sessions the routers have, this one included; None if they do not tell this client."""
-    counts = []
-    for answer in query(session, "@/*/router", timeout=_TIMEOUT):
-        try:
-            found = json.loads(answer.payload.to_bytes())
-        except (ValueError, RecursionError):
-            continue
-        sessions = found.get("sessions") if isinstance(found, dict) else None
-        if isinstance(sessions, list):
-            counts.append(len(sessions))
-    return sum(counts) if counts else None

@@ -21,6 +21,7 @@ from nedbus_msgs import Address, Row, Selection
 from .exposition import build_info, metrics_page
 from .families import MAX_STREAMS, Stream, is_switched_off, stream_families
 from .http_server import Page
+from .router_watch import RouterWatch
 
 _RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
 
@@ -43,17 +44,22 @@ class Exporter(Collector):
             selection.topic, vehicle=selection.vehicle, instance=selection.instance, mode="every"
         )
         self._monitor = Monitor()
+        self._routers = RouterWatch(bus)
         self._sources: dict[Address, str] = {}
         self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
     def run(self, stop: threading.Event) -> None:
         """Read until `stop` is set; raise what ends the reader before."""
-        with ThreadPoolExecutor(1, thread_name_prefix="nedbus-export") as pool:
+        with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
             reading = pool.submit(self._read)
             reading.add_done_callback(lambda _: stop.set())
+            asking = pool.submit(self._routers.run, stop)
+            asking.add_done_callback(lambda _: stop.set())
             stop.wait()
+            self._routers.close()
             self._subscription.close()
             reading.result()
+            asking.result()
 
     @property
     def healths(self) -> dict[Address, Health]:
@@ -83,7 +89,19 @@ class Exporter(Collector):
         yield GaugeMetricFamily(
             "nedbus_queue_messages", "Messages that wait to be read", value=self._subscription.waiting
         )
+        yield from self._router_families()
         yield from stream_families(self._streams(), messages=_RECEIVED)
+
+    def _router_families(self) -> Iterator[Metric]:
+        sessions = GaugeMetricFamily(
+            "nedbus_router_sessions", "Zenoh sessions at a router of the network, by its id", labels=["router"]
+        )
+        room = GaugeMetricFamily("nedbus_router_sessions_max", "Sessions that a router accepts", labels=["router"])
+        for state in self._routers.states:
+            sessions.add_metric([state.zid], state.sessions)
+            if state.max_sessions is not None:
+                room.add_metric([state.zid], state.max_sessions)
+        yield from (sessions, room)
 
     def _streams(self) -> list[Stream]:
         """Return all streams, those that were seen first first: which ones have labels of their own does not change."""

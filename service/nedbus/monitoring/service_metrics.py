@@ -37,6 +37,10 @@ class ServiceCollector(Collector):
         )
         sessions.add_metric([daemon.role], daemon.sessions)
         yield sessions
+        room = GaugeMetricFamily("nedbus_sessions_max", "Sessions that the embedded router accepts", labels=["role"])
+        if daemon.max_sessions is not None:
+            room.add_metric([daemon.role], daemon.max_sessions)
+        yield room
         streams = [stream for name, source in sources for stream in _streams(name, source)]
         yield from stream_families(streams, messages=_PUBLISHED)
         yield from _source_families(sources)

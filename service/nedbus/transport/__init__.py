@@ -30,7 +30,8 @@ from .rmw_zenoh import (
     publishers_of_type_key_expr,
     subscription_token,
 )
-from .router import RouterConfig, open_router, read_router_config, router_endpoints
+from .router import RouterConfig, open_router, read_router_config, router_endpoints, router_max_sessions
+from .router_state import RouterState, ask_routers
 from .session import (
     LEASE,
     RawSample,
@@ -79,6 +80,7 @@ __all__ = [
     "PublisherToken",
     "RawSample",
     "RouterConfig",
+    "RouterState",
     "RulesChange",
     "Session",
     "SourceInfo",
@@ -88,6 +90,7 @@ __all__ = [
     "alive_keys",
     "ask_alive_keys",
     "ask_kept",
+    "ask_routers",
     "certificate_name",
     "check_endpoints",
     "dial_endpoint",
@@ -112,6 +115,7 @@ __all__ = [
     "renew_certificate",
     "require_unforked",
     "router_endpoints",
+    "router_max_sessions",
     "split_endpoint",
     "subscription_token",
     "translate_error",

@@ -16,6 +16,7 @@ from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
+from .file_limit import allow_sessions
 from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
 from .tls import Tls
 
@@ -35,6 +36,7 @@ def open_router(
     `tls` is for the `tls/` routers that it joins, unless the file has a TLS section of its own.
 
     Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
+    The admin space shows `max_sessions` in `metadata`, and as many files may be open as these sessions need.
 
     Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, a TLS file that cannot be
     read, or a plugin that the file requires.
@@ -69,6 +71,8 @@ def open_router(
     if tls is not None and not json.loads(config.get_json("transport/link/tls")).get("root_ca_certificate"):
         files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
         insert_settings(config, files, where="tls")
+    sessions = _tell_max_sessions(config)
+    allow_sessions(sessions, pending=json.loads(config.get_json("transport/unicast/accept_pending")))
     try:
         return open_session(config)
     except zenoh.ZError as exc:
@@ -83,6 +87,14 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
     if listen or config_file is None:
         return tuple(listen) or (DEFAULT_ENDPOINT,)
     return _endpoints(_read_config(config_file), "listen") or (DEFAULT_ENDPOINT,)
+
+
+def router_max_sessions(config_file: Path | None = None) -> int:
+    """Return how many sessions a router accepts: what the file says, else Zenoh's default.
+
+    Raises ConfigError for a malformed file.
+    """
+    return _max_sessions(zenoh.Config() if config_file is None else _read_config(config_file))
 
 
 class RouterConfig(NamedTuple):
@@ -101,6 +113,19 @@ def read_router_config(path: Path) -> RouterConfig:
         name: Path(value) for name, value in tls.items() if value and name.endswith(("_certificate", "_private_key"))
     }
     return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), files)
+
+
+def _max_sessions(config: zenoh.Config) -> int:
+    return int(config.get_json("transport/unicast/max_sessions"))
+
+
+def _tell_max_sessions(config: zenoh.Config) -> int:
+    """Put `max_sessions` where the admin space shows it, in place of what a file says there; return it."""
+    sessions = _max_sessions(config)
+    metadata = json.loads(config.get_json("metadata"))
+    if metadata is None or isinstance(metadata, dict):  # it is the user's: it may be anything
+        config.insert_json5("metadata", json.dumps({**(metadata or {}), "max_sessions": sessions}))
+    return sessions
 
 
 def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
