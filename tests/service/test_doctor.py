@@ -157,6 +157,14 @@ def test_two_publishers_of_one_address(bus: nedbus.Bus, endpoint: str) -> None:
         found(look(endpoint), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
+def test_two_publishers_at_rest(bus: nedbus.Bus, endpoint: str) -> None:
+    """They send nothing while the doctor listens but heartbeats, each its own."""
+    with nedbus.connect(endpoint) as other:
+        for each in (bus, other):
+            each.publisher(VLP, vehicle="1").publish(message(1))
+        found(look(endpoint), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+
+
 def test_payload_that_is_no_message(raw: Session, endpoint: str) -> None:
     """It is found, with the decoder's reason; another layout is named as such."""
     with repeating(lambda: raw.put(f"nedbus/1/{VLP}", b"junk")):

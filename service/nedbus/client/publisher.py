@@ -82,7 +82,6 @@ class Publisher:
                 priority=qos.priority,
                 cache=zenoh.ext.CacheConfig(KEPT if lossless else qos.cache),
                 sample_miss_detection=misses,
-                publisher_detection=True,
             )
         self._acknowledgement = Acknowledgement(session, self.key, self._publisher, priority=qos.priority)
         self._thinned = ThinnedStreams(session, address, prefix=prefix, vehicle=thinned_demand)

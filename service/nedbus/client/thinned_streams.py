@@ -118,7 +118,6 @@ class _Step:
                 priority=self._priority,
                 cache=zenoh.ext.CacheConfig(max(_MIN_CACHE, math.ceil(_CACHE * self._rate))),
                 sample_miss_detection=misses,
-                publisher_detection=True,
             )
 
     def _withdraw(self) -> None:

@@ -16,6 +16,7 @@ from nedbus.transport import (
     Session,
     alive_keys,
     ask_routers,
+    follow_heartbeats,
     publishers_of_type_key_expr,
     query,
 )
@@ -44,6 +45,7 @@ _TIMEOUT: Final = 1.0  # s of a query
 _MAX_ANSWER: Final = 2**18  # bytes of a status that is read
 _MAX_TIME: Final = 1e11  # s since the epoch that a service may say it is
 _CLOCKS: Final = 2.0  # s after which no further service is asked for its clock
+_MAX_KEYS: Final = 10_000  # whose publishers are told apart
 _MAX_SERVICES: Final = 20  # that are looked at: any peer may claim to be a service
 
 
@@ -73,7 +75,7 @@ class Observation:
     """What was seen.
 
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
-    `streams`: what arrived, by key; `publishers`: who declares to publish, by key.
+    `streams`: what arrived, by key; `publishers`: those whose heartbeats came, by key.
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
     `routers`: those that tell this client of their sessions; `listened`: for how long streams were [s].
     """
@@ -101,12 +103,13 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
         )
         closing.callback(here.close)
         closing.callback(anywhere.close)
+        take_heartbeats, end_heartbeats = follow_heartbeats(session, f"{prefix}/*/**")
+        closing.callback(end_heartbeats)
         seen.routers = ask_routers(session, timeout=_TIMEOUT)
         for service in _services(session, prefix):
             in_time = time.monotonic() < start + _CLOCKS
             seen.services.append(_with_clock(session, service) if in_time else service)
         seen.alive = _alive(session, prefix)
-        seen.publishers = _publishers(session, prefix)
         seen.ros2 = _ros2_publishers(session)
         seen.ages = _ages(session, prefix)
         seen.elsewhere = {
@@ -122,6 +125,9 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
             time.sleep(_TICK)
             here.take()
             anywhere.take()
+            for publisher, (key, _) in take_heartbeats().items():
+                if key in seen.publishers or len(seen.publishers) < _MAX_KEYS:
+                    seen.publishers.setdefault(key, set()).add(publisher)
     seen.streams = here.streams
     seen.listened = time.monotonic() - start
     seen.elsewhere |= {
@@ -164,15 +170,6 @@ def _alive(session: Session, prefix: str) -> list[Address]:
         except AddressError:
             continue
     return addresses
-
-
-def _publishers(session: Session, prefix: str) -> dict[str, set[str]]:
-    """Return who declares to publish each key: two publishers of an address share its token, but not this one."""
-    found: dict[str, set[str]] = {}
-    for token in alive_keys(session, f"{prefix}/*/**/@adv/pub/*/*/**", timeout=_TIMEOUT):
-        key, _, publisher = token.partition("/@adv/pub/")
-        found.setdefault(key, set()).add(publisher)
-    return found
 
 
 def _ros2_publishers(session: Session) -> list[PublisherToken]:

@@ -62,9 +62,9 @@ def _judge(seen: Observation, address: Address, *, flows: bool) -> Iterator[Find
     if stream is not None and stream.error:
         advice = "who publishes this key, and is it nedbus? a newer layout needs a newer nedbus here"
         yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:300]}", advice)
-    declared = len(seen.publishers.get(key, ()))
+    beating = len(seen.publishers.get(key, ()))
     sending = max(len(stream.publishers), len(stream.clocks)) if stream is not None else 0
-    if max(declared, sending) > 1:
+    if max(beating, sending) > 1:
         advice = "their messages alternate for every reader: give one of the two another --vehicle, or stop it"
-        seen_text = f"{max(declared, sending)} publishers of this address"
+        seen_text = f"{max(beating, sending)} publishers of this address"
         yield Finding("vehicle", name, "wrong", seen_text, advice)
