@@ -1,0 +1,135 @@
+"""Two bases and a cloud, each with a router, and vehicles that know both bases: routers that die, and a thin link."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import statistics
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from functools import partial
+
+import pytest
+
+import nedbus
+from nedbus.transport import open_client, query
+from nedbus_msgs import Address
+from tests.conftest import DEADLINE, free_endpoint, wait_for
+
+from .conftest import StartStack
+from .flight import Flight, is_whole
+from .recorder import Recorder, indices
+from .stack import Stack, docker
+
+pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
+
+VLP = "vehicle_local_position"
+NEAR_A, NEAR_B = [Address("1", VLP), Address("2", VLP)], [Address("3", VLP)]
+ALL = [*NEAR_A, *NEAR_B]
+VEHICLES = [f"vehicle-{address.vehicle}" for address in ALL]
+
+
+class Fleet:
+    """The stack, with a port at each of its routers, and a reader of every message at each."""
+
+    def __init__(self, stack: Stack, endpoints: dict[str, str], closing: ExitStack) -> None:
+        """Start it, the vehicles when their routers answer: each is then at the base that it names first."""
+        self.stack = stack
+        self.endpoints = endpoints
+        stack.up(*endpoints)
+        buses = {
+            name: closing.enter_context(nedbus.connect(where, timeout=DEADLINE)) for name, where in endpoints.items()
+        }
+        stack.up(*VEHICLES)
+        self.cloud = buses["cloud"]
+        self.readers = {name: Recorder(bus.subscribe(VLP, mode="every")) for name, bus in buses.items()}
+        self.thin = Recorder(self.cloud.subscribe(VLP, mode="every", max_rate=5))
+        for reader in (*self.readers.values(), self.thin):
+            closing.callback(reader.close)
+        self.wait_for_news(*self.readers)
+
+    def clients(self, router: str) -> int:
+        """Return how many vehicles a router has."""
+        with closing(open_client([self.endpoints[router]], timeout=DEADLINE)) as session:
+            (zid,) = session.info.routers_zid()
+            (answer,) = query(session, f"@/{zid}/router", timeout=DEADLINE)
+        modes = [each["whatami"] for each in json.loads(answer.payload.to_bytes())["sessions"]]
+        return modes.count("client") - 2  # this session, and the reader
+
+    def wait_for_clients(self, router: str, count: int) -> None:
+        """Wait until a router has so many vehicles."""
+        wait_for(lambda: self.clients(router) == count, what=f"{count} vehicles at {router}")
+
+    def wait_for_news(self, *routers: str) -> None:
+        """Wait until the readers at these routers have 100 messages of each vehicle that were sent after this call."""
+        now = time.time_ns()
+        for router in routers:
+            samples = self.readers[router].samples
+            wait_for(partial(_have_news, samples, len(samples), now), what=f"all vehicles at {router}")
+
+    def end(self) -> None:
+        """Stop the vehicles, and wait until everybody has their last messages."""
+        self.stack.compose("stop", *VEHICLES)
+        readers = self.readers.values()
+        wait_for(lambda: all(len({last(each, of) for each in readers}) == 1 for of in ALL), what="the last messages")
+
+
+def _have_news(samples: list[nedbus.Sample], start: int, moment: int) -> bool:
+    news = Counter(each.address for each in samples[start:] if each.sent is not None and each.sent > moment)
+    return all(news[address] >= 100 for address in ALL)
+
+
+def last(reader: Recorder, address: Address) -> int:
+    """Return the timestamp of the last message of an address."""
+    return reader.of(address)[-1].message.timestamp
+
+
+def flown(address: Address) -> Flight:
+    """Return the flight of a vehicle."""
+    return Flight(f"sim:?vehicle={address.vehicle}")
+
+
+@pytest.fixture
+def fleet(make_stack: StartStack) -> Iterator[Fleet]:
+    """Start the fleet."""
+    ports = {"base-a": free_endpoint(), "base-b": free_endpoint()}
+    published = {f"NEDBUS_PUBLISH_{name[-1].upper()}": where.removeprefix("tcp/") for name, where in ports.items()}
+    stack = make_stack("fleet", "docker-compose.fleet.yml", "tests/compose/fleet-ports.yml", **published)
+    with ExitStack() as closing:
+        yield Fleet(stack, {"cloud": stack.endpoint, **ports}, closing)
+
+
+def test_routers_and_radios_die(fleet: Fleet) -> None:
+    """Vehicles go over to the other base and stay there; bases read on without the cloud; nobody loses anything.
+
+    The thinned reader at the cloud gets each 20th of 100 messages a second, and counts nothing as lost.
+    """
+    stack = fleet.stack
+    fleet.wait_for_clients("base-a", 2)
+    fleet.wait_for_clients("base-b", 1)
+    stack.compose("kill", "base-a")
+    fleet.wait_for_news("cloud", "base-b")
+    fleet.wait_for_clients("base-b", 3)
+    assert set(fleet.cloud.vehicles()) == {"1", "2", "3"}
+    stack.compose("start", "base-a")
+    fleet.wait_for_news("base-a")
+    assert (fleet.clients("base-a"), fleet.clients("base-b")) == (0, 3)
+    thinned = {address: fleet.thin.of(address) for address in ALL}
+    stack.compose("kill", "cloud")
+    fleet.wait_for_news("base-a", "base-b")
+    stack.compose("start", "cloud")
+    fleet.wait_for_news("cloud")
+    docker("network", "disconnect", stack.network("radio-b"), stack.container("vehicle-1"))
+    fleet.wait_for_news(*fleet.readers)
+    fleet.wait_for_clients("base-a", 1)
+    fleet.end()
+    for name, reader in fleet.readers.items():
+        for address in ALL:
+            assert is_whole(indices(reader.of(address), flown(address))), f"{address} at {name}"
+        assert reader.subscription.counts.lost == 0, name
+    for address, samples in thinned.items():
+        kept = indices(samples, flown(address))
+        assert statistics.median(after - before for before, after in itertools.pairwise(kept)) == 20
+    assert fleet.thin.subscription.counts.lost == 0
