@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -9,11 +10,12 @@ import pytest
 from nedbus import Counts, Mode
 from nedbus.client.decoder import Decoder
 from nedbus.client.layout_lookup import LayoutLookup
+from nedbus.client.sequence_tracker import Hole
 from nedbus.client.thinned_queue import ThinnedQueue
 from nedbus.client.unthinned import PATIENCE, Unthinned
 from nedbus.transport import RawSample
 
-from .raw_samples import KEY, drain, miss, raw, timestamps
+from .raw_samples import KEY, OTHER_KEY, drain, miss, name_of, raw, timestamps
 
 THINNED = f"{KEY}/@rate/5"
 
@@ -23,10 +25,13 @@ def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> ThinnedQueue:
     return ThinnedQueue(mode, Decoder(LayoutLookup(lambda _: None), prefix="nedbus"), max_rate=max_rate, name="queue")
 
 
-def at(sent: float, number: int | None, *, key: str = THINNED, timestamp: int | None = None) -> RawSample:
+def at(
+    sent: float, number: int | None, *, key: str = THINNED, timestamp: int | None = None, publisher: str = "a"
+) -> RawSample:
     """Return a sample that was sent at this second; its message's timestamp is that, in milliseconds."""
     stamp = SimpleNamespace(get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9)))
-    return raw(number, timestamp=round(sent * 1000) if timestamp is None else timestamp, key=key, stamp=stamp)
+    timestamp = round(sent * 1000) if timestamp is None else timestamp
+    return raw(number, timestamp=timestamp, key=key, publisher=publisher, stamp=stamp)
 
 
 def test_thinned_stream_passes_whole() -> None:
@@ -46,6 +51,20 @@ def test_gap_of_a_thinned_stream_is_lost() -> None:
     queue.put([at(2.6, 8)])
     assert [sample.lost for sample in drain(queue)] == [0, 0, 2, 3]
     assert queue.counts == Counts(received=4, lost=5)
+
+
+def test_whole_stream_begins_with_now_after_a_break() -> None:
+    """A reader turns to it when nobody sends it thinned: what its publisher keeps would take it back in time."""
+    queue = make_queue()
+    holes: list[Hole] = []
+    queue.recover(holes.append)
+    queue.unsettled_until = math.inf
+    queue.put([at(1.0, 50, key=KEY)])
+    queue.beat(OTHER_KEY, name_of("b"), 70, begins=False)
+    assert not holes
+    assert timestamps(queue) == [1000]
+    queue.put([at(2.0, 7, key=f"{OTHER_KEY}/@rate/5", publisher="c")])
+    assert [(hole.stream, hole.start, hole.stop) for hole in holes] == [(f"{OTHER_KEY}/@rate/5", 0, 7)]
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])

@@ -73,7 +73,8 @@ class SequenceTracker:
 
     While `recovering` is set, what is missing is not lost yet: with `asks`, each gap becomes a Hole in `dug`, and what
     comes after it is held until somebody fills it. Announcements then only tell how much of a gap was lost in transit.
-    `unsettled`: a publisher that is heard for the first time has perhaps sent something before, for this reader.
+    `unsettled`: a publisher that is heard for the first time has perhaps sent something before, for this reader; with
+    `thinned` only one that sends thinned, as a reader turns to a whole stream at any time.
 
     Memory is bounded: the least recently heard of more than `max_publishers` is forgotten, with what was announced for
     it counted as lost.
@@ -84,6 +85,7 @@ class SequenceTracker:
         self.dropped = 0
         self.queue_drops = queue_drops
         self.recovering = self.asks = self.unsettled = False
+        self.thinned = False
         self.hole: Hole | None = None
         self.dug: list[Hole] = []
         self._max = max_publishers
@@ -149,9 +151,10 @@ class SequenceTracker:
         """
         sequence = self._publishers.get(publisher)
         if sequence is None:
-            if not self.unsettled and not begins:
+            began = self._may_have_begun(stream)
+            if not began and not begins:
                 return
-            first = 0 if self.unsettled else number
+            first = 0 if began else number
             sequence = self._remember(publisher, stream, first)
             sequence.hole = Hole(stream, publisher, first, number + 1, exact=False)
             self.dug.append(sequence.hole)
@@ -177,7 +180,7 @@ class SequenceTracker:
     def _identify(self, stream: str, number: int, publisher: str) -> int:
         sequence = self._publishers.get(publisher)
         if sequence is None:
-            late = self.asks and self.unsettled
+            late = self.asks and self._may_have_begun(stream)
             sequence = self._remember(publisher, stream, 0 if late else number)
             if late and number:
                 sequence.hole = Hole(stream, publisher, 0, number, exact=False)
@@ -202,6 +205,9 @@ class SequenceTracker:
             sequence.expected = (number + 1) % _NUMBERS
             return 0
         return LATE if self.recovering and sequence.stream == stream else 0
+
+    def _may_have_begun(self, stream: str) -> bool:
+        return self.unsettled and (not self.thinned or "/@" in stream)
 
     def _remember(self, publisher: str, stream: str, expected: int) -> _Sequence:
         sequence = self._publishers[publisher] = _Sequence(publisher, stream, expected)

@@ -43,6 +43,7 @@ class ThinnedQueue(ReceiveQueue):
 
     def __init__(self, mode: Mode, decoder: Decoder, *, max_rate: float, name: str = "") -> None:
         super().__init__(mode, decoder, name=name)
+        self._follower.tracker.thinned = True
         check_max_rate(max_rate)
         self.rate = rate_step(max_rate)
         self.heard: set[str] = set()
