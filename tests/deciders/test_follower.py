@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 
 from nedbus import Counts
+from nedbus.client.publisher_sequence import Hole
 from nedbus.client.questions import Question
 from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.sequence_tracker import Hole
 
 from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, drain, junk, make_queue, miss, name_of, raw, timestamps
 
@@ -83,15 +83,36 @@ def test_nothing_found_is_lost(recovering: Recovering) -> None:
     assert [sample.lost for sample in drain(recovering.queue)] == [0, 2]
 
 
+def test_holes_that_are_known_are_one_question(recovering: Recovering) -> None:
+    """On a link that loses every second message each question would take a round trip, one after the other."""
+    recovering.put(0, 2, 4, 5)
+    assert recovering.asked == [(1, 4, True)]
+    recovering.fill(1, 2, 3)
+    assert recovering.numbers == [0, 1, 2, 3, 4, 5]
+    assert recovering.queue.counts == Counts(received=6)
+
+
 def test_hole_after_a_hole(recovering: Recovering) -> None:
-    """What waits may have a hole of its own, which is asked for once the first is filled."""
-    recovering.put(0, 2, 4)
+    """What waits may have holes, which are asked for together once the first is filled."""
+    recovering.put(0, 2)
+    recovering.put(4, 6, 7)
     assert recovering.asked == [(1, 2, True)]
     recovering.fill(1)
-    assert recovering.asked == [(3, 4, True)]
+    assert recovering.asked == [(3, 6, True)]
     assert recovering.numbers == [0, 1, 2]
     recovering.fill(3)
-    assert recovering.numbers == [3, 4]
+    assert [(sample.message.timestamp - 1, sample.lost) for sample in drain(recovering.queue)] == [
+        (3, 0), (4, 0), (6, 1), (7, 0),
+    ]  # fmt: skip
+
+
+def test_restart_while_a_hole_is_open_is_not_a_gap_of_billions(recovering: Recovering) -> None:
+    """A number that jumps so far is another life of the publisher."""
+    recovering.put(0, 2, 2**31)
+    assert recovering.asked == [(1, 2, True)]
+    recovering.fill(1)
+    assert recovering.queue.counts.lost == 0
+    assert len(drain(recovering.queue)) == 4
 
 
 def test_newest_messages_are_missed_by_heartbeat(recovering: Recovering) -> None:
@@ -149,6 +170,84 @@ def test_publisher_that_is_new_after_a_break_is_asked_for_all(recovering: Recove
     recovering.fill(2, 3, 4)
     assert recovering.numbers == [0, 1, 2, 3, 4, 5, 6]
     assert recovering.queue.counts == Counts(received=7)
+
+
+@pytest.mark.parametrize(
+    ("before", "beat", "after", "found", "read"),
+    [
+        ((), 7, (7,), (7,), [7]),  # the history's answer comes while the question is open
+        ((), 5, (5, 6), (5,), [5, 6]),
+        ((), 5, (4, 5, 6), (5,), [5, 6]),  # what is older than the beginning
+        ((3,), 5, (4, 5), (4, 5), [3, 4, 5]),
+    ],
+)
+@pytest.mark.parametrize("unsettled", [False, True])
+def test_heartbeat_never_doubles_what_comes_by_itself(  # noqa: PLR0917 - a table
+    recovering: Recovering,
+    before: tuple[int, ...],
+    beat: int,
+    after: tuple[int, ...],
+    found: tuple[int, ...],
+    read: list[int],
+    unsettled: bool,
+) -> None:
+    """In order and once, whatever is on its way while the newest message is asked for."""
+    recovering.put(*before)
+    recovering.queue.unsettled_until = float("inf") if unsettled else 0.0
+    recovering.queue.beat(KEY, name_of("a"), beat, begins=True)
+    for number in after:
+        recovering.put(number)
+    while recovering.holes:
+        recovering.fill(*found)
+    numbers = recovering.numbers
+    assert numbers == sorted(set(numbers))
+    assert set(read) <= set(numbers)
+    assert recovering.queue.counts == Counts(received=len(numbers))
+
+
+def test_heartbeats_on_another_key_decide_nothing(recovering: Recovering) -> None:
+    """A peer may send them on its own key, with any name: the messages of that one tell where it publishes."""
+    recovering.queue.beat(OTHER_KEY, name_of("a"), 900, begins=True)
+    recovering.put(0, 1)
+    recovering.put(4)
+    assert recovering.asked[-1] == (2, 4, True)
+    recovering.fill(2, 3, hole=-1)
+    assert recovering.numbers == [0, 1, 2, 3, 4]
+
+
+def test_heartbeats_make_nobody_forgotten(recovering: Recovering) -> None:
+    """Names can be invented: those that only heartbeats tell of have no place of those that publish."""
+    recovering.put(0)
+    for number in range(11_000):
+        recovering.queue.beat(OTHER_KEY, f"{number:x}:1", 5, begins=True)
+    recovering.put(1)
+    recovering.put(3)
+    assert recovering.numbers == [0, 1]
+    assert recovering.asked[-1] == (2, 3, True)
+    assert len(recovering.holes) <= 10_001
+
+
+def test_publisher_that_is_forgotten_with_a_hole_is_counted(recovering: Recovering) -> None:
+    """Memory is bounded: what waited for it is lost, and told."""
+    recovering.queue._follower.tracker._max = 1
+    recovering.put(0, 2, 3)
+    recovering.put(0, publisher="b", key=OTHER_KEY)
+    recovering.put(4)
+    recovering.fill(1)
+    counts = recovering.queue.counts
+    assert counts.lost + len(drain(recovering.queue)) == 6
+
+
+def test_nothing_is_held_any_more(recovering: Recovering) -> None:
+    """When nobody asks any more, what is missing is lost at once."""
+    recovering.put(0, 2)
+    recovering.queue.recover(None)
+    recovering.fill()
+    recovering.put(4)
+    recovering.queue.beat(KEY, name_of("a"), 9, begins=True)
+    assert not recovering.holes
+    assert recovering.numbers == [0, 2, 4]
+    assert recovering.queue.counts == Counts(received=3, lost=2)
 
 
 def test_full_channel_is_not_asked_for(recovering: Recovering) -> None:

@@ -10,7 +10,7 @@ import pytest
 from nedbus import Counts, Mode
 from nedbus.client.decoder import Decoder
 from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.sequence_tracker import Hole
+from nedbus.client.publisher_sequence import Hole
 from nedbus.client.thinned_queue import ThinnedQueue
 from nedbus.client.unthinned import PATIENCE, Unthinned
 from nedbus.transport import RawSample

@@ -216,6 +216,56 @@ def test_answers_of_others_are_left_out(lossy: Lossy, vehicle: nedbus.Bus, publi
     liar.undeclare()
 
 
+@pytest.mark.parametrize(
+    "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
+)
+def test_odd_heartbeats_are_none(lossy: Lossy, vehicle: nedbus.Bus, publisher: nedbus.Publisher, entity: str) -> None:
+    """What no publisher of Zenoh sends asks for nothing, and keeps nobody else from being asked."""
+    vehicle._session.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
+    vehicle._session.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
+    lossy.missing = {1}
+    publish(publisher, 0, 1, 2)
+    assert lossy.receive(3) == [0, 1, 2]
+    publish(publisher, 3)
+    assert lossy.receive(1) == [3]
+    assert {key for key, _, _ in lossy.asked} == {KEY}
+    assert not lossy.subscription._queue.incomplete
+
+
+def test_questions_that_nobody_answers_hold_up_nobody_else(
+    lossy: Lossy, vehicle: nedbus.Bus, publisher: nedbus.Publisher
+) -> None:
+    """A peer may invent publishers by heartbeats, and take the questions for them without an answer."""
+    taken: list[zenoh.Query] = []
+    evil = f"nedbus/evil/{VLP}/@adv/pub"
+    hole = vehicle._session.declare_queryable(f"{evil}/**", zenoh.handlers.Callback(taken.append, indirect=True))
+    for number in range(1, 300):
+        vehicle._session.put(f"{evil}/{number:x}/1/_", b"\x05\x00\x00\x00")
+    wait_for(lambda: taken, what="a question for one that is invented")
+    lossy.missing = {1}
+    publish(publisher, 0, 1, 2)
+    assert lossy.receive(3) == [0, 1, 2]
+    assert lossy.subscription._queue.incomplete  # the others still wait
+    taken.clear()
+    hole.undeclare()
+
+
+def test_recovery_that_ends_holds_nothing(
+    lossy: Lossy, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A bug may end its thread: then what is missing is lost at once, and counted, and the reader goes on."""
+    recovery = lossy.subscription._subscriber._recovery
+    assert recovery is not None
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    monkeypatch.setattr(recovery, "_look", lambda: 1 / 0)
+    wait_for(lambda: not recovery._thread.is_alive(), what="the end of the thread")
+    lossy.missing = {1}
+    publish(publisher, 0, 1, 2)
+    assert lossy.receive(2) == [0, 2]
+    assert lossy.subscription.counts == Counts(received=2, lost=1)
+    assert any("recovery ends after an unexpected error" in text for text in caplog.messages)
+
+
 def test_only_so_many_questions_are_open(bus: nedbus.Bus, vehicle: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """What 200 vehicles miss at the same moment is asked for a few at a time, and all of it comes."""
     monkeypatch.setattr(module, "_OPEN", 8)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 from nedbus.transport import entity_name
 
 from .decoder import MAX_KEYS, Arrival, Decoder
-from .sequence_tracker import HELD, Hole, SequenceTracker
+from .publisher_sequence import LARGEST_GAP, Hole
+from .sequence_tracker import HELD, SequenceTracker
 
 if TYPE_CHECKING:
     from zenoh.ext import Miss
@@ -41,13 +42,13 @@ class Follower:
 
     @property
     def holes(self) -> list[Hole]:
-        """What somebody is to ask for."""
-        return list(self._waiting)
+        """What somebody is to ask for, those for which most arrivals wait first."""
+        return sorted(self._waiting, key=lambda hole: -len(self._waiting[hole]))
 
-    def recover(self, on_hole: Callable[[Hole], object]) -> None:
-        """Call `on_hole` with each hole from now on; it must not wait, and `fill` must follow."""
+    def recover(self, on_hole: Callable[[Hole], object] | None) -> None:
+        """Call `on_hole` with each hole from now on; it must not wait, and `fill` must follow. None: dig no more."""
         self._on_hole = on_hole
-        self.tracker.recovering = True
+        self.tracker.recovering = on_hole is not None
 
     def announce(self, miss: Miss) -> None:
         """Note that messages are missing, or lost if nobody recovers them; called on Zenoh's thread."""
@@ -76,7 +77,9 @@ class Follower:
 
         `begins`: of a publisher that is new here this one is asked for.
         """
-        self.tracker.unsettled, self.tracker.asks = unsettled, True
+        self.tracker.unsettled, self.tracker.asks = unsettled, self.tracker.recovering
+        if not self.tracker.asks or len(self._waiting) >= MAX_KEYS:
+            return
         self.tracker.beat(stream, publisher, number, begins=begins)
         self._announce_holes()
 
@@ -88,18 +91,20 @@ class Follower:
         self.held -= len(waiting)
         here, later = {_number(arrival): arrival for arrival in found}, list[Arrival]()
         for arrival in waiting:  # some may have been on their way
-            if hole.start <= _number(arrival) < hole.stop:
+            if (hole.start if hole.exact else 0) <= _number(arrival) < hole.stop:
                 here[_number(arrival)] = arrival
             else:
                 later.append(arrival)
         tracker, arrivals = self.tracker, [here[number] for number in sorted(here)]
         tracker.queue_drops = tracker.asks = False
-        tracker.fill(hole, min(here, default=hole.stop))
+        if not tracker.fill(hole, min(here, default=hole.stop)):
+            tracker.lose(len({_number(arrival) for arrival in later}) + (hole.stop - hole.start if hole.exact else 0))
+            return []
         self._note(arrivals)
         lost = tracker.skip(hole)
         if lost and len(self._given_up) < MAX_KEYS:
             self._given_up[hole.stream] = self._given_up.get(hole.stream, 0) + lost
-        tracker.asks = True
+        tracker.asks = tracker.recovering
         self._note(later)
         return arrivals + later
 
@@ -146,7 +151,10 @@ class Follower:
     def _announce_holes(self) -> None:
         dug, self.tracker.dug = self.tracker.dug, []
         for hole in dug:
-            self._waiting.setdefault(hole, [])
+            numbers = set(map(_number, self._waiting.setdefault(hole, [])))
+            numbers = {number for number in numbers if 0 <= number - hole.start <= LARGEST_GAP}
+            # What waits already may have gaps of its own: one question for all of them.
+            hole.stop = max([hole.stop, *(number for number in numbers if number - 1 not in numbers)])
             if self._on_hole is not None:
                 self._on_hole(hole)
 

@@ -19,9 +19,9 @@ from nedbus_msgs import AddressError
 
 from .decoder import MAX_KEYS, Arrival, Decode, Decoder
 from .follower import Follower
+from .publisher_sequence import Hole
 from .questions import Question, Questions
 from .sample import Counts, M_co, Mode, Sample
-from .sequence_tracker import Hole
 from .wakeups import Wakeups
 
 if TYPE_CHECKING:
@@ -48,6 +48,8 @@ class ReceiveQueue:
         """Set by whoever receives, while it waits and nothing is left to receive."""
         self.unsettled_until = 0.0
         """Monotonic seconds: until then there may be publishers that sent something, and are not known yet."""
+        self.drains = 0
+        """How often all that had arrived was put."""
         self.wakeups = Wakeups()
         self._name = name
         self._warned = False
@@ -115,6 +117,7 @@ class ReceiveQueue:
         with self._lock:
             unsettled = time.monotonic() < self.unsettled_until
             self._follower.follow(arrivals, overflowed=overflowed, unsettled=unsettled)
+            self.drains += not overflowed
             overflowed |= self._queue(arrivals)
         self._after_put(dropping=overflowed, drained=True)
 

@@ -12,7 +12,7 @@ import logging
 import queue
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -23,13 +23,16 @@ import zenoh
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.transport import Heartbeats, RawSample, Session, ask_kept, follow_heartbeats, while_open
+from nedbus_msgs import PAYLOAD_LIMIT
 
+from .publisher_sequence import Hole
 from .receive_queue import CAPACITY, ReceiveQueue
-from .sequence_tracker import Hole
 
 _log = logging.getLogger(__name__)
 
-_OPEN: Final = 64  # questions at a time
+_OPEN: Final = 64  # questions at a time,
+_OPEN_BEGINNINGS: Final = 16  # of these for what a publisher sent before it was heard,
+_OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
 _TIMEOUT: Final = 3.0  # s until a question is given up
 _PATIENCE: Final = 20.0  # s of questions after which what is still missing is lost: so long publishers keep it
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
@@ -56,9 +59,15 @@ class _Search:
         """Whether its publisher has answered: one that sends the last message has all that it still keeps."""
         return self.hole.stop - 1 in self.found or len(self.found) >= _MOST
 
+    @property
+    def numbers(self) -> range:
+        """What to ask for: without what the last question brought before it ended."""
+        first = next(number for number in range(self.hole.start, self.hole.stop + 1) if number not in self.found)
+        return range(first, self.hole.stop)
+
     def add(self, number: int, sample: RawSample) -> None:
         """Keep an answer; called on a thread of Zenoh's."""
-        if len(self.found) < _MOST:
+        if len(self.found) < _MOST and len(sample.payload) <= PAYLOAD_LIMIT:
             self.found[number] = sample
 
 
@@ -84,12 +93,13 @@ class Recovery:
         self._on_fill = on_fill
         self._waiting: deque[_Search] = deque()
         self._searching: dict[Hole, _Search] = {}
-        self._open = 0
+        self._open: Counter[str] = Counter()  # questions by key; "" for those of beginnings
         self._silent: dict[str, None] = {}  # publishers that were asked in vain
         self._events: queue.SimpleQueue[Hole | _Search | None] = queue.SimpleQueue()
         self._closed = False
         self._watched: dict[str, Callable[[], Heartbeats]] = {}
         self._behind: Heartbeats = {}
+        self._drains = 0  # of the queue, when these were taken
         with while_open():
             self._links = session.info.declare_transport_events_listener(
                 zenoh.handlers.Callback(self._on_link, indirect=False), history=False
@@ -127,14 +137,14 @@ class Recovery:
                 if now >= next_look:
                     next_look = now + _LOOK
                     self._look()
-                with suppress(NedbusError):  # the session is closed
-                    self._ask(now)
+                self._ask(now)
                 if self._queue.held > CAPACITY:
-                    self._give_up()
+                    self._give_up(until=CAPACITY)
         except BaseException:
             _log.exception("%s: recovery ends after an unexpected error", self._name, extra=about("error"))
             raise
         finally:
+            self._queue.recover(None)  # nothing is held from now on
             self._give_up()
 
     def _take_events(self) -> None:
@@ -143,7 +153,8 @@ class Recovery:
             event = self._events.get(timeout=_PAUSES[0] if self._waiting else _LOOK)
             while True:
                 if isinstance(event, _Search):
-                    self._open -= 1
+                    self._open.subtract(_counted(event.hole))
+                    self._open += Counter()  # forget what is 0
                     self._judge(event)
                 elif event is not None:
                     patience = 0.0 if event.publisher in self._silent else _PATIENCE
@@ -153,27 +164,32 @@ class Recovery:
 
     def _ask(self, now: float) -> None:
         for _ in range(len(self._waiting)):
-            if self._open >= _OPEN:
+            if self._open.total() >= _OPEN:
                 return
             search = self._waiting.popleft()
             if search.ended:
                 continue
-            if search.due > now:
+            hole = search.hole
+            full = self._open[""] >= _OPEN_BEGINNINGS if not hole.exact else self._open[hole.stream] >= _OPEN_OF_KEY
+            if search.due > now or full:
                 self._waiting.append(search)
                 continue
-            hole = search.hole
             search.tries += 1
             search.until = search.until or now + search.patience  # not while others were asked before
-            ask_kept(
-                self._session,
-                hole.stream,
-                hole.publisher,
-                range(hole.start, hole.stop),
-                on_sample=search.add,
-                on_end=lambda search=search: self._events.put(search),  # type: ignore[misc]
-                timeout=_TIMEOUT,
-            )
-            self._open += 1
+            try:
+                ask_kept(
+                    self._session,
+                    hole.stream,
+                    hole.publisher,
+                    search.numbers,
+                    on_sample=search.add,
+                    on_end=lambda search=search: self._events.put(search),  # type: ignore[misc]
+                    timeout=_TIMEOUT,
+                )
+            except NedbusError:  # the session is closed
+                self._fill(search)
+            else:
+                self._open.update(_counted(hole))
 
     def _judge(self, search: _Search) -> None:
         """Decide what follows from the end of a question."""
@@ -205,19 +221,29 @@ class Recovery:
             self._queue.fill(search.hole, [])
         self._on_fill(search.hole.stream)
 
-    def _give_up(self) -> None:
-        """Fill all holes with what was found so far: too much waits, or the subscription ends."""
+    def _give_up(self, *, until: int = -1) -> None:
+        """Fill holes with what was found so far, until no more than so many messages wait: too much, or the end."""
         for hole in self._queue.holes:
+            if self._queue.held <= until:
+                return
             self._fill(self._searching.get(hole) or _Search(hole, 0.0))
 
     def _look(self) -> None:
         """Ask for the newest messages that heartbeats of the look before told of, if they have not come since."""
-        for publisher, (key, number) in self._behind.items():
+        if self._behind and not (self._queue.idle or self._queue.drains >= self._drains + 2):
+            return  # what they tell of may be in the channel still
+        for (key, publisher), number in self._behind.items():
             self._queue.beat(key, publisher, number, begins=self._begins)
         newest: Heartbeats = {}
         for take in self._watched.values():
             newest |= take()
-        self._behind = newest
+        self._behind, self._drains = newest, self._queue.drains
 
     def _on_link(self, _: zenoh.TransportEvent) -> None:
         self._queue.unsettled_until = time.monotonic() + _UNSETTLED
+        self._silent.clear()  # they could not answer, perhaps
+
+
+def _counted(hole: Hole) -> tuple[str]:
+    """Return under what a question for a hole counts."""
+    return (hole.stream if hole.exact else "",)

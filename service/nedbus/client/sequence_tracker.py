@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 from nedbus.transport import SourceInfo, entity_name
 
+from .publisher_sequence import LARGEST_GAP, Hole, PublisherSequence, StreamRun
+
 _NUMBERS: Final = 2**32  # Zenoh's sequence numbers wrap here
-_LARGEST_GAP: Final = 2**30  # a step of more is not a gap: the publisher started again
 _REORDERED: Final = 2**16  # a number that is so much too low is late or a duplicate; more is a restart
+_NEVER: Final = -1
+_LOOKED_AT: Final = 100
 _MAX_PUBLISHERS: Final = 10_000
 SETTLED: Final = 1000
 """Messages of one publisher in a row after which a stream is followed by number alone."""
@@ -21,44 +24,6 @@ HELD: Final = -1
 
 LATE: Final = -2
 """In place of a count of losses: the message was here already, or was given up."""
-
-
-@dataclass(slots=True, eq=False)
-class Hole:
-    """Messages `start` to `stop` - 1 of a publisher, which may still be got from it.
-
-    `exact`: all of them were sent for this reader. Of another hole what its publisher does not keep is not lost.
-    """
-
-    stream: str
-    publisher: str
-    start: int
-    stop: int
-    exact: bool
-
-
-@dataclass(slots=True, eq=False)
-class _Sequence:
-    """The sequence of one publisher.
-
-    `expected` is the number that comes next. `announced` are losses that were announced before their gap.
-    `stream` is the key on which it is heard, None if these are several: then nothing is asked for, so that nobody who
-    publishes under another's name holds up what that one sends.
-    """
-
-    publisher: str
-    stream: str | None
-    expected: int
-    announced: int = 0
-    hole: Hole | None = None
-
-
-@dataclass(slots=True, eq=False)
-class _Stream:
-    """One key: the publisher of its last message, and how many in a row came from it."""
-
-    sequence: _Sequence
-    run: int = 0
 
 
 class SequenceTracker:
@@ -91,8 +56,8 @@ class SequenceTracker:
         self._max = max_publishers
         self._lost = 0
         self._announced = 0  # the sum of what is announced and not yet seen as a gap
-        self._publishers: OrderedDict[str, _Sequence] = OrderedDict()  # the most recently heard last
-        self._streams: dict[str, _Stream] = {}  # by key
+        self._publishers: OrderedDict[str, PublisherSequence] = OrderedDict()  # the most recently heard last
+        self._streams: dict[str, StreamRun] = {}  # by key
 
     @property
     def lost(self) -> int:
@@ -142,7 +107,7 @@ class SequenceTracker:
         if sequence is None:
             return None
         announced = 0 if self.recovering else sequence.announced
-        return (sequence.expected + announced - 1 - number) % _NUMBERS <= _LARGEST_GAP
+        return (sequence.expected + announced - 1 - number) % _NUMBERS <= LARGEST_GAP
 
     def beat(self, stream: str, publisher: str, number: int, *, begins: bool) -> None:
         """Note that a publisher has sent a message, `number`, that should have arrived by now.
@@ -152,33 +117,49 @@ class SequenceTracker:
         sequence = self._publishers.get(publisher)
         if sequence is None:
             began = self._may_have_begun(stream)
-            if not began and not begins:
-                return
+            if len(self._publishers) >= self._max or not (began or begins):
+                return  # nobody is forgotten for who has sent nothing
             first = 0 if began else number
             sequence = self._remember(publisher, stream, first)
+            sequence.heard = False
             sequence.hole = Hole(stream, publisher, first, number + 1, exact=False)
             self.dug.append(sequence.hole)
-        elif (number - sequence.expected) % _NUMBERS <= _LARGEST_GAP:
+        elif (number - sequence.expected) % _NUMBERS <= LARGEST_GAP:
             self._dig(sequence, stream, number + 1)
 
-    def fill(self, hole: Hole, first: int) -> None:
-        """Hold no more for a hole of which, from number `first` on, something is here; its stop if nothing is."""
-        sequence = self._publishers.get(hole.publisher) or self._remember(hole.publisher, hole.stream, hole.start)
+    def fill(self, hole: Hole, first: int) -> bool:
+        """Hold no more for a hole of which, from number `first` on, something is here; its stop if nothing is.
+
+        Returns False if its publisher was forgotten meanwhile.
+        """
+        sequence = self._publishers.get(hole.publisher)
+        if sequence is None or sequence.hole is not hole:
+            return False
         sequence.hole = None
-        if not hole.exact:
+        if not hole.exact and sequence.expected == hole.start:  # else some came by themselves
             sequence.expected = first
+        return True
+
+    def lose(self, count: int) -> None:
+        """Count messages of a publisher that was forgotten."""
+        self._lost += count
 
     def skip(self, hole: Hole) -> int:
         """Give up what is still missing before the stop of a hole; return how many messages are lost by that."""
         sequence = self._publishers.get(hole.publisher)
         step = 0 if sequence is None else (hole.stop - sequence.expected) % _NUMBERS
-        if sequence is None or step > _LARGEST_GAP:
+        if sequence is None or step > LARGEST_GAP:
             return 0
         sequence.expected = hole.stop % _NUMBERS
         return self._close_gap(sequence, step)
 
     def _identify(self, stream: str, number: int, publisher: str) -> int:
         sequence = self._publishers.get(publisher)
+        if sequence is not None and not sequence.heard:
+            if sequence.stream != stream:  # whoever sent those heartbeats was not this publisher
+                sequence = None
+            else:
+                sequence.heard = True
         if sequence is None:
             late = self.asks and self._may_have_begun(stream)
             sequence = self._remember(publisher, stream, 0 if late else number)
@@ -190,7 +171,7 @@ class SequenceTracker:
         self._publishers.move_to_end(publisher)
         known = self._streams.get(stream)
         if known is None:
-            known = self._streams[stream] = _Stream(sequence)
+            known = self._streams[stream] = StreamRun(sequence)
             if len(self._streams) > self._max:
                 del self._streams[next(iter(self._streams))]
         step = (number - sequence.expected) % _NUMBERS
@@ -198,7 +179,7 @@ class SequenceTracker:
         known.sequence, known.run = sequence, known.run + 1 if expected else 0
         if step and self._dig(sequence, stream, number):
             return HELD
-        if step <= _LARGEST_GAP:
+        if step <= LARGEST_GAP:
             sequence.expected = (number + 1) % _NUMBERS
             return self._close_gap(sequence, step)
         if _NUMBERS - step > _REORDERED:
@@ -209,19 +190,19 @@ class SequenceTracker:
     def _may_have_begun(self, stream: str) -> bool:
         return self.unsettled and (not self.thinned or "/@" in stream)
 
-    def _remember(self, publisher: str, stream: str, expected: int) -> _Sequence:
-        sequence = self._publishers[publisher] = _Sequence(publisher, stream, expected)
+    def _remember(self, publisher: str, stream: str, expected: int) -> PublisherSequence:
+        sequence = self._publishers[publisher] = PublisherSequence(publisher, stream, expected)
         if len(self._publishers) > self._max:
-            self._forget_oldest()
+            self._forget_oldest(publisher)
         return sequence
 
-    def _dig(self, sequence: _Sequence, stream: str, stop: int) -> bool:
+    def _dig(self, sequence: PublisherSequence, stream: str, stop: int) -> bool:
         """Return whether what is from number `stop` on has to wait for a hole before it."""
         if sequence.stream != stream:
             return False
         if sequence.hole is None:
             # Across the wrap no question can ask.
-            if not self.asks or not 0 < stop - sequence.expected <= _LARGEST_GAP:
+            if not self.asks or not 0 < stop - sequence.expected <= LARGEST_GAP:
                 return False
             self._close_announced(sequence, stop - sequence.expected)
             sequence.hole = Hole(stream, sequence.publisher, sequence.expected, stop, exact=True)
@@ -229,20 +210,25 @@ class SequenceTracker:
         self.hole = sequence.hole
         return True
 
-    def _close_gap(self, sequence: _Sequence, gap: int) -> int:
+    def _close_gap(self, sequence: PublisherSequence, gap: int) -> int:
         announced = self._close_announced(sequence, gap)
         lost = announced if self.queue_drops else gap
         self._lost += lost
         self.dropped += gap - lost
         return lost
 
-    def _close_announced(self, sequence: _Sequence, gap: int) -> int:
+    def _close_announced(self, sequence: PublisherSequence, gap: int) -> int:
         announced = min(gap, sequence.announced)
         sequence.announced -= announced
         self._announced -= announced
         return announced
 
-    def _forget_oldest(self) -> None:
-        _, oldest = self._publishers.popitem(last=False)
+    def _forget_oldest(self, newest: str) -> None:
+        # One that something waits for is forgotten only where there are many of them.
+        names = islice(self._publishers, _LOOKED_AT)
+        free = (each for each in names if self._publishers[each].hole is None and each != newest)
+        name = next(free, next(iter(self._publishers)))
+        oldest = self._publishers.pop(name)
+        oldest.expected = _NEVER  # a settled stream goes on with it, else
         self._lost += 0 if self.recovering else oldest.announced
         self._announced -= oldest.announced

@@ -107,7 +107,7 @@ class ThinnedSubscriber(ZenohSubscriber):
         for key, whole in self._wholes.items():
             batch = whole.take()
             if batch:
-                self._put(batch)
+                self._put(batch, full=_CHANNEL)
                 self._queue.wakeups.wake()
                 self._warn_once(key)
 

@@ -161,12 +161,11 @@ class ZenohSubscriber:
         self._busy = len(batch) >= _BUSY
         self._put(batch)
 
-    def _put(self, batch: list[zenoh.Sample]) -> None:
+    def _put(self, batch: list[zenoh.Sample], *, full: int = _CHANNEL) -> None:
         if self._queue.ended:
             return
         try:
-            overflowed = len(batch) >= _CHANNEL
-            self._queue.put(batch, overflowed=overflowed)
+            self._queue.put(batch, overflowed=len(batch) >= full)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             extra = about("bug")
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)

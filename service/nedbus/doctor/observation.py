@@ -125,7 +125,7 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
             time.sleep(_TICK)
             here.take()
             anywhere.take()
-            for publisher, (key, _) in take_heartbeats().items():
+            for key, publisher in take_heartbeats():
                 if key in seen.publishers or len(seen.publishers) < _MAX_KEYS:
                     seen.publishers.setdefault(key, set()).add(publisher)
     seen.streams = here.streams

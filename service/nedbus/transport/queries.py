@@ -6,6 +6,7 @@ full. The wait for the last reply is Python's, so Ctrl-C ends it, and so does it
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,13 +16,14 @@ import zenoh
 
 from .session import RawSample, Session, entity_name, while_open
 
-Heartbeats = dict[str, tuple[str, int]]
-"""By the name of a publisher, the key of its stream and the number of its newest message."""
+Heartbeats = dict[tuple[str, str], int]
+"""The number of the newest message, by the key of a stream and the name of its publisher."""
 
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
 _HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
+_HEARTBEAT: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
 _NUMBER: Final = 4  # bytes of a heartbeat
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
 
@@ -89,11 +91,9 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
                 beat = subscriber.handler.try_recv()
                 if beat is None:
                     break
-                key, _, entity = str(beat.key_expr).partition("/@adv/pub/")
-                publisher = entity.rpartition("/")[0].replace("/", ":")
-                payload = beat.payload.to_bytes()
-                if len(payload) == _NUMBER:
-                    newest[publisher] = key, int.from_bytes(payload, "little")
+                found, payload = _HEARTBEAT.fullmatch(str(beat.key_expr)), beat.payload.to_bytes()
+                if found is not None and len(payload) == _NUMBER:  # else it is none, whoever sent it
+                    newest[found[1], f"{found[2]}:{found[3]}"] = int.from_bytes(payload, "little")
         return newest
 
     return take, subscriber.undeclare
