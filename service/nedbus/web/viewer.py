@@ -77,6 +77,7 @@ class Viewer:
             RejectionTable(style),
             Plots(style, offset=0.0 if controls else time.localtime().tm_gmtoff),
         )
+        self._grid = column(sizing_mode="stretch_both", styles={"flex": "7 1 0"})
         self._map = MapPlot(style, self._plots.chosen, background)
         self._streams.source.selected.on_change("indices", lambda _, __, rows: self._choose(rows, self._streams.order))
         self._map.marks.selected.on_change("indices", lambda _, __, rows: self._choose(rows, self._map.shown))
@@ -100,6 +101,9 @@ class Viewer:
             return
         self._slow = now - self._updated if now - self._updated > _SLOW else 0.0
         self._sent, self._updated = self._sent + 1, now
+        if self._drawn.value and not self._grid.children:  # map and table are there sooner without
+            figures = self._plots.figures
+            self._grid.children = [row(*figures[first : first + 2], sizing_mode="stretch_both") for first in (0, 2)]
         picture = self._fleet.picture
         vehicles: dict[str, list[Line]] = {}
         for line in picture.lines:
@@ -162,14 +166,12 @@ class Viewer:
         self._note.text = f'<span class="quiet">{escape(_frame(self._fleet, mains))}</span>'
 
     def _lay_out(self, controls: Row | None, *hidden: LayoutDOM) -> LayoutDOM:
-        grid = [row(*self._plots.figures[index : index + 2], sizing_mode="stretch_both") for index in (0, 2)]
         self._streams.table.css_classes = ["nedbus-streams"]
         self._streams.table.styles = {"flex": "5 1 0"}
         self._rejections.table.styles = {"flex": "1.6 1 0"}
         left = column(self._note, self._map.figure, sizing_mode="stretch_both", styles={"flex": "42 1 0"})
-        plots = column(*grid, sizing_mode="stretch_both", styles={"flex": "7 1 0"})
         right = column(
-            self._streams.table, self._rejections.table, self._title, plots,
+            self._streams.table, self._rejections.table, self._title, self._grid,
             sizing_mode="stretch_both", styles={"flex": "58 1 0"},
         )  # fmt: skip
         for control in controls.children if controls else ():
