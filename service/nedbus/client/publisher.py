@@ -74,6 +74,9 @@ class Publisher:
         misses = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT, sporadic_heartbeat=None)
         with while_open():
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
+            # A router remembers where to send what comes on a key that it knows as such; of any other it finds out for
+            # each message, which is most of what one costs where several routers are joined.
+            self._key_token = session.liveliness().declare_token(self.key)
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 session,
                 self.key,
@@ -165,6 +168,7 @@ class Publisher:
         with suppress(zenoh.ZError):  # closed already with the session
             self._publisher.undeclare()
             self._token.undeclare()
+            self._key_token.undeclare()
 
     def __enter__(self) -> Self:
         return self

@@ -84,6 +84,7 @@ class _Step:
         self._gate = RateGate(rate)
         self._demand = Demand(session, self._key)
         self._publisher: zenoh.ext.AdvancedPublisher | None = None
+        self._token: zenoh.LivelinessToken | None = None  # so that routers know the key, as in Publisher
         self._wanted_at = 0
 
     @property
@@ -111,6 +112,7 @@ class _Step:
         self._gate = RateGate(self._rate)
         misses = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT, sporadic_heartbeat=None)
         with while_open():
+            self._token = self._session.liveliness().declare_token(self._key)
             self._publisher = zenoh.ext.declare_advanced_publisher(
                 self._session,
                 self._key,
@@ -121,7 +123,9 @@ class _Step:
             )
 
     def _withdraw(self) -> None:
-        if self._publisher is not None:
-            with suppress(zenoh.ZError):  # closed already with the session
+        with suppress(zenoh.ZError):  # closed already with the session
+            if self._publisher is not None:
                 self._publisher.undeclare()
-        self._publisher = None
+            if self._token is not None:
+                self._token.undeclare()
+        self._publisher = self._token = None
