@@ -57,9 +57,8 @@ class Lossy:
         publisher: str,
         numbers: range,
         *,
-        on_sample: Callable[[int, RawSample], object],
         on_end: Callable[[], object],
-        timeout: float,
+        **more: object,
     ) -> None:
         self.asked.append((key, numbers.start, numbers.stop))
         if len(self.asked) <= self.unanswered:
@@ -74,7 +73,7 @@ class Lossy:
                 self.open -= 1
             on_end()
 
-        ask_kept(session, key, publisher, numbers, on_sample=on_sample, on_end=end, timeout=timeout)
+        ask_kept(session, key, publisher, numbers, on_end=end, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 from nedbus.transport import entity_name
@@ -15,6 +16,7 @@ from .sequence_tracker import HELD, SequenceTracker
 if TYPE_CHECKING:
     from zenoh.ext import Miss
 
+_PAYLOAD: Final = itemgetter(1)
 _MANY: Final = 8  # samples of one key for which a look at all of them together pays
 
 
@@ -134,7 +136,7 @@ class Follower:
         """Return whether these follow each other, of one stream, and are noted by that."""
         if self._given_up or len(arrivals) < _MANY or len({stream for stream, _, _, _ in arrivals}) > 1:
             return False
-        if not all(payload for _, payload, _, _ in arrivals):
+        if not all(map(_PAYLOAD, arrivals)):
             return False
         infos = [raw.source_info for _, _, raw, _ in arrivals]
         numbers = [info.source_sn for info in infos if info is not None]

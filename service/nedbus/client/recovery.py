@@ -153,8 +153,7 @@ class Recovery:
             event = self._events.get(timeout=_PAUSES[0] if self._waiting else _LOOK)
             while True:
                 if isinstance(event, _Search):
-                    self._open.subtract(_counted(event.hole))
-                    self._open += Counter()  # forget what is 0
+                    self._open -= Counter([_share(event.hole)])
                     self._judge(event)
                 elif event is not None:
                     patience = 0.0 if event.publisher in self._silent else _PATIENCE
@@ -169,9 +168,8 @@ class Recovery:
             search = self._waiting.popleft()
             if search.ended:
                 continue
-            hole = search.hole
-            full = self._open[""] >= _OPEN_BEGINNINGS if not hole.exact else self._open[hole.stream] >= _OPEN_OF_KEY
-            if search.due > now or full:
+            hole, share = search.hole, _share(search.hole)
+            if search.due > now or self._open[share] >= (_OPEN_OF_KEY if share else _OPEN_BEGINNINGS):
                 self._waiting.append(search)
                 continue
             search.tries += 1
@@ -189,7 +187,7 @@ class Recovery:
             except NedbusError:  # the session is closed
                 self._fill(search)
             else:
-                self._open.update(_counted(hole))
+                self._open[share] += 1
 
     def _judge(self, search: _Search) -> None:
         """Decide what follows from the end of a question."""
@@ -244,6 +242,6 @@ class Recovery:
         self._silent.clear()  # they could not answer, perhaps
 
 
-def _counted(hole: Hole) -> tuple[str]:
-    """Return under what a question for a hole counts."""
-    return (hole.stream if hole.exact else "",)
+def _share(hole: Hole) -> str:
+    """Return which share of the open questions one for this hole is of: that of its key, or "", of beginnings."""
+    return hole.stream if hole.exact else ""

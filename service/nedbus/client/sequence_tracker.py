@@ -29,9 +29,8 @@ LATE: Final = -2
 class SequenceTracker:
     """Follow the sequence numbers of all publishers that a reader hears, and count what is absent.
 
-    There are two sources of knowledge: gaps in the numbers that arrive, and announcements (Zenoh's miss listener) of
-    losses that recovery gave up on, which come before the gap, or without one at the end of a stream.
-    Each message is counted once.
+    There are two sources of knowledge: gaps in the numbers that arrive, and announcements of Zenoh's miss listener,
+    which come before the gap, or without one at the end of a stream. Each message is counted once.
 
     While `queue_drops` is set, a queue before this tracker has perhaps dropped what its reader was too slow for: then
     only announced losses are lost in transit, and the rest of a gap was dropped.

@@ -84,14 +84,10 @@ class ZenohSubscriber:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something in the queue; return False after `timeout` seconds."""
-        if timeout is not None:
+        if timeout is not None or self._queue.incomplete:  # what comes next may come from recovery
             self._by_reader = False
             self._needed.set()
             return self._queue.wait(timeout)
-        if self._queue.incomplete:  # what comes next does not come through the channel, perhaps
-            self._by_reader = False
-            self._needed.set()
-            return self._queue.wait(None)
         self._by_reader = True
         if not self._receiving.acquire(blocking=False):
             return self._queue.wait(None)
