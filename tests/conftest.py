@@ -351,6 +351,7 @@ class Process:
     """A process that a test starts: its output in files, gone at the end of the test at the latest."""
 
     def __init__(self, arguments: list[str], where: Path, environment: dict[str, str]) -> None:
+        self._measured = any(name.startswith("COVERAGE_") for name in environment)
         self._out = where / "stdout"
         self._err = where / "stderr"
         with self._out.open("wb") as out, self._err.open("wb") as err:
@@ -378,11 +379,18 @@ class Process:
             pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{said}")
 
     def signal(self, number: signal.Signals) -> None:
+        if self._measured and number == signal.SIGINT:
+            pytest.fail("start what SIGINT is to end with measured=False")
         self.popen.send_signal(number)
 
     def kill(self) -> None:
         self.popen.kill()
         self.popen.wait(DEADLINE)
+
+
+def unmeasured() -> dict[str, str]:
+    """Return an environment without coverage, for what SIGINT ends: KeyboardInterrupt can be raised in its lock."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
 
 
 Start = Callable[..., Process]
@@ -396,10 +404,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
     def start_process(*arguments: str, measured: bool = True, **environment: str) -> Process:
         where = tmp_path / f"process-{len(processes)}"
         where.mkdir()
-        inherited = {name: value for name, value in os.environ.items() if not name.startswith("NEDBUS_")}
-        if not measured:
-            # A signal can find coverage inside its own lock, where it stays.
-            inherited = {name: value for name, value in inherited.items() if not name.startswith("COVERAGE_")}
+        inherited = dict(os.environ) if measured else unmeasured()
+        inherited = {name: value for name, value in inherited.items() if not name.startswith("NEDBUS_")}
         environment = inherited | {"PYTHONFAULTHANDLER": "1"} | environment
         process = Process([sys.executable, *arguments], where, environment)
         processes.append(process)

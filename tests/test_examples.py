@@ -39,7 +39,7 @@ def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process
     """Run an example; the default endpoint in it is replaced by this test's."""
     script = folder / name
     script.write_text((EXAMPLES / name).read_text().replace("tcp/127.0.0.1:7447", endpoint))
-    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1")
+    return start(str(script), NEDBUS_CONNECT=endpoint, PYTHONUNBUFFERED="1", measured=False)
 
 
 def test_all_examples_are_tested() -> None:

@@ -122,7 +122,7 @@ def test_echo_full_prints_every_field(run_nedbus: Start, flying: str) -> None:
 
 def test_interrupt_is_130(run_nedbus: Start, flying: str) -> None:
     """Ctrl-C ends echo at once and quietly."""
-    echo = run_nedbus("echo", "-c", flying)
+    echo = run_nedbus("echo", "-c", flying, measured=False)
     wait_for(lambda: echo.out, what="a line")
     echo.signal(signal.SIGINT)
     assert echo.wait() == 130

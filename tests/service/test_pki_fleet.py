@@ -456,7 +456,6 @@ def test_two_routers_take_new_rules_in_turn_without_a_loss(start: Start, file: P
             for name in ("vehicle-99", "reader"):
                 join(name, endpoint_of(each)).close()
             wait_for(lambda: receive_one_more() and len(received) > known + 40, what="messages")  # noqa: B023 - at once
-        wait_for(lambda: receive_one_more() and received[-1] > publisher.published - 5, what="what is left")
         while received[-1] < publisher.published:
             received.append(subscription.receive(DEADLINE).message.timestamp)
         assert received == list(range(received[0], publisher.published + 1))

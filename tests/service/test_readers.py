@@ -145,7 +145,7 @@ def kill(reader: Process) -> None:
 
 
 def interrupt(reader: Process) -> None:
-    reader.popen.send_signal(signal.SIGINT)
+    reader.signal(signal.SIGINT)
 
 
 @pytest.mark.parametrize("end", [kill, interrupt])
@@ -154,7 +154,7 @@ def test_reader_that_dies_is_given_up(
 ) -> None:
     """A replay goes on without one that is killed, or ends, and others miss nothing."""
     slow = READER.replace("if number ==", "import time; time.sleep(0.05)\n        if number ==", 1)
-    reader = start("-c", slow, endpoint, "slow", str(COUNT))
+    reader = start("-c", slow, endpoint, "slow", str(COUNT), measured=False)
     wait_for(lambda: "ready" in reader.out, what="the reader")
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         _, sending = publish_all(bus)

@@ -22,7 +22,7 @@ from nedbus.cli.format import printable, to_line, to_text
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT_TOPIC, TOPICS
-from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, message, unmeasured, wait_for
 
 VLP = DEFAULT_TOPIC
 EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
@@ -167,7 +167,7 @@ class Terminal:
         self._main, terminal = pty.openpty()
         self._output = bytearray()
         self._stopping = threading.Event()
-        environment = {**os.environ, "COLUMNS": str(columns), "LINES": str(lines), "TERM": "xterm"}
+        environment = {**unmeasured(), "COLUMNS": str(columns), "LINES": str(lines), "TERM": "xterm"}
         self.popen = subprocess.Popen(
             [sys.executable, "-m", "nedbus", *arguments],
             stdout=terminal,
@@ -355,7 +355,7 @@ def test_hostile_keys_are_shown_harmless(run_nedbus: Start, endpoint: str, raw: 
 
 def test_flood_of_keys_leaves_hz_small(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """Of 1000 vehicles there are 50 rows a second and a number, not 1000."""
-    hz = run_nedbus("hz", "-c", endpoint)
+    hz = run_nedbus("hz", "-c", endpoint, measured=False)
     publishers = [bus.publisher(VLP, vehicle=f"flood-{number}") for number in range(1000)]
 
     def is_shown() -> bool:
@@ -417,7 +417,9 @@ def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: list[str
     where = ["-l", free_endpoint()] if command[0] in {"serve", "router"} else ["-c", endpoint]
     for imports in (1, 50, 150, 300, 10_000):
         arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command, *where]
-        with subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(
+            arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=unmeasured()
+        ) as process:
             assert process.stderr is not None
             started, seen = False, 0
             for line in process.stderr:  # the moment is one of the program, not of a clock

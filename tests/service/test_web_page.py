@@ -522,7 +522,7 @@ def test_reader_of_a_secure_router_sees_all(web: Web, tab: Open, run_nedbus: Sta
 def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: str) -> None:
     """With --listen 0.0.0.0 the command says who can look, and ends with 0 at Ctrl-C."""
     port = free_endpoint().rpartition(":")[2]
-    process = run_nedbus("web", "-c", endpoint, "--listen", f"0.0.0.0:{port}")
+    process = run_nedbus("web", "-c", endpoint, "--listen", f"0.0.0.0:{port}", measured=False)
     wait_for(lambda: "without a password" in process.err, what="the warning")
     assert status_of(f"http://127.0.0.1:{port}/healthz") == 200
     process.signal(signal.SIGINT)
