@@ -7,7 +7,7 @@ it is a router that dies, and nothing is made.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 
 import pytest
@@ -17,7 +17,7 @@ import nedbus
 from nedbus import Counts
 from nedbus.client import recovery as module
 from nedbus.client.decoder import WAKE_UP
-from nedbus.transport import RawSample, Session, ask_kept, entity_name, open_router
+from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept, entity_name, open_router
 from nedbus_msgs import encode, encoding_of
 from tests.conftest import DEADLINE, free_endpoint, message, wait_for, wait_for_reader
 
@@ -37,7 +37,6 @@ class Lossy:
         self.asked: list[tuple[str, int, int]] = []
         self.unanswered = 0
         self.open = self.most = 0
-        self._counting = threading.Lock()
         self._put = subscription._queue.put
         monkeypatch.setattr(subscription._queue, "put", self._lose)
         monkeypatch.setattr(module, "ask_kept", self._ask)
@@ -50,30 +49,39 @@ class Lossy:
         left = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]
         self._put(left, overflowed=overflowed)
 
-    def _ask(
-        self,
-        session: Session,
-        key: str,
-        publisher: str,
-        numbers: range,
-        *,
-        on_end: Callable[[], object],
-        **more: object,
-    ) -> None:
+    def _ask(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
         self.asked.append((key, numbers.start, numbers.stop))
         if len(self.asked) <= self.unanswered:
-            on_end()
-            return
-        with self._counting:
-            self.open += 1
-            self.most = max(self.most, self.open)
+            return Unanswered()
+        self.open += 1
+        self.most = max(self.most, self.open)
+        return Counted(ask_kept(session, key, publisher, numbers, timeout=timeout), self)
 
-        def end() -> None:
-            with self._counting:
-                self.open -= 1
-            on_end()
 
-        ask_kept(session, key, publisher, numbers, on_end=end, **more)  # type: ignore[arg-type]
+class Unanswered:
+    """What a router that drops a question says."""
+
+    ended = True
+
+    def take(self) -> dict[int, RawSample]:
+        return {}
+
+
+class Counted:
+    """Answers of a question that counts as open until they have ended."""
+
+    def __init__(self, answers: KeptAnswers, lossy: Lossy) -> None:
+        self._answers = answers
+        self._lossy = lossy
+
+    def take(self) -> dict[int, RawSample]:
+        was, taken = self._answers.ended, self._answers.take()
+        self._lossy.open -= self._answers.ended and not was
+        return taken
+
+    @property
+    def ended(self) -> bool:
+        return self._answers.ended
 
 
 @pytest.fixture
@@ -124,8 +132,8 @@ def test_answer_that_is_not_whole_is_the_last(
 ) -> None:
     """A publisher that sends the newest one has no more: the rest is lost, without another question."""
 
-    def forget(session: Session, key: str, name: str, numbers: range, **more: object) -> None:
-        ask_kept(session, key, name, numbers[-2:], **more)  # type: ignore[arg-type]
+    def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> KeptAnswers:
+        return ask_kept(session, key, name, numbers[-2:], timeout=timeout)
 
     monkeypatch.setattr(module, "ask_kept", forget)
     lossy.missing = {1, 2, 3, 4}
@@ -212,6 +220,37 @@ def test_answers_of_others_are_left_out(lossy: Lossy, vehicle: nedbus.Bus, publi
     publish(publisher, 0, 1, 2)
     assert lossy.receive(3) == [0, 1, 2]
     assert lossy.subscription.counts == Counts(received=3)
+    liar.undeclare()
+
+
+@pytest.mark.parametrize("when", ["open", "closed"])
+def test_flood_of_answers_holds_up_nobody(
+    lossy: Lossy, bus: nedbus.Bus, vehicle: nedbus.Bus, publisher: nedbus.Publisher, when: str
+) -> None:
+    """More answers than were asked for: the session goes on receiving, also after its reader has closed."""
+    asked = threading.Event()
+
+    def flood(query: zenoh.Query) -> None:
+        with query:
+            asked.set()
+            for _ in range(2000):
+                query.reply(KEY, b"junk")
+
+    name = entity_name(publisher._publisher.id).replace(":", "/")
+    callback = zenoh.handlers.Callback(flood, indirect=True)
+    liar = vehicle._session.declare_queryable(f"{KEY}/@adv/pub/{name}/**", callback)
+    lossy.missing = {1}
+    publish(publisher, 0, 1, 2)
+    if when == "closed":
+        assert asked.wait(DEADLINE)
+        lossy.subscription.close()
+    else:
+        assert lossy.receive(3) == [0, 1, 2]
+    with bus.subscribe(VLP, vehicle="8", mode="every") as other:
+        second = vehicle.publisher(VLP, vehicle="8")
+        wait_for_reader(vehicle._session, second.key)
+        publish(second, 7)
+        assert other.receive(DEADLINE).message.timestamp == 7
     liar.undeclare()
 
 

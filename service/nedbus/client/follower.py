@@ -53,7 +53,7 @@ class Follower:
         self.tracker.recovering = on_hole is not None
 
     def announce(self, miss: Miss) -> None:
-        """Note that messages are missing, or lost if nobody recovers them; called on Zenoh's thread."""
+        """Note that messages are missing, or lost if nobody recovers them; from any thread."""
         self._announcements.append(miss)
 
     def apply_announcements(self) -> None:

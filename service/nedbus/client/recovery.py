@@ -15,18 +15,17 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Final
 
 import zenoh
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import Heartbeats, RawSample, Session, ask_kept, follow_heartbeats, while_open
-from nedbus_msgs import PAYLOAD_LIMIT
+from nedbus.transport import Heartbeats, Session, ask_kept, follow_heartbeats, while_open
 
 from .publisher_sequence import Hole
 from .receive_queue import CAPACITY, ReceiveQueue
+from .search import Search
 
 _log = logging.getLogger(__name__)
 
@@ -35,40 +34,11 @@ _OPEN_BEGINNINGS: Final = 16  # of these for what a publisher sent before it was
 _OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
 _TIMEOUT: Final = 3.0  # s until a question is given up
 _PATIENCE: Final = 20.0  # s of questions after which what is still missing is lost: so long publishers keep it
+_POLL: Final = 0.005  # s between two looks for answers
 _PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
-_MOST: Final = 10_000  # messages of one answer; no publisher of nedbus keeps more
 _MAX_SILENT: Final = 1000
 _LOOK: Final = 0.25  # s between two looks at heartbeats
 _UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
-
-
-@dataclass(slots=True, eq=False)
-class _Search:
-    """The questions for one hole, for `patience` seconds from the first on; times in monotonic seconds."""
-
-    hole: Hole
-    patience: float
-    until: float | None = None
-    due: float = 0.0
-    tries: int = 0
-    found: dict[int, RawSample] = field(default_factory=dict)
-    ended: bool = False
-
-    @property
-    def complete(self) -> bool:
-        """Whether its publisher has answered: one that sends the last message has all that it still keeps."""
-        return self.hole.stop - 1 in self.found or len(self.found) >= _MOST
-
-    @property
-    def numbers(self) -> range:
-        """What to ask for: without what the last question brought before it ended."""
-        first = next(number for number in range(self.hole.start, self.hole.stop + 1) if number not in self.found)
-        return range(first, self.hole.stop)
-
-    def add(self, number: int, sample: RawSample) -> None:
-        """Keep an answer; called on a thread of Zenoh's."""
-        if len(self.found) < _MOST and len(sample.payload) <= PAYLOAD_LIMIT:
-            self.found[number] = sample
 
 
 class Recovery:
@@ -91,11 +61,12 @@ class Recovery:
         self._name = name
         self._begins = begins
         self._on_fill = on_fill
-        self._waiting: deque[_Search] = deque()
-        self._searching: dict[Hole, _Search] = {}
-        self._open: Counter[str] = Counter()  # questions by key; "" for those of beginnings
+        self._waiting: deque[Search] = deque()
+        self._searching: dict[Hole, Search] = {}
+        self._asked: list[Search] = []  # those with an open question,
+        self._open: Counter[str] = Counter()  # and how many by key; "" for those of beginnings
         self._silent: dict[str, None] = {}  # publishers that were asked in vain
-        self._events: queue.SimpleQueue[Hole | _Search | None] = queue.SimpleQueue()
+        self._holes: queue.SimpleQueue[Hole | None] = queue.SimpleQueue()
         self._closed = False
         self._watched: dict[str, Callable[[], Heartbeats]] = {}
         self._behind: Heartbeats = {}
@@ -104,7 +75,7 @@ class Recovery:
             self._links = session.info.declare_transport_events_listener(
                 zenoh.handlers.Callback(self._on_link, indirect=False), history=False
             )
-        receive_queue.recover(self._events.put)
+        receive_queue.recover(self._holes.put)
         self._thread = threading.Thread(target=self._run, name="nedbus-recovery", daemon=True)
         self._thread.start()
 
@@ -122,7 +93,7 @@ class Recovery:
     def close(self) -> None:
         """Ask no more: what is missing now is lost."""
         self._closed = True
-        self._events.put(None)
+        self._holes.put(None)
         with suppress(zenoh.ZError):  # closed already with the session
             self._links.undeclare()
         if threading.current_thread() is not self._thread:
@@ -132,7 +103,8 @@ class Recovery:
         try:
             next_look = time.monotonic() + _LOOK
             while not self._closed:
-                self._take_events()
+                self._take_holes()
+                self._take_answers()
                 now = time.monotonic()
                 if now >= next_look:
                     next_look = now + _LOOK
@@ -146,20 +118,24 @@ class Recovery:
         finally:
             self._queue.recover(None)  # nothing is held from now on
             self._give_up()
+            self._asked.clear()  # nobody takes answers any more, and a full channel would hold up the session
 
-    def _take_events(self) -> None:
-        """Wait for holes and ends of questions, at most until something is due, and note them."""
+    def _take_holes(self) -> None:
+        """Wait for holes, at most until something else is due, and note them."""
         with suppress(queue.Empty):
-            event = self._events.get(timeout=_PAUSES[0] if self._waiting else _LOOK)
+            hole = self._holes.get(timeout=_POLL if self._asked else _PAUSES[0] if self._waiting else _LOOK)
             while True:
-                if isinstance(event, _Search):
-                    self._open -= Counter([_share(event.hole)])
-                    self._judge(event)
-                elif event is not None:
-                    patience = 0.0 if event.publisher in self._silent else _PATIENCE
-                    self._searching[event] = search = _Search(event, patience)
+                if hole is not None:
+                    patience = 0.0 if hole.publisher in self._silent else _PATIENCE
+                    self._searching[hole] = search = Search(hole, patience)
                     self._waiting.append(search)
-                event = self._events.get_nowait()
+                hole = self._holes.get_nowait()
+
+    def _take_answers(self) -> None:
+        for search in [each for each in self._asked if each.take()]:
+            self._asked.remove(search)
+            self._open -= Counter([_share(search.hole)])
+            self._judge(search)
 
     def _ask(self, now: float) -> None:
         for _ in range(len(self._waiting)):
@@ -175,21 +151,14 @@ class Recovery:
             search.tries += 1
             search.until = search.until or now + search.patience  # not while others were asked before
             try:
-                ask_kept(
-                    self._session,
-                    hole.stream,
-                    hole.publisher,
-                    search.numbers,
-                    on_sample=search.add,
-                    on_end=lambda search=search: self._events.put(search),  # type: ignore[misc]
-                    timeout=_TIMEOUT,
-                )
+                search.answers = ask_kept(self._session, hole.stream, hole.publisher, search.numbers, timeout=_TIMEOUT)
             except NedbusError:  # the session is closed
                 self._fill(search)
             else:
+                self._asked.append(search)
                 self._open[share] += 1
 
-    def _judge(self, search: _Search) -> None:
+    def _judge(self, search: Search) -> None:
         """Decide what follows from the end of a question."""
         if search.ended:
             return
@@ -207,7 +176,7 @@ class Recovery:
                 self._silent[publisher] = None
             self._fill(search)
 
-    def _fill(self, search: _Search) -> None:
+    def _fill(self, search: Search) -> None:
         search.ended = True
         self._searching.pop(search.hole, None)
         try:
@@ -224,7 +193,7 @@ class Recovery:
         for hole in self._queue.holes:
             if self._queue.held <= until:
                 return
-            self._fill(self._searching.get(hole) or _Search(hole, 0.0))
+            self._fill(self._searching.get(hole) or Search(hole, 0.0))
 
     def _look(self) -> None:
         """Ask for the newest messages that heartbeats of the look before told of, if they have not come since."""

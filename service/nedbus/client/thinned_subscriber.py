@@ -133,12 +133,15 @@ class _WholeStream:
     def __init__(self, session: Session, key: str, queue: ThinnedQueue, recovery: Recovery | None) -> None:
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
         with while_open():
-            self._subscriber, self._misses = declare_reader(session, key, channel, queue)
+            self._subscriber, self._misses = declare_reader(session, key, channel)
+        self._thinned_queue = queue
         self._unwatch = recovery.watch(key) if recovery is not None else None
 
     def take(self) -> list[zenoh.Sample]:
         """Return what has arrived."""
-        return take_all(self._subscriber.handler, [])
+        batch = take_all(self._subscriber.handler, [])
+        self._misses.announce(self._thinned_queue)
+        return batch
 
     def close(self) -> None:
         if self._unwatch is not None:

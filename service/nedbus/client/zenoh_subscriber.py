@@ -57,7 +57,7 @@ class ZenohSubscriber:
         # No late-publisher detection: after a router's restart it would ask for what recovery asks for.
         history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
         with while_open():
-            self._subscriber, self._misses = declare_reader(session, key_expr, channel, receive_queue, history=history)
+            self._subscriber, self._misses = declare_reader(session, key_expr, channel, history=history)
             asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
             answers = every and not thinned
             self._asked = session.declare_queryable(ack_key(key_expr), asked) if answers else None
@@ -78,6 +78,7 @@ class ZenohSubscriber:
         if self._receiving.acquire(blocking=False):
             try:
                 if batch := take_all(self._handler, []):
+                    self._misses.announce(self._queue)
                     self._put(batch)
             finally:
                 self._receiving.release()
@@ -155,6 +156,7 @@ class ZenohSubscriber:
         finally:
             receive_queue.idle = False
         self._busy = len(batch) >= _BUSY
+        self._misses.announce(receive_queue)
         self._put(batch)
 
     def _put(self, batch: list[zenoh.Sample], *, full: int = _CHANNEL) -> None:
@@ -201,14 +203,33 @@ def declare_reader(
     session: Session,
     key_expr: str,
     channel: zenoh.handlers.RingChannel[zenoh.Sample],
-    receive_queue: ReceiveQueue,
     *,
     history: zenoh.ext.HistoryConfig | None = None,
-) -> tuple[zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]], zenoh.ext.SampleMissListener[None]]:
-    """Declare a subscriber, and let a queue know what is missing."""
+) -> tuple[zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]], Misses]:
+    """Declare a subscriber, and what notes the gaps in what it receives."""
     subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, channel, history=history)
-    misses = subscriber.sample_miss_listener(zenoh.handlers.Callback(receive_queue.announce_loss, indirect=False))
-    return subscriber, misses
+    return subscriber, Misses(subscriber)
+
+
+class Misses:
+    """The gaps in what a subscriber receives, until somebody passes them on.
+
+    No callback does: on Zenoh's thread, on which everything arrives, each would wait for the interpreter's lock.
+    """
+
+    def __init__(self, subscriber: zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]) -> None:
+        channel: zenoh.handlers.RingChannel[zenoh.ext.Miss] = zenoh.handlers.RingChannel(_CHANNEL)
+        self._listener = subscriber.sample_miss_listener(channel)
+        self._handler = iter(self._listener)
+
+    def announce(self, receive_queue: ReceiveQueue) -> None:
+        """Let a queue know which gaps are those of the network, before what arrived behind them is put."""
+        for miss in take_all(self._handler, []):
+            receive_queue.announce_loss(miss)
+
+    def undeclare(self) -> None:
+        """Note no more; a second call raises ZError."""
+        self._listener.undeclare()
 
 
 def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:

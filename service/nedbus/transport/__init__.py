@@ -10,6 +10,7 @@ from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_e
 from .queries import (
     MAX_ANSWERS,
     Heartbeats,
+    KeptAnswers,
     alive_keys,
     ask_alive_keys,
     ask_kept,
@@ -77,6 +78,7 @@ __all__ = [
     "Certificate",
     "CertificateEntry",
     "Heartbeats",
+    "KeptAnswers",
     "PublisherToken",
     "RawSample",
     "RouterConfig",

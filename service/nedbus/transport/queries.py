@@ -1,7 +1,8 @@
 """Queries: what is answered on a key expression, and which liveliness tokens there are.
 
 Replies are collected by a callback: a channel of Zenoh's holds 256 of them, and blocks the query for ever when it is
-full. The wait for the last reply is Python's, so Ctrl-C ends it, and so does its timeout.
+full. The wait for the last reply is Python's, so Ctrl-C ends it, and so does its timeout. Only where many questions are
+asked while much arrives, in `ask_kept`, there is a channel, which somebody empties all the time.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ MAX_ANSWERS: Final = 10_000
 _HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
 _HEARTBEAT: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
 _NUMBER: Final = 4  # bytes of a heartbeat
+_SPARE: Final = 64  # answers that nobody asked for, of others or of more publishers
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
 
 
@@ -43,39 +45,58 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
     return [reply.ok for reply in collector.wait(timeout) if reply.ok is not None]
 
 
-def ask_kept(
-    session: Session,
-    key: str,
-    publisher: str,
-    numbers: range,
-    *,
-    on_sample: Callable[[int, RawSample], object],
-    on_end: Callable[[], object],
-    timeout: float,
-) -> None:
+class KeptAnswers:
+    """What a publisher answers of its messages `numbers`; for the thread of whoever asked, which takes it by polling.
+
+    No callback does: Zenoh's thread, on which everything arrives, would wait for the interpreter's lock at each answer.
+    """
+
+    def __init__(self, handler: zenoh.Handler[zenoh.Reply], key: str, publisher: str, numbers: range) -> None:
+        self.ended = False
+        """Whether the last answer was taken, or the timeout has passed."""
+        self._handler = handler
+        self._key = key
+        self._publisher = publisher
+        self._numbers = numbers
+
+    def take(self) -> dict[int, RawSample]:
+        """Return what came since the last call, by its number."""
+        taken: dict[int, RawSample] = {}
+        try:
+            for _ in range(MAX_ANSWERS):
+                reply = self._handler.try_recv()
+                if reply is None:
+                    break
+                self._add(taken, reply.ok)
+        except zenoh.ZError:  # it is empty, and closed
+            self.ended = True
+        return taken
+
+    def _add(self, taken: dict[int, RawSample], sample: RawSample | None) -> None:
+        info = None if sample is None else sample.source_info
+        if sample is None or info is None or info.source_sn not in self._numbers:
+            return
+        if str(sample.key_expr) == self._key and entity_name(info.source_id) == self._publisher:  # else another's
+            taken[info.source_sn] = sample
+
+
+def ask_kept(session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> KeptAnswers:
     """Ask an advanced publisher for messages that it still keeps, by their numbers, and return at once.
 
     `publisher` is its name as `entity_name` returns it. The key is that of its cache, without wildcards: a router finds
     it at once, while a key expression is compared with the queryables of all publishers.
-    `on_sample` is called with the number of each message, and `on_end` last, on threads of Zenoh's.
     """
-
-    def on_reply(reply: zenoh.Reply) -> None:
-        sample, info = reply.ok, reply.ok and reply.ok.source_info
-        if sample is None or info is None or info.source_sn not in numbers:
-            return
-        if str(sample.key_expr) == key and entity_name(info.source_id) == publisher:  # else another's answer
-            on_sample(info.source_sn, sample)
-
     with while_open():
-        session.get(
+        handler = session.get(
             f"{key}/@adv/pub/{publisher.replace(':', '/')}/_?_sn={numbers.start}..{numbers.stop - 1}",
-            zenoh.handlers.Callback(on_reply, on_end, indirect=False),
+            # With room for all: a channel that is full holds up all that its session receives.
+            zenoh.handlers.FifoChannel(min(len(numbers), MAX_ANSWERS) + _SPARE),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=_zenoh_timeout(timeout),
         )
+    return KeptAnswers(handler, key, publisher, numbers)
 
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
