@@ -122,6 +122,7 @@ def run(fleet: Fleet) -> dict[str, Any]:
         "readers": reports,
         "accounts": account(published, reports),
         "recorded": _count(fleet),
+        "recorder": fleet.recorder_log.read_text().splitlines()[-1],
         "looks": [vars(look) for look in fleet.looks],
     }
 

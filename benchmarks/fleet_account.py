@@ -129,6 +129,7 @@ def _accounts(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"{name:8}" + "".join(f"{each[column]:12,}" for column in titles)
     total = sum(count for count, _ in found["published"].values())
     yield f"recorder: {found['recorded']:,} of {total:,} in the file, {total - found['recorded']:,} missing"
+    yield f"it says: {found['recorder']}"
 
 
 def _latencies(found: Mapping[str, Any]) -> Iterator[str]:

@@ -51,7 +51,7 @@ class Fleet:
         self.add_reader("all", "*", 0)
         self.add_reader("one", "v0", 1)
         recording = [sys.executable, "-m", "nedbus", "record", "-c", self.endpoints[-1], "-o", str(self.recording)]
-        with (self._folder / "recorder.log").open("w") as log:
+        with self.recorder_log.open("w") as log:
             self.processes["recorder"] = subprocess.Popen(
                 recording, stdin=subprocess.PIPE, stdout=log, stderr=log, text=True
             )
@@ -71,6 +71,11 @@ class Fleet:
     def recording(self) -> Path:
         """The file of the recorder."""
         return self._folder / "fleet.mcap"
+
+    @property
+    def recorder_log(self) -> Path:
+        """What the recorder says, at its end how many messages were lost or dropped."""
+        return self._folder / "recorder.log"
 
     @property
     def vehicles(self) -> list[Process]:

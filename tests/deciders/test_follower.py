@@ -272,6 +272,22 @@ def test_announced_hole_is_no_loss_yet(recovering: Recovering) -> None:
     assert recovering.queue.counts == Counts(lost=4, dropped=12)
 
 
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_announced_messages_that_a_heartbeat_told_of_are_no_loss(recovering: Recovering, when: str) -> None:
+    """They were asked for when Zenoh announces them, with the next message: that is counted neither then nor later."""
+    recovering.put(0)
+    recovering.queue.beat(KEY, name_of("a"), 3, begins=True)
+    if when == "after":
+        recovering.fill(1, 2, 3)
+    recovering.queue.announce_loss(miss(3))
+    recovering.put(4)
+    if when == "before":
+        recovering.fill(1, 2, 3)
+    assert recovering.numbers == [0, 1, 2, 3, 4]
+    recovering.queue.recover(None)  # the end of a subscription
+    assert recovering.queue.counts == Counts(received=5)
+
+
 def test_message_that_comes_too_late_is_left_out(recovering: Recovering) -> None:
     """It was given up before, and counted: the order that a reader sees is never broken."""
     recovering.put(0, 3)

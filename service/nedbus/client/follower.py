@@ -51,6 +51,7 @@ class Follower:
         """Call `on_hole` with each hole from now on; it must not wait, and `fill` must follow. None: dig no more."""
         self._on_hole = on_hole
         self.tracker.recovering = on_hole is not None
+        self.tracker.counts_announced &= on_hole is None
 
     def announce(self, miss: Miss) -> None:
         """Note that messages are missing, or lost if nobody recovers them; from any thread."""

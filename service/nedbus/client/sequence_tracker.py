@@ -36,7 +36,8 @@ class SequenceTracker:
     only announced losses are lost in transit, and the rest of a gap was dropped.
 
     While `recovering` is set, what is missing is not lost yet: with `asks`, each gap becomes a Hole in `dug`, and what
-    comes after it is held until somebody fills it. Announcements then only tell how much of a gap was lost in transit.
+    comes after it is held until somebody fills it. Announcements then only tell how much of a gap was lost in transit,
+    and without `counts_announced` those that no gap followed are never lost: what filled a hole settled them.
     `unsettled`: a publisher that is heard for the first time has perhaps sent something before, for this reader; with
     `thinned` only one that sends thinned, as a reader turns to a whole stream at any time.
 
@@ -49,6 +50,7 @@ class SequenceTracker:
         self.dropped = 0
         self.queue_drops = queue_drops
         self.recovering = self.asks = self.unsettled = False
+        self.counts_announced = True
         self.thinned = False
         self.hole: Hole | None = None
         self.dug: list[Hole] = []
@@ -61,7 +63,7 @@ class SequenceTracker:
     @property
     def lost(self) -> int:
         """Messages that were lost in transit, all publishers together."""
-        return self._lost if self.recovering else self._lost + self._announced
+        return self._lost + self._announced if self.counts_announced else self._lost
 
     def announce(self, publisher: str, count: int) -> None:
         """Note that messages of a publisher are lost; the gap in its sequence may follow."""

@@ -11,6 +11,7 @@ import re
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from typing import Final
 
 import zenoh
@@ -25,6 +26,7 @@ MAX_ANSWERS: Final = 10_000
 
 _HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
 _HEARTBEAT: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
+_LONGEST: Final = 1024  # characters of the key of a heartbeat, which is remembered
 _NUMBER: Final = 4  # bytes of a heartbeat
 _SPARE: Final = 64  # answers that nobody asked for, of others or of more publishers
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
@@ -112,12 +114,20 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
                 beat = subscriber.handler.try_recv()
                 if beat is None:
                     break
-                found, payload = _HEARTBEAT.fullmatch(str(beat.key_expr)), beat.payload.to_bytes()
-                if found is not None and len(payload) == _NUMBER:  # else it is none, whoever sent it
-                    newest[found[1], f"{found[2]}:{found[3]}"] = int.from_bytes(payload, "little")
+                key, payload = str(beat.key_expr), beat.payload.to_bytes()
+                publisher = _publisher_of(key) if len(key) <= _LONGEST else None
+                if publisher is not None and len(payload) == _NUMBER:  # else it is none, whoever sent it
+                    newest[publisher] = int.from_bytes(payload, "little")
         return newest
 
     return take, subscriber.undeclare
+
+
+@lru_cache(_HEARTBEATS)
+def _publisher_of(heartbeat: str) -> tuple[str, str] | None:
+    """Return the stream and the name of the publisher on whose key a heartbeat came."""
+    found = _HEARTBEAT.fullmatch(heartbeat)
+    return None if found is None else (found[1], f"{found[2]}:{found[3]}")
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
