@@ -335,11 +335,25 @@ def test_too_much_that_waits_is_let_go(
     lossy: Lossy, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(module, "CAPACITY", 50)
+    monkeypatch.setattr(module, "_HELD", 50)
     lossy.unanswered, lossy.missing = 1_000_000, {1}
     publish(publisher, *range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
     assert lossy.subscription.counts == Counts(received=59, lost=1)
+
+
+def test_reader_that_is_behind_asks_when_it_has_read(
+    lossy: Lossy, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is recovered does not push out what a slow reader has not read yet."""
+    monkeypatch.setattr(module, "_BEHIND", 5)
+    lossy.missing = {10}
+    publish(publisher, *range(20))
+    wait_for(lambda: lossy.subscription._queue.waiting == 10, what="what comes before the hole")
+    wait_for(lambda: lossy.subscription._queue.held == 9, what="what comes after it")
+    asked_before = list(lossy.asked)
+    assert lossy.receive(20) == list(range(20))
+    assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])
 
 
 def test_unexpected_error_costs_what_caused_it(

@@ -112,6 +112,8 @@ class Decoder:
     def keep(self, arrival: Arrival) -> Arrival:
         """Return an arrival that takes up no more memory than it needs."""
         stream, payload, raw, lost = arrival
+        if isinstance(raw, Kept):
+            return arrival
         return stream, payload, Kept(raw.timestamp, raw.source_info, self.provenance(arrival)), lost
 
     def provenance(self, arrival: Arrival) -> Provenance:

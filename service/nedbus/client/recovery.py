@@ -32,6 +32,8 @@ _log = logging.getLogger(__name__)
 _OPEN: Final = 64  # questions at a time,
 _OPEN_BEGINNINGS: Final = 16  # of these for what a publisher sent before it was heard,
 _OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
+_BEHIND: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
+_HELD: Final = 2 * CAPACITY  # messages that wait for others, some 90 MB
 _TIMEOUT: Final = 3.0  # s until a question is given up
 _PATIENCE: Final = 20.0  # s of questions after which what is still missing is lost: so long publishers keep it
 _POLL: Final = 0.005  # s between two looks for answers
@@ -110,8 +112,8 @@ class Recovery:
                     next_look = now + _LOOK
                     self._look()
                 self._ask(now)
-                if self._queue.held > CAPACITY:
-                    self._give_up(until=CAPACITY)
+                if self._queue.held > _HELD:
+                    self._give_up(until=_HELD)
         except BaseException:
             _log.exception("%s: recovery ends after an unexpected error", self._name, extra=about("error"))
             raise
@@ -139,7 +141,7 @@ class Recovery:
 
     def _ask(self, now: float) -> None:
         for _ in range(len(self._waiting)):
-            if self._open.total() >= _OPEN:
+            if self._open.total() >= _OPEN or self._queue.waiting > _BEHIND:
                 return
             search = self._waiting.popleft()
             if search.ended:
