@@ -463,9 +463,9 @@ def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -
 
 @pytest.mark.process
 @pytest.mark.parametrize("value", ["0", "-1", "nan"])
-def test_echo_refuses_what_is_no_rate(run_nedbus: Start, endpoint: str, value: str) -> None:
-    """A rate that is none ends with 2 and one line."""
-    echo = run_nedbus("echo", "-c", endpoint, "--max-rate", value)
+def test_echo_refuses_what_is_no_rate(run_nedbus: Start, value: str) -> None:
+    """A rate that is none ends with 2 and one line, before a router is looked for."""
+    echo = run_nedbus("echo", "--wait", "-c", "tcp/127.0.0.1:1", "--max-rate", value)
     assert echo.wait() == 2
     assert "max" in echo.err
     assert "rate" in echo.err

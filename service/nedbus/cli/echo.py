@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from nedbus.client import Bus, Sample, Subscription
+from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
 from nedbus_msgs import ANY, FIELD_TYPES, Address
 
@@ -27,7 +27,7 @@ from .options import (
     TopicArgument,
     VehicleOption,
     choose,
-    on_bus,
+    lazily_on_bus,
     require_one,
     write,
     write_stderr,
@@ -35,9 +35,9 @@ from .options import (
 from .table import terminal_width
 
 
-@on_bus
+@lazily_on_bus
 def echo(
-    bus: Bus,
+    open_bus: Callable[[], Bus],
     topic: TopicArgument = None,
     *,
     topic_option: PositionTopicOption = None,
@@ -73,6 +73,8 @@ def echo(
     require_one({"--full": full, "--json": json_output, "--csv": csv_output})
     require_one({"--once": once, "--count": count is not None})
     fields = _parse_fields(field)
+    if max_rate is not None:
+        check_max_rate(max_rate)
     form = to_json if json_output else to_csv if csv_output else to_fields if full else _Lines()
     show: Callable[[Sample], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
@@ -87,7 +89,8 @@ def echo(
         return True
 
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
-    with bus.subscribe_to(selection, mode="every" if every else "latest", max_rate=max_rate) as subscription:
+    mode: Mode = "every" if every else "latest"
+    with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
         try:
             if csv_output:
                 write(to_csv_head(fields))

@@ -39,7 +39,9 @@ def web(
     ] = None,
     background: Annotated[
         Path | None,
-        typer.Option("--map", metavar="FILE", help="GeoJSON, or a picture with a world file, under the tracks"),
+        typer.Option(
+            "--map", exists=True, metavar="FILE", help="GeoJSON, or a picture with a world file, under the tracks"
+        ),
     ] = None,
 ) -> None:
     """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""

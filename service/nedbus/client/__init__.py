@@ -15,6 +15,7 @@ from .monitor import Monitor
 from .publisher import HEARTBEAT, Publisher
 from .publisher_registry import PublisherRegistry
 from .query_server import QueryServer
+from .rate_gate import check_max_rate
 from .rejections import RejectionReport, Rejections
 from .sample import Counts, Mode, Sample
 from .stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
@@ -46,6 +47,7 @@ __all__ = [
     "StreamHealth",
     "StreamState",
     "Subscription",
+    "check_max_rate",
     "connect",
     "connect_async",
     "connect_with",
