@@ -26,7 +26,7 @@ FLOORS = [
 ONLY: dict[str, set[str]] = {
     "zenoh": {
         "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries",
-        "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
+        "nedbus/client/channels", "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
         "nedbus/client/acknowledgement", "nedbus/client/recovery", "nedbus/client/rejections",
         "nedbus/client/query_server", "nedbus/client/qos", "nedbus/client/demand",

@@ -8,8 +8,8 @@ from itertools import pairwise
 import pytest
 
 from nedbus.client.acknowledgement import KEPT, WINDOW, Acknowledgement
+from nedbus.client.channels import CHANNEL
 from nedbus.client.receive_queue import CAPACITY
-from nedbus.client.zenoh_subscriber import _CHANNEL
 from nedbus.errors import ClosedError
 from nedbus.transport import LEASE
 
@@ -30,7 +30,7 @@ def acknowledgement(world: World, monkeypatch: pytest.MonkeyPatch) -> Acknowledg
 
 def test_limits_fit_into_each_other() -> None:
     """What is sent without an acknowledgement is still kept for recovery, and fits into the queue of each reader."""
-    assert WINDOW < LIMIT < KEPT < _CHANNEL < CAPACITY
+    assert WINDOW < LIMIT < KEPT < CHANNEL < CAPACITY
     assert LIMIT + WINDOW == KEPT
 
 

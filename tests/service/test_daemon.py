@@ -344,7 +344,7 @@ def test_signal_ends_the_service(
         "missing": "ulog:/nowhere.ulg",
     }
     endpoint = free_endpoint()
-    service = run_nedbus("serve", "-l", endpoint, "-s", texts[source])
+    service = run_nedbus("serve", "-l", endpoint, "-s", texts[source], measured=False)
     with until_connected(endpoint) as bus:
         wait_for(bus.services, what=f"the service: {service.err}")
         service.signal(number)

@@ -140,3 +140,32 @@ time.sleep(600)
     wait_for(lambda: "mine" in bus.vehicles(), what="the vehicle")
     process.kill()
     wait_for(lambda: "mine" not in bus.vehicles(), what="the vehicle to go")
+
+
+def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that comes back from there while the interpreter ends aborts the process: 'FATAL: exception not rethrown'."""
+    joined: list[str] = []
+    join = threading.Thread.join
+
+    def note(thread: threading.Thread, timeout: float | None = None) -> None:
+        joined.append(thread.name)
+        join(thread, timeout)
+
+    monkeypatch.setattr(threading.Thread, "join", note)
+    publisher = bus.publisher("vehicle_local_position", vehicle="0")
+    before = set(threading.enumerate())
+    subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(20)]
+    reader = threading.Thread(target=lambda: list(subscriptions[0]))
+    reader.start()
+
+    def is_inside() -> bool:
+        publisher.publish(message(1))
+        return subscriptions[0]._subscriber._reader_waits
+
+    wait_for(is_inside, what="the reader to be inside Zenoh")
+    for subscription in subscriptions:
+        subscription.close()
+    assert not subscriptions[0]._subscriber._reader_waits
+    assert set(threading.enumerate()) - before <= {reader}
+    assert {"nedbus-pump", "nedbus-ack", "nedbus-recovery"} <= set(joined)
+    reader.join()

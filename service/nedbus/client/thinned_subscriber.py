@@ -20,11 +20,12 @@ from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, follow_alive_keys, query, while_open
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key, get_topic
 
+from .channels import declare_reader, take_all
 from .publisher_registry import LIVE
 from .recovery import Recovery
 from .thinned_queue import ThinnedQueue
 from .unthinned import Unthinned
-from .zenoh_subscriber import ZenohSubscriber, declare_reader, take_all
+from .zenoh_subscriber import ZenohSubscriber
 
 _log = logging.getLogger(__name__)
 

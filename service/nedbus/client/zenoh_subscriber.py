@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from contextlib import suppress
-from typing import Final, TypeVar
+from typing import Final
 
 import zenoh
 
@@ -19,6 +19,7 @@ from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
+from .channels import CHANNEL, declare_reader, take_all
 from .decoder import WAKE_UP
 from .questions import CLOSED, MAX_PENDING, Question, read_parameters
 from .receive_queue import ReceiveQueue
@@ -26,12 +27,10 @@ from .recovery import Recovery
 
 _log = logging.getLogger(__name__)
 
-_CHANNEL: Final = 16_384  # samples that may arrive until somebody looks; more than 0.2 s of the largest fleet
 _LOOK: Final = 0.1  # s until the pump looks whether the reader has gone
 _BUSY: Final = 64  # samples at once after which a pause pays: whoever receives is woken once for many
 _PAUSE: Final = 0.001  # s
-
-_T = TypeVar("_T")
+_JOIN: Final = 3.0  # s that a busy machine has to end a thread
 
 
 class ZenohSubscriber:
@@ -51,9 +50,10 @@ class ZenohSubscriber:
         self._receiving = threading.Lock()  # whoever has it empties the channel
         self._by_reader = False  # the reader has waited by itself since the pump looked
         self._reader_waits = False  # for the channel
+        self._reader: int | None = None  # the thread that did so last
         self._busy = False
         self._needed = threading.Event()  # the pump is
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
+        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(CHANNEL)
         # No late-publisher detection: after a router's restart it would ask for what recovery asks for.
         history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
         with while_open():
@@ -69,8 +69,13 @@ class ZenohSubscriber:
             self._unwatch = self._recovery.watch(key_expr)
         self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
         self._pump.start()
+        self._threads = [self._pump]
         if self._asked is not None:
-            threading.Thread(target=self._listen, args=[self._asked.handler], name="nedbus-ack", daemon=True).start()
+            answering = threading.Thread(
+                target=self._listen, args=[self._asked.handler], name="nedbus-ack", daemon=True
+            )
+            answering.start()
+            self._threads.append(answering)
 
     def receive(self) -> None:
         """Queue what has arrived by now, unless the pump does so; it does not wait."""
@@ -93,7 +98,7 @@ class ZenohSubscriber:
         if not self._receiving.acquire(blocking=False):
             return self._queue.wait(None)
         try:
-            self._reader_waits = True
+            self._reader, self._reader_waits = threading.get_ident(), True
             if not self._queue.waiting:  # nothing was recovered since the caller looked
                 self._receive()
         finally:
@@ -117,7 +122,10 @@ class ZenohSubscriber:
             self._recovery.close()
         self._subscriber.undeclare()
         self._needed.set()
-        self._pump.join(1.0)
+        for thread in self._threads:  # one that is inside Zenoh when the interpreter ends aborts the process
+            thread.join(_JOIN)
+        if self._reader != threading.get_ident() and self._receiving.acquire(timeout=_JOIN):
+            self._receiving.release()
 
     def _run(self) -> None:
         try:
@@ -159,7 +167,7 @@ class ZenohSubscriber:
         self._misses.announce(receive_queue)
         self._put(batch)
 
-    def _put(self, batch: list[zenoh.Sample], *, full: int = _CHANNEL) -> None:
+    def _put(self, batch: list[zenoh.Sample], *, full: int = CHANNEL) -> None:
         if self._queue.ended:
             return
         try:
@@ -197,46 +205,3 @@ class ZenohSubscriber:
                 _log.debug("%s: a question could not be answered: %s", key, exc)
 
         self._queue.ask(Question(*parameters, reply))
-
-
-def declare_reader(
-    session: Session,
-    key_expr: str,
-    channel: zenoh.handlers.RingChannel[zenoh.Sample],
-    *,
-    history: zenoh.ext.HistoryConfig | None = None,
-) -> tuple[zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]], Misses]:
-    """Declare a subscriber, and what notes the gaps in what it receives."""
-    subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, channel, history=history)
-    return subscriber, Misses(subscriber)
-
-
-class Misses:
-    """The gaps in what a subscriber receives, until somebody passes them on.
-
-    No callback does: on Zenoh's thread, on which everything arrives, each would wait for the interpreter's lock.
-    """
-
-    def __init__(self, subscriber: zenoh.ext.AdvancedSubscriber[zenoh.Handler[zenoh.Sample]]) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.ext.Miss] = zenoh.handlers.RingChannel(_CHANNEL)
-        self._listener = subscriber.sample_miss_listener(channel)
-        self._handler = iter(self._listener)
-
-    def announce(self, receive_queue: ReceiveQueue) -> None:
-        """Let a queue know which gaps are those of the network, before what arrived behind them is put."""
-        for miss in take_all(self._handler, []):
-            receive_queue.announce_loss(miss)
-
-    def undeclare(self) -> None:
-        """Note no more; a second call raises ZError."""
-        self._listener.undeclare()
-
-
-def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
-    """Add all that is there to a batch, up to a full channel, and return it."""
-    try:
-        while len(batch) < _CHANNEL and (item := handler.try_recv()) is not None:
-            batch.append(item)
-    except zenoh.ZError:  # undeclared: the next wait notices
-        pass
-    return batch
