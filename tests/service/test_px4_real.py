@@ -138,7 +138,7 @@ def status(bus: nedbus.Bus) -> Mapping[str, Any]:
 
 
 def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
-    """Wait until the service published or rejected so many messages."""
+    """Wait until the service published or rejected so many messages; it counts one after it was sent."""
 
     def is_counted() -> bool:
         now = status(bus)
@@ -204,6 +204,7 @@ def test_flight_arrives_as_it_was_logged(where: str) -> None:
             if sent.payload:
                 window.setdefault(sent.address, []).append(sent.cdr)
                 total += 1
+        wait_until_counted(bus, total)
         now = status(bus)
         assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (total, 0, 0, 0)
         assert (total, every.counts.lost) == (26_514, 0)
@@ -251,6 +252,7 @@ def test_two_that_are_alike_are_not_mixed(where: str) -> None:
         play([sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"])
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
+        wait_until_counted(bus, played)
         now = status(bus)
         assert (now["published"], now["rejected"]) == (len(alone), played - len(alone))
         assert (now["lost"], now["reboots"], every.counts.lost) == (0, 0, 0)
@@ -342,6 +344,7 @@ def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
             assert [fields[name] for name in names] == [row[name] for name in names]
             for flag in flags:
                 differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += fields[flag] != row[flag]
+        wait_until_counted(bus, 1276)
         now = status(bus)
     assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (1276, 0, 0, 0)
     assert compared == 1275

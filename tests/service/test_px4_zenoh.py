@@ -184,8 +184,9 @@ def test_loss_and_reboot_are_counted(serve: Serve, raw: Session, bus: nedbus.Bus
     px4.put(3)
     px4.put(4, skip=1)
     assert [sample.message.timestamp for sample in receive(every, 4)] == [1, 2, 3, 4]
+    wait_for(lambda: status(bus)["published"] == 4, what="the last one to be counted")
     now = status(bus)
-    assert (now["lost"], now["reboots"], now["published"], now["rejected"]) == (4, 1, 4, 0)
+    assert (now["lost"], now["reboots"], now["rejected"]) == (4, 1, 0)
     assert "the vehicle rebooted" in service.err
 
 
@@ -244,7 +245,7 @@ def test_hostile_input_is_counted_and_logged(
     samples = receive(every, 2)
     assert [(sample.vehicle, sample.message.timestamp) for sample in samples] == [("1", 1), ("1", 2)]
     assert every.counts.received == 2
-    assert status(bus)["published"] == 2
+    wait_for(lambda: status(bus)["published"] == 2, what="the last one to be counted")
     assert "not a VehicleLocalPosition" not in service.err
     rejections = [line for line in service.err.splitlines() if ": rejected: " in line]
     assert sum(64 * "0" in line for line in rejections) == 1
@@ -370,8 +371,9 @@ def test_ros_2_publisher_that_restarts_is_received_at_once(
         node = peer("talk", "1.16", topic=f"/fmu/out/{VLP}", rows=rows)
         assert [sample.message for sample in receive(every, len(rows))] == messages
         node.kill()
+    wait_for(lambda: status(bus)["published"] == 2 * len(rows), what="the last one to be counted")
     now = status(bus)
-    assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (2 * len(rows), 0, 0, 1)
+    assert (now["rejected"], now["lost"], now["reboots"]) == (0, 0, 1)
 
 
 def test_ros_2_lists_the_source_as_a_subscriber(serve: Serve, peer: Peer, raw: Session) -> None:
