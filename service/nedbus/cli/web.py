@@ -40,7 +40,11 @@ def web(
     background: Annotated[
         Path | None,
         typer.Option(
-            "--map", exists=True, metavar="FILE", help="GeoJSON, or a picture with a world file, under the tracks"
+            "--map",
+            exists=True,
+            dir_okay=False,
+            metavar="FILE",
+            help="GeoJSON, or a picture with a world file, under the tracks",
         ),
     ] = None,
 ) -> None:

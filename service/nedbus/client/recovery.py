@@ -65,8 +65,7 @@ class Recovery:
         self._on_fill = on_fill
         self._waiting: deque[Search] = deque()
         self._searching: dict[Hole, Search] = {}
-        self._asked: list[Search] = []  # those with an open question,
-        self._open: Counter[str] = Counter()  # and how many by key; "" for those of beginnings
+        self._asked: list[Search] = []  # those with an open question
         self._silent: dict[str, None] = {}  # publishers that were asked in vain
         self._holes: queue.SimpleQueue[Hole | None] = queue.SimpleQueue()
         self._closed = False
@@ -136,18 +135,18 @@ class Recovery:
     def _take_answers(self) -> None:
         for search in [each for each in self._asked if each.take()]:
             self._asked.remove(search)
-            self._open -= Counter([_share(search.hole)])
             self._judge(search)
 
     def _ask(self, now: float) -> None:
+        shares = Counter(_share(each.hole) for each in self._asked)
         for _ in range(len(self._waiting)):
-            if self._open.total() >= _OPEN or self._queue.waiting > _BEHIND:
+            if len(self._asked) >= _OPEN or self._queue.waiting > _BEHIND:
                 return
             search = self._waiting.popleft()
             if search.ended:
                 continue
             hole, share = search.hole, _share(search.hole)
-            if search.due > now or self._open[share] >= (_OPEN_OF_KEY if share else _OPEN_BEGINNINGS):
+            if search.due > now or shares[share] >= (_OPEN_OF_KEY if share else _OPEN_BEGINNINGS):
                 self._waiting.append(search)
                 continue
             search.tries += 1
@@ -158,7 +157,7 @@ class Recovery:
                 self._fill(search)
             else:
                 self._asked.append(search)
-                self._open[share] += 1
+                shares[share] += 1
 
     def _judge(self, search: Search) -> None:
         """Decide what follows from the end of a question."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
-from nedbus.transport import KeptAnswers, RawSample
+from nedbus.transport import MAX_ANSWERS, KeptAnswers, RawSample
 from nedbus_msgs import PAYLOAD_LIMIT
 
 from .publisher_sequence import Hole
-
-_MOST: Final = 10_000  # messages of one answer; no publisher of nedbus keeps more
 
 
 @dataclass(slots=True, eq=False)
@@ -29,7 +26,7 @@ class Search:
     @property
     def complete(self) -> bool:
         """Whether its publisher has answered: one that sends the last message has all that it still keeps."""
-        return self.hole.stop - 1 in self.found or len(self.found) >= _MOST
+        return self.hole.stop - 1 in self.found or len(self.found) >= MAX_ANSWERS
 
     @property
     def numbers(self) -> range:
@@ -42,6 +39,6 @@ class Search:
         if self.answers is None:
             return True
         for number, sample in self.answers.take().items():
-            if len(self.found) < _MOST and len(sample.payload) <= PAYLOAD_LIMIT and not self.ended:
+            if len(self.found) < MAX_ANSWERS and len(sample.payload) <= PAYLOAD_LIMIT and not self.ended:
                 self.found[number] = sample
         return self.answers.ended

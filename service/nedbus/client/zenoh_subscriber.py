@@ -83,7 +83,6 @@ class ZenohSubscriber:
         if self._receiving.acquire(blocking=False):
             try:
                 if batch := take_all(self._handler, []):
-                    self._misses.announce(self._queue)
                     self._put(batch)
             finally:
                 self._receiving.release()
@@ -164,12 +163,12 @@ class ZenohSubscriber:
         finally:
             receive_queue.idle = False
         self._busy = len(batch) >= _BUSY
-        self._misses.announce(receive_queue)
         self._put(batch)
 
     def _put(self, batch: list[zenoh.Sample], *, full: int = CHANNEL) -> None:
         if self._queue.ended:
             return
+        self._misses.announce(self._queue)
         try:
             self._queue.put(batch, overflowed=len(batch) >= full)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
