@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -176,22 +177,26 @@ def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-@contextmanager
-def blocking(monkeypatch: pytest.MonkeyPatch, method: str) -> Iterator[threading.Event]:
-    """Let the sources of this process block in a method of their output; yield what is set as soon as one does."""
-    entered, released = threading.Event(), threading.Event()
+@dataclass
+class Gate:
+    """Where sources block: `entered` is set as soon as one does, and all go on once `opened` is."""
+
+    entered: threading.Event = field(default_factory=threading.Event)
+    opened: threading.Event = field(default_factory=threading.Event)
+
+
+def block(monkeypatch: pytest.MonkeyPatch, method: str) -> Gate:
+    """Let the sources that are started after this block in a method of their output."""
+    gate = Gate()
     original = getattr(SourceOutput, method)
 
-    def block(output: SourceOutput, *arguments: object) -> object:
-        entered.set()
-        released.wait(DEADLINE)
+    def wait(output: SourceOutput, *arguments: object) -> object:
+        gate.entered.set()
+        gate.opened.wait(DEADLINE)
         return original(output, *arguments)
 
-    monkeypatch.setattr(SourceOutput, method, block)
-    try:
-        yield entered
-    finally:
-        released.set()
+    monkeypatch.setattr(SourceOutput, method, wait)
+    return gate
 
 
 @pytest.mark.parametrize(
@@ -206,18 +211,19 @@ def test_no_watchdog_while_a_source_is_stuck(
     limit = 0.3  # s; a live source goes round every 0.25 s
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": str(round(2e6 * limit))}
     daemon = publishing(source, listen=free_endpoint())
+    gate = block(monkeypatch, method)
     with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):
-        with blocking(monkeypatch, method) as entered:
-            systemd.receive_until(is_ready)
-            wait_for(entered.is_set, what="the source to block")
-            wait_for(lambda: daemon.busy > limit, what="the limit")
-            with notifier.reloading():
-                systemd.receive_until(lambda datagram: "RELOADING" in datagram)
-            wait_for(lambda: daemon.busy > 7 * limit, what="several limits")
-            with notifier.reloading():
-                stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
-            # One may have been on its way at the first reload.
-            assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
+        systemd.receive_until(is_ready)
+        wait_for(gate.entered.is_set, what="the source to block")
+        wait_for(lambda: daemon.busy > limit, what="the limit")
+        with notifier.reloading():
+            systemd.receive_until(lambda datagram: "RELOADING" in datagram)
+        wait_for(lambda: daemon.busy > 7 * limit, what="several limits")
+        with notifier.reloading():
+            stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
+        # One may have been on its way at the first reload.
+        assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
+        gate.opened.set()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
@@ -225,13 +231,14 @@ def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypat
     """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
     environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
     daemon = publishing("sim:?speed=max&duration=3600", listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):  # noqa: SIM117
-        with blocking(monkeypatch, "publish") as entered:
-            wait_for(entered.is_set, what="the source to wait")
-            systemd.receive_until(is_ready)
-            for _ in range(10):
-                systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
-            assert daemon.busy == 0
+    gate = block(monkeypatch, "publish")
+    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):
+        wait_for(gate.entered.is_set, what="the source to wait")
+        systemd.receive_until(is_ready)
+        for _ in range(10):
+            systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
+        assert daemon.busy == 0
+        gate.opened.set()
 
 
 @pytest.mark.parametrize(
