@@ -16,9 +16,11 @@ from contextlib import contextmanager, suppress
 from functools import partial
 
 import pytest
+from rich.console import Console
 
 import nedbus
 from nedbus.cli.format import printable, to_line, to_text
+from nedbus.cli.live_table import LiveTable
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT_TOPIC, TOPICS
@@ -239,6 +241,32 @@ def test_hz_leaves_the_cursor_as_it_was(run_nedbus: Start, endpoint: str, bus: n
             assert terminal.popen.wait(DEADLINE) == code
         assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
         assert "Traceback" not in terminal.shown
+
+
+@pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
+def test_signal_while_a_table_starts(
+    monkeypatch: pytest.MonkeyPatch, number: signal.Signals, raised: type[BaseException]
+) -> None:
+    """It has its effect when the table has started, and can be stopped: the cursor is shown again."""
+    shown: list[bool] = []
+
+    def show_cursor(console: Console, show: bool = True) -> bool:
+        shown.append(show)
+        if show is False:
+            signal.raise_signal(number)
+        return True
+
+    monkeypatch.setattr(Console, "show_cursor", show_cursor)
+    monkeypatch.setattr("nedbus.cli.live_table.terminal_width", lambda: 80)
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(raised), LiveTable(HEAD, ()) as table:
+            table.show(ROWS)
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    assert shown == [False, True]
 
 
 # Links and states

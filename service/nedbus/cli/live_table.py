@@ -5,7 +5,8 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Self
 
 from .logs import log_to
@@ -61,6 +62,24 @@ class LiveTable:
         log_to(console)
         # The cursor is hidden from the start to the stop, which a signal must not leave out.
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-        self._live = Live(console=console, auto_refresh=False)
-        self._live.start()
+        with _holding_signals():  # a Live that is half started can be neither used nor stopped
+            self._live = Live(console=console, auto_refresh=False)
+            self._live.start()
         return self._live
+
+
+@contextmanager
+def _holding_signals() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM have their effect at the end of the block."""
+    held: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, _: held.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for each in held:
+        signal.raise_signal(each)

@@ -37,20 +37,19 @@ _ENCRYPTED: Final = ("tls/", "quic/")
 
 
 class Display:
-    """Show the state of a daemon; `update` is called several times a second."""
+    """Show the state of a daemon; `update` is called several times a second, where Ctrl-C raises nothing."""
 
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon
         self._hinted = False
         self._reports = 0
         self._last = time.monotonic()
+        self._starts = sys.stderr.isatty() and not logs_for_programs()
         self._progress: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._rates: dict[str, tuple[float, int]] = {}
 
     def __enter__(self) -> Self:
-        if sys.stderr.isatty() and not logs_for_programs():
-            self._start_progress()
         return self
 
     def __exit__(self, *exc: object) -> None:
@@ -60,11 +59,14 @@ class Display:
 
     def update(self) -> None:
         """Show the current state; a terminal that is gone ends the display, not the service."""
-        if self._daemon.ready.is_set():
-            try:
+        try:
+            if self._starts:
+                self._starts = False
+                self._start_progress()
+            if self._daemon.ready.is_set():
                 self._update()
-            except OSError:
-                self._progress = None
+        except OSError:
+            self._progress = None
 
     def _update(self) -> None:
         if not self._hinted:
