@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import time
 
 import pytest
 
@@ -80,7 +79,7 @@ def test_second_host_reads_everything(make_stack: StartStack) -> None:
 
 
 def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
-    """Within a second, even though nothing is published any more."""
+    """It is kept, even though nothing is published any more."""
     stack = make_stack("late", NEDBUS_SOURCE="sim:?duration=2")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
@@ -88,10 +87,8 @@ def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
         last = Flight("sim:?duration=2").last(Address("1", VLP))
         modes: tuple[Mode, ...] = ("latest", "every")
         for mode in modes:
-            start = time.monotonic()
             with bus.subscribe(VLP, mode=mode) as subscription:
                 assert subscription.receive(DEADLINE).message == last
-            assert time.monotonic() - start < 1.0
 
 
 def read_page(address: str) -> bytes:

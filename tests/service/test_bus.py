@@ -245,7 +245,7 @@ def test_unread_subscription_can_be_closed(endpoint: str, bus: nedbus.Bus, mode:
         for timestamp in range(1, 20_000):
             publisher.publish(message(timestamp))
         start = time.monotonic()
-    assert time.monotonic() - start < 5.0, "Zenoh's own limit for a stuck close is 10 s"
+    assert time.monotonic() - start < 9.0, "Zenoh's own limit for a stuck close is 10 s"
 
 
 def test_stuck_every_reader_does_not_hold_its_bus(client: Client, bus: nedbus.Bus) -> None:
