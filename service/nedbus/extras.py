@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, Final
@@ -17,12 +18,17 @@ def needs(extra: str, module: str) -> Any:
 
     Raises ConfigError, which says what to install, when something that it imports is missing.
     """
+    collects = gc.isenabled()
+    gc.disable()  # as in the command line: nothing that is imported is garbage
     try:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
         package = f"'nedbus[{extra}]'" if extra in EXTRAS else extra
         raise ConfigError(missing, f"not installed: pip install {package}") from exc
+    finally:
+        if collects:
+            gc.enable()
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from bokeh.models import ColumnDataSource, HoverTool, TapTool
 from bokeh.plotting import figure
 
 from nedbus_msgs import Address, MapProjection
 
-from .background import Background
 from .fleet import TRUTH, Line, Picture
 from .send import replace
 from .style import COLOURS, Style
 from .tracks import Tracks
+
+if TYPE_CHECKING:
+    from .background import Background
 
 _MINUTE: Final = 60.0  # s for which a reset is shown
 _MARKS: Final = ("east", "north", "angle", "shape", "colour", "fill", "label", "words")

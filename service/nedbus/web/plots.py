@@ -32,7 +32,11 @@ class Plots:
         self.chosen, self._truth = (ColumnDataSource({name: [] for name in COLUMNS}) for _ in range(2))
         self._shown: dict[ColumnDataSource, tuple[Address | None, int]] = {}
         self._range = Range1d()
-        self.figures = [self._draw(style, title, names) for title, names in _PLOTS.items()]
+        self._style = style
+
+    def draw(self) -> list[figure]:
+        """Return the four plots: when the map is there, as they take as long as everything else of the page."""
+        return [self._draw(title, names) for title, names in _PLOTS.items()]
 
     def update(self, fleet: Fleet, chosen: Address | None, truth: Address | None) -> None:
         """Send the points that are new."""
@@ -59,12 +63,12 @@ class Plots:
         """Forget what was sent: the time has jumped."""
         self._shown.clear()
 
-    def _draw(self, style: Style, title: str, names: tuple[str, ...]) -> figure:
+    def _draw(self, title: str, names: tuple[str, ...]) -> figure:
         plot = figure(
             title=title, x_range=self._range, x_axis_type="datetime", tools="", toolbar_location=None, min_border=4,
             sizing_mode="stretch_both", height=100,
         )  # fmt: skip
-        for name, colour in zip(names, style.lines, strict=False):
+        for name, colour in zip(names, self._style.lines, strict=False):
             plot.line("time", name, source=self.chosen, color=colour, legend_label=name, line_width=1.5)
             if name in {"north", "east", "height", "vx", "vy", "climb"}:
                 plot.line("time", name, source=self._truth, color=colour, line_dash="dotted", line_width=1.5)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bokeh.document import Document
 
@@ -14,11 +15,13 @@ from nedbus.client import Bus
 from nedbus.monitoring import Page
 from nedbus_msgs import Selection
 
-from .background import Background
 from .live import LOOK, LiveFleet
 from .playback import Player, Recording
 from .server import WebServer
 from .viewer import TICK, Viewer
+
+if TYPE_CHECKING:
+    from .background import Background
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +37,11 @@ class Where:
         self, open_page: Callable[[Document, Background | None], object], pages: Mapping[str, Callable[[], Page]]
     ) -> WebServer:
         """Return a server that listens there; raise ConfigError for a bad background, ListenError if it cannot."""
-        background = Background(self.background) if self.background else None
+        background = None
+        if self.background is not None:
+            from .background import Background
+
+            background = Background(self.background)
         return WebServer(
             self.host, self.port, lambda page: open_page(page, background), pages=pages, origins=self.origins
         )

@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from bokeh.document import Document
 from bokeh.events import ConnectionLost, DocumentReady
@@ -17,12 +17,14 @@ from bokeh.models.widgets import Div, TextInput, Toggle
 from nedbus.client import to_age
 from nedbus_msgs import Address
 
-from .background import Background
 from .fleet import CONDITIONS, MAX_STREAMS, TRUTH, Fleet, Line, Picture, main_line
 from .map_plot import MapPlot
 from .plots import Plots
 from .style import DARK, LIGHT, badge, to_clock
 from .table import RejectionTable, StreamTable
+
+if TYPE_CHECKING:
+    from .background import Background
 
 TICK: Final = 100
 """Milliseconds between two moves of the map."""
@@ -102,7 +104,7 @@ class Viewer:
         self._slow = now - self._updated if now - self._updated > _SLOW else 0.0
         self._sent, self._updated = self._sent + 1, now
         if self._drawn.value and not self._grid.children:  # map and table are there sooner without
-            figures = self._plots.figures
+            figures = self._plots.draw()
             self._grid.children = [row(*figures[first : first + 2], sizing_mode="stretch_both") for first in (0, 2)]
         picture = self._fleet.picture
         vehicles: dict[str, list[Line]] = {}
