@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Protocol, Self, cast
 
@@ -93,11 +94,24 @@ def repeating(action: Callable[[], object]) -> Iterator[None]:
         thread.join(DEADLINE)
 
 
+# From 32768 on Linux gives ports to connections that go out: one that is free now may be taken before it is used.
+# Each process of pytest begins elsewhere.
+_ports = islice(cycle(range(10_000, 32_000)), os.getpid() * 2503 % 22_000, None)
+
+
+def free_port() -> int:
+    """Return a port of loopback that nobody uses now, neither with TCP nor with UDP."""
+    for port in _ports:
+        with suppress(OSError), socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
+            tcp.bind(("127.0.0.1", port))
+            udp.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("never: ports begin again")
+
+
 def free_endpoint() -> str:
-    """Return a Zenoh endpoint on a port of loopback that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """Return a Zenoh endpoint on a free port of loopback."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @pytest.fixture

@@ -12,17 +12,12 @@ from urllib.parse import quote
 
 import pytest
 
-from tests.conftest import Process, Start, free_endpoint, wait_for
+from tests.conftest import Process, Start, free_port, wait_for
 
 PACKAGING: Final = Path(__file__).parents[1] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
 # Whatever `start` starts is Python: this one reads a file as its input and becomes another program.
 _BECOME: Final = "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"
-
-
-def free_port() -> int:
-    """Return a TCP port of loopback that nobody uses now."""
-    return int(free_endpoint().rpartition(":")[2])
 
 
 def find_program(name: str) -> str:

@@ -33,7 +33,7 @@ from nedbus.transport import (
     publisher_token,
 )
 from nedbus_msgs import ROS2_TYPE, dds_type, encode, status_key
-from tests.conftest import DEADLINE, Start, free_endpoint, message, repeating, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, free_port, message, repeating, wait_for
 
 CONFIG = Path(__file__).parents[2] / "config"
 VLP = "vehicle_local_position"
@@ -455,9 +455,7 @@ def test_damaged_certificates_are_refused(pki: Path) -> None:
 @pytest.fixture
 def link() -> tuple[str, tuple[str, int]]:
     """Return a link on a free port, and where to send."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     return f"udpin:127.0.0.1:{port}", ("127.0.0.1", port)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
@@ -25,7 +24,7 @@ from nedbus_msgs import (
     to_global,
     upgrade,
 )
-from tests.conftest import DEADLINE, Process, Start, message, wait_for
+from tests.conftest import DEADLINE, Process, Start, free_port, message, wait_for
 
 VLP = DEFAULT_TOPIC
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
@@ -80,9 +79,7 @@ class Client:
 @pytest.fixture
 def server(run_nedbus: Start, endpoint: str, start: Start) -> Iterator[tuple[Process, Client]]:
     """Run `nedbus foxglove`, and connect a client."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     process = run_nedbus("foxglove", "-c", endpoint, "--port", str(port), measured=False)
     wait_for(lambda: "open ws://" in process.err or process.popen.poll() is not None, what=f"the server {process.err}")
     client = Client(f"ws://127.0.0.1:{port}")

@@ -26,7 +26,7 @@ from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, OutOfOrderError, Vehicle
 from nedbus_msgs import upgrade
-from tests.conftest import DEADLINE, LOGS, Process, Start, wait_for
+from tests.conftest import DEADLINE, LOGS, Process, Start, free_port, wait_for
 from tests.replays import open_replay
 
 PEER = str(Path(__file__).with_name("mavlink_peer.py"))
@@ -43,9 +43,7 @@ Fly = Callable[..., Process]
 @pytest.fixture
 def port() -> int:
     """Return a free UDP port."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return cast("int", probe.getsockname()[1])
+    return free_port()
 
 
 @pytest.fixture

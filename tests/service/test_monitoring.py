@@ -31,8 +31,8 @@ from nedbus.monitoring.families import MAX_STREAMS, Stream, stream_families
 from nedbus.monitoring.service_metrics import _streams
 from nedbus.settings import load_settings
 from nedbus_msgs import VehicleLocalPosition, encode
-from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
-from tests.prometheus import free_port, start_promtool
+from tests.conftest import DEADLINE, Process, Start, free_endpoint, free_port, message, wait_for
+from tests.prometheus import start_promtool
 from tests.ulogs import UlogWriter
 
 VLP = "vehicle_local_position"
@@ -226,7 +226,7 @@ def test_exporter_without_a_router_is_not_ready(run_nedbus: Start, pages: Pages)
     """An exporter that has lost its router says so."""
     where = free_endpoint()
     router = run_nedbus("router", "-l", where)
-    run_nedbus("export", "-c", where, "--http", pages.where)
+    run_nedbus("export", "--wait", "-c", where, "--http", pages.where)
     wait_for(lambda: pages.ask("/readyz") == (200, "ready\n"), what="the exporter")
     router.kill()
     wait_for(lambda: pages.ask("/readyz") == (503, f"no router answers at {where}\n"), what="the end of the router")

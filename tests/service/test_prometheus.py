@@ -17,8 +17,8 @@ import zenoh
 import nedbus
 from nedbus_msgs import encode
 from nedbus_msgs.arrays import to_array
-from tests.conftest import Process, Start, free_endpoint, message, wait_for
-from tests.prometheus import ALERTS, PACKAGING, Prometheus, free_port, start_promtool
+from tests.conftest import Process, Start, free_endpoint, free_port, message, wait_for
+from tests.prometheus import ALERTS, PACKAGING, Prometheus, start_promtool
 from tests.ulogs import write_log
 
 VLP = "vehicle_local_position"
@@ -91,12 +91,6 @@ def shorten(rules: str) -> str:
     return re.sub(r"\[5m\]", "[10s]", re.sub(r"for: \d+[sm]", "for: 1s", rules))
 
 
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def names_of(rules: str) -> set[str]:
     return set(re.findall(r"alert: (\w+)", rules))
 
@@ -110,7 +104,7 @@ def test_every_alert_fires_and_clears(
     All are caused at the same time; the rules are those that are shipped, with shorter times.
     """
     rules = shorten(ALERTS.read_text())
-    silent, lossy = free_udp_port(), free_udp_port()
+    silent, lossy = free_port(), free_port()
     second, missing = free_endpoint(), tmp_path / "flight.ulg"
     addresses = [f"127.0.0.1:{free_port()}" for _ in range(7)]
     service, exporter, lonely, lonely_exporter, ended, full, full_exporter = addresses
@@ -135,7 +129,7 @@ def test_every_alert_fires_and_clears(
     start("-c", SMALL_EXPORTER, "export", "-c", endpoint, "--http", exporter)
     router = route()
     run_nedbus("serve", "-c", second, "--http", lonely, "-s", "sim:?speed=0.3&vehicle=lonely")
-    run_nedbus("export", "-c", second, "--http", lonely_exporter)
+    run_nedbus("export", "--wait", "-c", second, "--http", lonely_exporter)
     to_end = export_ended()
     small = start_small_router(run_nedbus, tmp_path, full, full_exporter)
     vehicle = fly(lossy, "--drop", "0.3")

@@ -19,8 +19,7 @@ from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.transport import open_router
-from tests.conftest import DEADLINE, Start, free_endpoint, repeating, wait_for
-from tests.prometheus import free_port
+from tests.conftest import DEADLINE, Start, free_endpoint, free_port, repeating, wait_for
 
 Datagram = dict[str, str]
 
