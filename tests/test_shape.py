@@ -227,6 +227,17 @@ def test_public_signatures_mention_public_names_only(name: str) -> None:
         assert not unknown, annotation
 
 
+def test_no_python_code_runs_on_threads_of_zenoh() -> None:
+    """A callback would wait there for the interpreter's lock: what arrives waits in a channel.
+
+    An advanced publisher is dropped: `undeclare` waits for Zenoh before it gives up the interpreter's lock.
+    """
+    for path in sorted((ROOT / "service").rglob("*.py")):
+        code = path.read_text()
+        assert not re.search(r"handlers\.Callback|indirect=", code), path
+        assert "declare_advanced_publisher" not in code or "publisher.undeclare(" not in code, path
+
+
 @pytest.mark.parametrize(
     ("program", "absent"),
     [

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from types import SimpleNamespace
-from typing import Final, Self, cast
+from typing import Final, cast
 
 import pytest
 import zenoh
 
 from nedbus.client import acknowledgement as module
-from nedbus.client.acknowledgement import Acknowledgement
+from nedbus.client.acknowledgement import Acknowledgement, SharedWindow
 from nedbus.client.questions import CLOSED
 from nedbus.transport import LEASE, Session
 
@@ -51,18 +52,26 @@ class Query:
     """A query of the publisher, and the readers that still have to answer it."""
 
     parameters: dict[str, str]
-    callback: zenoh.handlers.Callback[zenoh.Reply]
     end: float
     waiting: list[Reader]
+    replies: deque[SimpleNamespace] = field(default_factory=deque)
+    ended: bool = False
+    lost: bool = False  # a full queue dropped it
 
     @property
     def number(self) -> int:
         return int(self.parameters["number"])
 
+    def try_recv(self) -> SimpleNamespace | None:
+        """Return the next answer, as the channel of a query does."""
+        if not self.replies and self.ended:
+            raise zenoh.ZError("ended")
+        return self.replies.popleft() if self.replies else None
+
 
 @dataclass(eq=False)
 class World:
-    """The session of the publisher, its clock and its condition; everything happens in the thread that waits."""
+    """The session of the publisher, and its clock; everything happens in the thread that waits."""
 
     readers: list[Reader] = field(default_factory=list)
     now: float = 0.0
@@ -72,15 +81,23 @@ class World:
     pending: list[Query] = field(default_factory=list)
     plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
     routers: list[str] = field(default_factory=lambda: ["r1"])
-    notified: bool = False
     closed: bool = False
+    dropping: bool = False
+    """Whether a full queue drops the questions that are asked."""
 
-    def acknowledgement(self, monkeypatch: pytest.MonkeyPatch) -> Acknowledgement:
+    def acknowledgement(
+        self, monkeypatch: pytest.MonkeyPatch, *, shared: SharedWindow | None = None, needs_router: bool = True
+    ) -> Acknowledgement:
         """Return an acknowledgement that lives here."""
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now))
-        monkeypatch.setattr(module, "threading", SimpleNamespace(Condition=lambda: self))
-        publisher = cast("zenoh.ext.AdvancedPublisher", SimpleNamespace(id=SimpleNamespace(zid="p", eid=1)))
-        return Acknowledgement(cast("Session", self), KEY, publisher, priority=zenoh.Priority.DATA)
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep))
+        return Acknowledgement(
+            cast("Session", self),
+            KEY,
+            "p:1",
+            priority=zenoh.Priority.DATA,
+            shared=shared or SharedWindow(),
+            needs_router=needs_router,
+        )
 
     def publish(self, acknowledgement: Acknowledgement, count: int, *, rate: float = 10_000.0) -> None:
         """Publish so many messages, so many a second where nothing holds it up."""
@@ -134,8 +151,8 @@ class World:
         return self.closed
 
     def get(
-        self, selector: str, callback: zenoh.handlers.Callback[zenoh.Reply], *, timeout: float, **options: object
-    ) -> None:
+        self, selector: str, channel: zenoh.handlers.FifoChannel[zenoh.Reply], *, timeout: float, **options: object
+    ) -> Query:
         if self.closed:
             raise zenoh.ZError("session closed")
         key, _, parameters = selector.partition("?")
@@ -143,42 +160,37 @@ class World:
         parsed = dict(each.split("=") for each in parameters.split(";"))
         self.asked.append(parsed)
         linked = [reader for reader in self.readers if self.is_linked(reader) and not reader.closed]
-        self.pending.append(Query(parsed, callback, self.now + timeout, linked))
+        query = Query(parsed, self.now + timeout, linked)
+        query.lost = self.dropping and bool(self.routers)
+        self.pending.append(query)
+        return query
 
-    # What it needs of a condition.
+    # What it needs of a clock.
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
-
-    def wait(self, timeout: float) -> None:
-        end, self.notified = self.now + timeout, False
-        while not self.notified and self.now < end:
+    def sleep(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end:
             self.advance(min(_TICK, end - self.now) or _TICK)
-
-    def notify_all(self) -> None:
-        self.notified = True
 
     def _answer(self, query: Query) -> None:
         for reader in list(query.waiting):
             if not self.is_linked(reader):
                 query.waiting.remove(reader)
+            elif query.lost:
+                continue
             elif reader.closed:
                 self._reply(query, reader, CLOSED)
             elif reader.is_running() and (query.parameters["read"] == "0" or reader.read > query.number):
                 self._reply(query, reader, b"")
-        late = bool(query.waiting)
+        late = bool(query.waiting) or query.lost
         if late and self.now < query.end:
             return
         self.pending.remove(query)
         if late:
-            query.callback.callback(cast("zenoh.Reply", SimpleNamespace(ok=None)))
-        assert query.callback.drop is not None
-        query.callback.drop()
+            query.replies.append(SimpleNamespace(ok=None))
+        query.ended = True
 
     def _reply(self, query: Query, reader: Reader, payload: bytes) -> None:
         query.waiting.remove(reader)
         answer = SimpleNamespace(ok=SimpleNamespace(payload=Payload(payload)), replier_id=reader.name)
-        query.callback.callback(cast("zenoh.Reply", answer))
+        query.replies.append(answer)

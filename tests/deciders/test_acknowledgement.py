@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from nedbus.client.acknowledgement import KEPT, WINDOW, Acknowledgement
+from nedbus.client.acknowledgement import KEPT, WINDOW, Acknowledgement, SharedWindow
 from nedbus.client.channels import CHANNEL
 from nedbus.client.receive_queue import CAPACITY
 from nedbus.errors import ClosedError
@@ -53,7 +53,7 @@ def test_reader_that_keeps_up_is_not_waited_for(world: World, acknowledgement: A
 def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, acknowledgement: Acknowledgement) -> None:
     """2,000 messages at once, then 10 a second for others, until no more are kept; then nothing at all.
 
-    It is connected and therefore never given up, and is asked again every 10 s.
+    It is connected and therefore never given up; it is asked every 10 s, and again after 0.5, 1, 2 and 4 s.
     """
     world.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
@@ -62,20 +62,42 @@ def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, ack
     assert world.sent[WINDOW - 1] == pytest.approx(0.2)
     steps = [later - earlier for earlier, later in pairwise(world.sent[WINDOW:])]
     assert steps == pytest.approx([0.1] * len(steps), abs=0.011)
-    assert len(world.asked) == pytest.approx(3600 / 10.2, rel=0.05)
+    assert len(world.asked) == pytest.approx(5 * 3600 / 10, rel=0.05)
 
 
-def test_publisher_that_shares_the_window_has_a_smaller_one(world: World, acknowledgement: Acknowledgement) -> None:
-    """It asks as often for each window; how far it goes beyond is the same."""
-    assert acknowledgement.window == WINDOW
-    acknowledgement.window = 200
-    world.readers.append(Reader("stuck", rate=0.0))
-    with pytest.raises(Stuck):
-        world.publish(acknowledgement, 10_000)
-    assert world.asked[0]["number"] == "24"
-    assert world.sent[199] == pytest.approx(0.02)
-    assert world.sent[200] == pytest.approx(0.12, abs=0.011)
-    assert world.published == LIMIT
+def test_window_is_shared_while_it_is_used() -> None:
+    """Each publisher has its part, and what others do not use; one that has sent nothing for a second uses nothing."""
+    shared = SharedWindow()
+    assert shared.part("a", 0, now=0.0) == WINDOW
+    assert shared.part("a", 1900, now=0.1) == WINDOW
+    assert shared.part("b", 0, now=0.2) == WINDOW // 2
+    assert shared.part("b", 500, now=0.3) == WINDOW // 2
+    assert shared.part("a", 100, now=0.4) == WINDOW - 500
+    for number in range(8):
+        shared.part(f"other {number}", 1000, now=0.5)
+    assert shared.part("a", 100, now=0.6) == WINDOW // 10
+    assert shared.part("a", 100, now=1.8) == WINDOW
+
+
+@pytest.mark.parametrize("at", [0.0, 0.1, 5.0])
+def test_question_that_a_full_queue_dropped_is_asked_again(
+    world: World, acknowledgement: Acknowledgement, at: float
+) -> None:
+    """After half a second, not when it is given up: nobody notices more than that."""
+    world.readers.append(Reader("fast"))
+    world.plan(at, lambda: setattr(world, "dropping", True))
+    world.plan(at + 0.2, lambda: setattr(world, "dropping", False))
+    world.publish(acknowledgement, 100_000)
+    assert world.now < 10.0 + 0.6
+
+
+def test_slow_publisher_asks_again_too(world: World, acknowledgement: Acknowledgement) -> None:
+    """It looks for answers with each few messages that it sends, also while nothing holds it up."""
+    world.readers.append(Reader("fast"))
+    world.dropping = True
+    world.plan(0.3, lambda: setattr(world, "dropping", False))
+    world.publish(acknowledgement, 10_000, rate=1000.0)
+    assert world.longest_pause() < 0.02
 
 
 def test_reader_that_goes_on_gets_everything(world: World, acknowledgement: Acknowledgement) -> None:
@@ -120,13 +142,46 @@ def test_reader_that_is_closed_is_not_waited_for(world: World, acknowledgement: 
 
 
 @pytest.mark.parametrize("rate", [math.inf, 5_000.0])
-def test_reader_that_died_is_not_waited_for(world: World, acknowledgement: Acknowledgement, rate: float) -> None:
-    """Its link is gone and the publisher's own is not: it has ended, between two questions or while one is open."""
-    reader = Reader("killed", rate=rate)
+def test_reader_whose_link_was_reset_has_missed_nothing(
+    world: World, acknowledgement: Acknowledgement, rate: float
+) -> None:
+    """It is back after 2 s: the publisher, whose own link is up, has waited for it."""
+    reader = Reader("reset", rate=rate)
     world.readers += [reader, Reader("fast")]
     world.plan(0.1, lambda: setattr(reader, "alive", False))
-    world.publish(acknowledgement, 20_000)
-    assert world.now < 2.1
+    world.plan(2.1, lambda: setattr(reader, "alive", True))
+    ahead: list[float] = []
+    world.plan(2.09, lambda: ahead.append(world.published - reader.read))
+    world.publish(acknowledgement, 40_000)
+    assert ahead[0] < LIMIT
+    assert reader.read > 40_000 - WINDOW
+
+
+@pytest.mark.parametrize("away", [0.5, 4.0, 7.0, 60.0])
+@pytest.mark.parametrize("answered", [True, False])
+def test_no_time_runs_while_there_is_no_router(
+    world: World, acknowledgement: Acknowledgement, away: float, answered: bool
+) -> None:
+    """A reader that comes back 3 s after the router has missed nothing, whether it has ever answered or not."""
+    reader = Reader("back")
+    world.readers.append(reader)
+    world.publish(acknowledgement, 1000 if answered else 249)
+    reader.alive = False
+    world.routers.clear()
+    world.plan(away, lambda: world.routers.append("r2"))
+    world.plan(away + 3.0, lambda: setattr(reader, "alive", True))
+    ahead: list[float] = []
+    world.plan(away + 2.99, lambda: ahead.append(world.published - reader.read))
+    world.publish(acknowledgement, 40_000)
+    assert ahead[0] < LIMIT
+    assert reader.read > 40_000 - WINDOW
+
+
+def test_router_itself_needs_none(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the publishers of a router nobody has to be waited for where nobody answers."""
+    world.routers.clear()
+    world.publish(world.acknowledgement(monkeypatch, needs_router=False), 20_000)
+    assert world.now == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("rate", [math.inf, 5_000.0])
@@ -145,12 +200,12 @@ def test_reader_that_comes_back_in_time_has_missed_nothing(
 
 
 def test_reader_that_does_not_come_back_is_given_up(world: World, acknowledgement: Acknowledgement) -> None:
-    """Others get ten messages a second for 5 s, then everything."""
+    """Others get ten messages a second until 5 s after the router is back, then everything."""
     reader = Reader("gone", rate=5_000.0)
     world.readers += [reader, Reader("fast")]
     world.restart_router(reader, 0.1003, until=math.inf)
     world.publish(acknowledgement, 20_000)
-    assert 2.0 + 5.0 - 0.3 < world.now < 2.0 + 5.0 + 0.5
+    assert 2.0 + 6.0 - 0.3 < world.now < 2.0 + 6.0 + 0.5
     assert world.longest_pause() < 0.2
 
 
@@ -232,16 +287,16 @@ def test_flush_asks_anew_each_time(world: World, acknowledgement: Acknowledgemen
 
 
 def test_flush_waits_for_a_reader_that_may_come_back(world: World, acknowledgement: Acknowledgement) -> None:
-    """For as long as one that publishes would, and not for one that has ended."""
-    ended, away = Reader("ended"), Reader("away")
+    """For as long as one that publishes would, and not for one that answered that it is closed."""
+    ended, away = Reader("ended", stopped=0.0), Reader("away")
     world.readers += [ended, away]
-    assert acknowledgement.wait(100, timeout=5.0)
-    ended.alive = False
+    world.plan(0.1, lambda: setattr(ended, "closed", True))
+    world.plan(0.1, lambda: setattr(ended, "stopped", None))
     assert acknowledgement.wait(200, timeout=5.0)
-    assert world.now < 0.1
+    assert world.now < 0.2
     world.restart_router(away, 0.0, until=math.inf)
     assert acknowledgement.wait(300, timeout=60.0)
-    assert world.now == pytest.approx(5.0, abs=0.5)
+    assert world.now == pytest.approx(6.0, abs=0.5)
 
 
 def test_number_of_the_last_message_wraps(world: World, acknowledgement: Acknowledgement) -> None:

@@ -13,11 +13,10 @@ def note(
     *answers: str,
     late: bool = False,
     stood_still: bool = False,
-    broken: bool = False,
 ) -> bool:
     """Note who answered a question, with a minus before one that is closed; return whether anybody is away."""
     by_reader = {each.removeprefix("-"): each.startswith("-") for each in answers}
-    readers.note(by_reader, late=late, stood_still=stood_still, broken=broken, now=now)
+    readers.note(by_reader, late=late, stood_still=stood_still, now=now)
     return readers.away
 
 
@@ -37,30 +36,36 @@ def test_nobody_is_away_where_all_answer() -> None:
     assert not note(readers, 2.0, "a", "b")
 
 
-def test_reader_that_has_gone_has_ended() -> None:
-    """It was closed between two questions, or killed: the publisher's own link is up, and nobody stood still."""
+def test_reader_that_has_gone_may_return_for_5_seconds() -> None:
+    """Its link was reset, perhaps, or its router has restarted."""
     readers = Readers()
     note(readers, 0.0, "a", "b")
-    assert not note(readers, 10.0, "b")
-    assert not note(readers, 20.0, "b", broken=True)  # forgotten
-
-
-def test_reader_may_return_for_5_seconds_where_the_link_of_the_publisher_broke() -> None:
-    """The router has restarted, perhaps, and the reader comes back to it too."""
-    readers = Readers()
-    note(readers, 0.0, "a", "b")
-    assert note(readers, 10.0, broken=True)
+    assert note(readers, 10.0, "b")
     assert away_for(readers, 10.0, "b") == pytest.approx(RETURN, abs=0.6)
-    assert not note(readers, 100.0, "b", broken=True)  # forgotten
+    assert not note(readers, 100.0, "b")  # forgotten
+
+
+def test_nobodys_time_runs_while_the_publisher_has_no_router() -> None:
+    """The 5 s begin when there is one again; of readers that never answered too."""
+    for known in (["a"], []):
+        readers = Readers()
+        note(readers, 0.0, *known)
+        note(readers, 1.0)
+        for second in range(1, 60):
+            readers.wait_for_link(float(second))
+        assert away_for(readers, 60.0) == pytest.approx(RETURN, abs=1.6)
+    late = Readers()
+    late.wait_for_link(0.0)
+    assert not note(late, 1.0, "a"), "a reader that answers for the first time is the one that was waited for"
 
 
 def test_reader_that_returns_is_not_away_any_more() -> None:
     """It answers, and may go again."""
     readers = Readers()
     note(readers, 0.0, "a")
-    assert note(readers, 10.0, broken=True)
+    assert note(readers, 10.0)
     assert not note(readers, 12.0, "a")
-    assert note(readers, 20.0, broken=True)
+    assert note(readers, 20.0)
     assert away_for(readers, 20.0) == pytest.approx(RETURN, abs=0.6)
 
 
@@ -128,10 +133,10 @@ def test_late_reader_that_has_gone_may_return_for_90_seconds(known: bool) -> Non
 
 
 def test_reader_that_answered_and_ended_is_not_waited_for_beside_a_silent_one() -> None:
-    """Who is suspected of standing still is the one that did not answer, not one that did and was closed."""
+    """The one suspected of standing still is the one that did not answer, not one that did and was closed."""
     readers = Readers()
     assert not note(readers, 10.0, "a", late=True)
-    assert not note(readers, 10.1, "b")
+    assert not note(readers, 10.1, "-a", "b")
     assert not note(readers, 20.0, "b", late=True)
     assert note(readers, 20.1), "the silent one may have been stopped"
     assert not note(readers, 20.1 + THAW)

@@ -169,3 +169,29 @@ def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkey
     assert set(threading.enumerate()) - before <= {reader}
     assert {"nedbus-pump", "nedbus-ack", "nedbus-recovery"} <= set(joined)
     reader.join()
+
+
+def test_publisher_ends_amid_a_flood_of_queries(start: Start, endpoint: str) -> None:
+    """Its schema is asked for more often than it can answer: what is being answered at its end does not abort it."""
+    code = """
+import time, nedbus
+bus = nedbus.connect()
+publishers = [bus.publisher("vehicle_local_position", vehicle=str(number)) for number in range(2)]
+for publisher in publishers:
+    publisher.publish({"timestamp": 1})
+print("ready", flush=True)
+time.sleep(0.5)
+"""
+    flood = """
+import time, nedbus, zenoh
+bus = nedbus.connect()
+while True:
+    for _ in range(50):
+        bus._session.get("nedbus/@schema/VehicleLocalPosition", zenoh.handlers.RingChannel(1), timeout=1.0)
+    time.sleep(0.002)
+"""
+    for _ in range(2):
+        start("-c", flood, NEDBUS_CONNECT=endpoint, measured=False)
+    for _ in range(6):
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+        assert process.wait() == 0, process.err

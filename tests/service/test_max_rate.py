@@ -110,7 +110,7 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def wait_for_demand(publisher: nedbus.Publisher) -> None:
     """Wait until a publisher knows that somebody reads it thinned."""
-    wait_for(lambda: publisher._thinned.vehicle.wanted, what="the demand for a thinned stream")
+    wait_for(publisher._thinned.vehicle.is_wanted, what="the demand for a thinned stream")
 
 
 def take(subscription: nedbus.Subscription, count: int) -> list[int]:
@@ -243,7 +243,7 @@ def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, clock: Clock) -> None:
             publish(other, clock, 11, 2)
             assert [step._rate for step in publisher._thinned._steps if step.opened] == [5]
             assert not other._thinned.opened
-        wait_for(lambda: not any(demand.wanted for demand in demands_of(publisher)), what="the end of the demand")
+        wait_for(lambda: not any(demand.is_wanted() for demand in demands_of(publisher)), what="the end of the demand")
         publish(publisher, clock, 13, 100)
         assert publisher._thinned.opened
         clock.now += 61_000 * MS
@@ -297,7 +297,7 @@ def publish_over_a_break(
         publish(publisher, clock, first, 20)
         taken.append(subscription.receive(DEADLINE))
     link.cut()
-    wait_for(lambda: not publisher._thinned.vehicle.wanted, what="the end of the link")
+    wait_for(lambda: not publisher._thinned.vehicle.is_wanted(), what="the end of the link")
     last = 100 + 100 * seconds
     publish(publisher, clock, 101, last - 100)
     link.broken = False

@@ -17,7 +17,7 @@ import nedbus
 from nedbus import Counts
 from nedbus.client import recovery as module
 from nedbus.client.decoder import WAKE_UP
-from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept, entity_name, open_router
+from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept, open_router
 from nedbus_msgs import encode, encoding_of
 from tests.conftest import DEADLINE, free_endpoint, message, wait_for, wait_for_reader
 
@@ -209,7 +209,7 @@ def test_waking_a_reader_is_seen_by_nobody(
 
 def test_answers_of_others_are_left_out(lossy: Lossy, vehicle: nedbus.Bus, publisher: nedbus.Publisher) -> None:
     """Whoever answers in the place of a publisher, without being it, adds nothing."""
-    name = entity_name(publisher._publisher.id).replace(":", "/")
+    name = publisher._acknowledgement._publisher.replace(":", "/")
 
     def lie(query: zenoh.Query) -> None:
         with query:
@@ -236,7 +236,7 @@ def test_flood_of_answers_holds_up_nobody(
             for _ in range(2000):
                 query.reply(KEY, b"junk")
 
-    name = entity_name(publisher._publisher.id).replace(":", "/")
+    name = publisher._acknowledgement._publisher.replace(":", "/")
     callback = zenoh.handlers.Callback(flood, indirect=True)
     liar = vehicle._session.declare_queryable(f"{KEY}/@adv/pub/{name}/**", callback)
     lossy.missing = {1}

@@ -26,7 +26,9 @@ def test_reports_arrive_with_their_reason(endpoint: str) -> None:
             service._session.put(key, payload)
         service._session.put(ADDRESS.rejected_key(), b'{"reason": "%s"}' % (b"x" * 100_000))
         queries = QueryServer(service._session)
-        PublisherRegistry(service._session, queries, prefix="nedbus").reject(ADDRESS, {"reason": "x is NaN"})
+        PublisherRegistry(service._session, queries, prefix="nedbus", is_client=True).reject(
+            ADDRESS, {"reason": "x is NaN"}
+        )
         reports: list[RejectionReport] = []
 
         def has_come() -> bool:

@@ -42,7 +42,7 @@ class Bus:
         self._tls = tls
         self._session = session
         self._queries = QueryServer(session)
-        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix)
+        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(session, prefix=prefix)
         self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
         self._finalizer = Finalizer(self, partial(_close, session, self._queries, self._subscribers))

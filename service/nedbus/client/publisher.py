@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 import zenoh
 
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.transport import Session, require_unforked, translate_error, while_open
+from nedbus.transport import Session, entity_name, require_unforked, translate_error, while_open
 from nedbus_msgs import (
     FIELD_TYPES,
     PAYLOAD_SIZE,
@@ -23,7 +23,7 @@ from nedbus_msgs import (
     encoding_of,
 )
 
-from .acknowledgement import KEPT, Acknowledgement
+from .acknowledgement import KEPT, Acknowledgement, SharedWindow
 from .demand import Demand
 from .qos import TOPIC_QOS
 from .thinned_streams import ThinnedStreams
@@ -54,6 +54,8 @@ class Publisher:
         lossless: bool,
         source: str | None,
         thinned_demand: Demand,
+        shared_window: SharedWindow,
+        needs_router: bool,
         on_close: Callable[[], object],
         owner: object,
     ) -> None:
@@ -66,7 +68,6 @@ class Publisher:
         self._session = session
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as somebody may publish
-        self._closed = False
         self._provided: Set[str] = frozenset()
         self._partial_encoding = ""
         self._encoding = encoding_of(source)
@@ -77,7 +78,7 @@ class Publisher:
             # A router remembers where to send what comes on a key that it knows as such; of any other it finds out for
             # each message, which is most of what one costs where several routers are joined.
             self._key_token = session.liveliness().declare_token(self.key)
-            self._publisher = zenoh.ext.declare_advanced_publisher(
+            publisher = zenoh.ext.declare_advanced_publisher(
                 session,
                 self.key,
                 encoding=self._encoding,
@@ -86,7 +87,15 @@ class Publisher:
                 cache=zenoh.ext.CacheConfig(KEPT if lossless else qos.cache),
                 sample_miss_detection=misses,
             )
-        self._acknowledgement = Acknowledgement(session, self.key, self._publisher, priority=qos.priority)
+        self._publisher: zenoh.ext.AdvancedPublisher | None = publisher
+        self._acknowledgement = Acknowledgement(
+            session,
+            self.key,
+            entity_name(publisher.id),
+            priority=qos.priority,
+            shared=shared_window,
+            needs_router=needs_router,
+        )
         self._thinned = ThinnedStreams(session, address, prefix=prefix, vehicle=thinned_demand)
 
     def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
@@ -121,7 +130,7 @@ class Publisher:
             raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
         for element in messages[~valid_mask(messages)]:
             to_message(element)  # raises, with the reason
-        if self._closed:
+        if self._publisher is None:
             raise ClosedError
         require_unforked()
         payloads = encode_array(messages)
@@ -131,16 +140,12 @@ class Publisher:
             for start in range(0, len(payloads), PAYLOAD_SIZE):
                 payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
                 put(payload, timestamp=stamp)
-                if thinned.vehicle.wanted or thinned.opened:
+                if thinned.opened or thinned.vehicle.is_wanted():
                     thinned.put(payload, stamp, self._encoding)
                 self.last = payload, stamp, self._encoding
                 self.published += 1
                 if lossless:
                     pace(self.published)
-
-    def set_window(self, window: int) -> None:
-        """Set how many messages a lossless publisher sends without an acknowledgement."""
-        self._acknowledgement.window = window
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have what was published; return False if one has not in time.
@@ -157,16 +162,17 @@ class Publisher:
 
         A lossless publisher flushes before.
         """
-        if self._closed:
+        if self._publisher is None:
             return
-        self._closed = True
+        # Dropped, as nothing else refers to it: undeclare() would wait for Zenoh while it holds the interpreter's lock.
+        publisher, self._publisher = self._publisher, None
         if self.lossless:
             with suppress(NedbusError):
                 self.flush()
+        del publisher
         self._on_close()
         self._thinned.close()
         with suppress(zenoh.ZError):  # closed already with the session
-            self._publisher.undeclare()
             self._token.undeclare()
             self._key_token.undeclare()
 
@@ -177,21 +183,22 @@ class Publisher:
         self.close()
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
-        if self._closed:
+        publisher = self._publisher
+        if publisher is None:
             raise ClosedError
         require_unforked()
         encoding = self._encoding
         try:
             stamp = self._session.new_timestamp()
             if len(provided) == len(_ALL):
-                self._publisher.put(payload, timestamp=stamp)
+                publisher.put(payload, timestamp=stamp)
             else:
                 if provided != self._provided:  # almost always the same fields are missing
                     self._provided = frozenset(provided)
                     self._partial_encoding = encoding_of(self.source, self._provided)
                 encoding = self._partial_encoding
-                self._publisher.put(payload, timestamp=stamp, encoding=encoding)
-            if self._thinned.vehicle.wanted or self._thinned.opened:
+                publisher.put(payload, timestamp=stamp, encoding=encoding)
+            if self._thinned.opened or self._thinned.vehicle.is_wanted():
                 self._thinned.put(payload, stamp, encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc

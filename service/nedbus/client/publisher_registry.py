@@ -17,7 +17,7 @@ from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
 from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table, schema_key
 
-from .acknowledgement import WINDOW
+from .acknowledgement import SharedWindow
 from .demand import Demand
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
@@ -25,7 +25,6 @@ from .query_server import JSON, Answer, QueryServer, Reply
 _log = logging.getLogger(__name__)
 
 _PATIENCE: Final = 2.0  # s for a router that is slow to say which publishers it knows; it answers within milliseconds
-_MIN_WINDOW: Final = 100  # messages
 _ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 
 
@@ -34,15 +33,20 @@ LIVE: Final = b"live"
 
 
 class PublisherRegistry:
-    """Make the publishers of a session, at most one for each address, and answer queries for their last messages."""
+    """Make the publishers of a session, at most one for each address, and answer queries for their last messages.
 
-    def __init__(self, session: Session, queries: QueryServer, *, prefix: str) -> None:
+    `is_client`: the session is that of a client, whose readers are behind its router.
+    """
+
+    def __init__(self, session: Session, queries: QueryServer, *, prefix: str, is_client: bool) -> None:
         self.prefix = prefix
         self._session = session
+        self._is_client = is_client
         self._queries = queries
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
         self._thinned_demands: dict[str, Demand] = {}  # by vehicle, for any thinned stream of it
+        self._shared_window = SharedWindow()
         self._lock = threading.Lock()
 
     @property
@@ -68,11 +72,12 @@ class PublisherRegistry:
                 lossless=lossless,
                 source=source,
                 thinned_demand=demand,
+                shared_window=self._shared_window,
+                needs_router=self._is_client,
                 on_close=lambda: self._forget(address),
                 owner=owner,
             )
             self._publishers[address] = publisher
-            self._share_window()
             if not self._vehicles:
                 self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
             if address.vehicle not in self._vehicles:
@@ -127,13 +132,6 @@ class PublisherRegistry:
             if demand is not None and not any(each.vehicle == address.vehicle for each in self._publishers):
                 del self._thinned_demands[address.vehicle]
                 demand.close()
-        self._share_window()
-
-    def _share_window(self) -> None:
-        """Share a window among the lossless publishers, as one reader may have to hold what all of them send."""
-        lossless = [publisher for publisher in self.publishers if publisher.lossless]
-        for publisher in lossless:
-            publisher.set_window(max(_MIN_WINDOW, WINDOW // len(lossless)))
 
     def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:

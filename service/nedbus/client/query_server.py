@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import queue
 import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -18,7 +17,10 @@ from nedbus.transport import Session, while_open
 
 _log = logging.getLogger(__name__)
 
-_MAX_PENDING: Final = 1000  # queries that wait for an answer
+_MAX_PENDING: Final = 1000  # queries that wait for an answer, on each key expression; the oldest are not answered
+_TURN: Final = 64  # queries on one key expression until others have their turn
+_POLL: Final = 0.01  # s between two looks for queries
+_JOIN: Final = 10.0  # s that an answer has to get out of Zenoh: its thread would abort a process that ends
 JSON: Final = "application/json"
 """Encoding of answers that are JSON documents."""
 
@@ -43,10 +45,10 @@ class QueryServer:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._pending: queue.Queue[tuple[zenoh.Query, Reply] | None]
-        self._pending = queue.Queue(_MAX_PENDING)
-        self._queryables: list[zenoh.Queryable[None]] = []
+        self._queryables: list[zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
+        self._replies: list[tuple[zenoh.Handler[zenoh.Query], Reply]] = []
         self._lock = threading.Lock()
+        self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
     def answer(self, key_expr: str, reply: Reply) -> None:
@@ -55,16 +57,11 @@ class QueryServer:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
                 self._thread.start()
-
-        def enqueue(query: zenoh.Query) -> None:
-            # On Zenoh's own thread, which must not wait; queries beyond the limit are not answered.
-            with suppress(queue.Full):
-                self._pending.put_nowait((query, reply))
-
-        # A Python thread of Zenoh's would keep the process from exiting: the callback is a direct one.
-        callback = zenoh.handlers.Callback(enqueue, indirect=False)
+        channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
-            self._queryables.append(self._session.declare_queryable(key_expr, callback))
+            queryable = self._session.declare_queryable(key_expr, channel)
+        self._queryables.append(queryable)
+        self._replies.append((queryable.handler, reply))
 
     def answer_json(self, key: str, content: Callable[[], Mapping[str, object]]) -> None:
         """Answer queries on a key with a JSON document, made anew for each."""
@@ -72,29 +69,33 @@ class QueryServer:
 
     def close(self) -> None:
         """Stop answering."""
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join(_JOIN)
         for queryable in self._queryables:
             with suppress(zenoh.ZError):
                 queryable.undeclare()
-        if self._thread is not None:
-            with suppress(queue.Full):
-                self._pending.put(None, timeout=0.5)
-            self._thread.join(0.5)
 
     def _run(self) -> None:
-        while (item := self._pending.get()) is not None:
-            query, reply = item
-            key_expr = str(query.key_expr)  # a query that has ended does not tell it any more
-            try:
-                with query:
-                    for each in reply(query):
-                        query.reply(
-                            each.key,
-                            each.payload,
-                            encoding=each.encoding,
-                            timestamp=each.stamp,
-                            attachment=each.attachment,
-                        )
-            except zenoh.ZError as exc:
-                _log.debug("a query on %s could not be answered: %s", key_expr, exc)
-            except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
-                _log.exception("a query on %s is not answered", key_expr, extra=about("bug"))
+        while not self._ended.wait(_POLL):
+            for handler, reply in list(self._replies):
+                with suppress(zenoh.ZError):  # the session is closed
+                    for _ in range(_TURN):
+                        query = handler.try_recv()
+                        if query is None or self._ended.is_set():
+                            break
+                        _answer(query, reply)
+
+
+def _answer(query: zenoh.Query, reply: Reply) -> None:
+    key_expr = str(query.key_expr)  # a query that has ended does not tell it any more
+    try:
+        with query:
+            for each in reply(query):
+                query.reply(
+                    each.key, each.payload, encoding=each.encoding, timestamp=each.stamp, attachment=each.attachment
+                )
+    except zenoh.ZError as exc:
+        _log.debug("a query on %s could not be answered: %s", key_expr, exc)
+    except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
+        _log.exception("a query on %s is not answered", key_expr, extra=about("bug"))

@@ -73,9 +73,9 @@ class Recovery:
         self._behind: Heartbeats = {}
         self._drains = 0  # of the queue, when these were taken
         with while_open():
-            self._links = session.info.declare_transport_events_listener(
-                zenoh.handlers.Callback(self._on_link, indirect=False), history=False
-            )
+            links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
+            self._links = session.info.declare_transport_events_listener(links, history=False)
+            self._link_events = self._links.handler
         receive_queue.recover(self._holes.put)
         self._thread = threading.Thread(target=self._run, name="nedbus-recovery", daemon=True)
         self._thread.start()
@@ -90,6 +90,13 @@ class Recovery:
             undeclare()
 
         return end
+
+    def notice_links(self) -> None:
+        """Note that a link broke or came back; to be called before what arrived since is put into the queue."""
+        with suppress(zenoh.ZError):  # closed
+            while self._link_events.try_recv() is not None:
+                self._queue.unsettled_until = time.monotonic() + _UNSETTLED
+                self._silent.clear()  # they could not answer, perhaps
 
     def close(self) -> None:
         """Ask no more: what is missing now is lost."""
@@ -106,6 +113,7 @@ class Recovery:
             while not self._closed:
                 self._take_holes()
                 self._take_answers()
+                self.notice_links()
                 now = time.monotonic()
                 if now >= next_look:
                     next_look = now + _LOOK
@@ -206,10 +214,6 @@ class Recovery:
         for take in self._watched.values():
             newest |= take()
         self._behind, self._drains = newest, self._queue.drains
-
-    def _on_link(self, _: zenoh.TransportEvent) -> None:
-        self._queue.unsettled_until = time.monotonic() + _UNSETTLED
-        self._silent.clear()  # they could not answer, perhaps
 
 
 def _share(hole: Hole) -> str:

@@ -31,8 +31,8 @@ _LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come b
 class ThinnedStreams:
     """Publish the messages of one address thinned, to whoever subscribes to that.
 
-    `vehicle` is the demand for any thinned stream of this vehicle. While `vehicle.wanted` or `opened`, each message is
-    to be put here as well. For use from one thread at a time, that of the publisher.
+    `vehicle` is the demand for any thinned stream of this vehicle. While it is wanted, or `opened`, each message is to
+    be put here as well. For use from one thread at a time, that of the publisher.
     """
 
     def __init__(self, session: Session, address: Address, *, prefix: str, vehicle: Demand) -> None:
@@ -50,13 +50,14 @@ class ThinnedStreams:
         if self._demand is None:
             self._demand = Demand(self._session, self._address.rate_key(ANY, prefix=self._prefix))
             self.opened = True
-        if self._demand.wanted and not self._steps:
+        wanted = self._demand.is_wanted()
+        if wanted and not self._steps:
             self._steps = [_Step(self._session, self._address, rate, prefix=self._prefix) for rate in RATES]
         for step in self._steps:
             step.put(now, payload, stamp, encoding)
-        if not self._demand.wanted and not any(step.opened for step in self._steps):
+        if not wanted and not any(step.opened for step in self._steps):
             self._close_steps()
-            if not self.vehicle.wanted:
+            if not self.vehicle.is_wanted():
                 self.close()
 
     def close(self) -> None:
@@ -92,7 +93,7 @@ class _Step:
         return self._publisher is not None
 
     def put(self, now: int, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
-        if self._demand.wanted:
+        if self._demand.is_wanted():
             self._wanted_at = now
             if self._publisher is None:
                 self._open()
@@ -124,8 +125,6 @@ class _Step:
 
     def _withdraw(self) -> None:
         with suppress(zenoh.ZError):  # closed already with the session
-            if self._publisher is not None:
-                self._publisher.undeclare()
             if self._token is not None:
                 self._token.undeclare()
-        self._publisher = self._token = None
+        self._publisher = self._token = None  # dropped, not undeclared: see Publisher.close

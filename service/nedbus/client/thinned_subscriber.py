@@ -17,7 +17,7 @@ import zenoh
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import Session, alive_keys, follow_alive_keys, query, while_open
+from nedbus.transport import AliveChanges, Session, alive_keys, query, while_open
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key, get_topic
 
 from .channels import declare_reader, take_all
@@ -72,12 +72,19 @@ class ThinnedSubscriber(ZenohSubscriber):
             closing.callback(self._close_wholes)
             self._queue_last()
             alive = self._selection.alive_key_expr(prefix=self._prefix)
-            end = follow_alive_keys(self._session, alive, self._on_token)
-            closing.callback(end)
-            for key in alive_keys(self._session, alive, timeout=_TIMEOUT):
-                self._on_token(key, True)
-            while not self._ended.wait(_DRAIN if self._wholes else _LOOK):
+            changes = AliveChanges(self._session, alive)
+            closing.callback(changes.close)
+            known = False
+            while True:
+                if not known:
+                    for key in alive_keys(self._session, alive, timeout=_TIMEOUT):
+                        self._change(key, alive=True)
+                for key, is_alive in changes.take():
+                    self._change(key, alive=is_alive)
+                known = not changes.missed
                 self._look()
+                if self._ended.wait(_DRAIN if self._wholes else _LOOK):
+                    break
 
     def _queue_last(self) -> None:
         """Queue the last messages of publishers, without those of a storage: their vehicles are gone."""
@@ -86,8 +93,8 @@ class ThinnedSubscriber(ZenohSubscriber):
         self._thinned_queue.put_last(live)
         self._queue.wakeups.wake()
 
-    def _on_token(self, key: str, alive: bool) -> None:
-        """Note a liveliness token; on a thread of Zenoh's."""
+    def _change(self, key: str, *, alive: bool) -> None:
+        """Note a liveliness token."""
         try:
             address = address_of_alive_key(key, prefix=self._prefix)
         except AddressError:

@@ -5,11 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
 from typing import Final
 
 from nedbus.log_event import about
-from nedbus.transport import MAX_ANSWERS, Session, ask_alive_keys, follow_alive_keys
+from nedbus.transport import MAX_ANSWERS, AliveChanges, Session, ask_alive_keys
 from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_expr
 
 _log = logging.getLogger(__name__)
@@ -30,29 +29,29 @@ class VehicleDirectory:
         self._prefix = prefix
         self._asking = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by the key of the token
-        self._gone: set[str] = set()  # tokens that went while all were asked for
         self._next_ask = float("-inf")
-        self._end: Callable[[], object] | None = None
+        self._changes: AliveChanges | None = None
 
     def vehicles(self, *, timeout: float) -> dict[str, list[Address]]:
         """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
         with self._asking:
             key_expr = alive_key_expr(prefix=self._prefix)
-            if self._end is None:
-                self._end = follow_alive_keys(self._session, key_expr, self._on_change)
+            if self._changes is None:
+                self._changes = AliveChanges(self._session, key_expr)
+            self._take(self._changes)
             if time.monotonic() >= self._next_ask:
                 self._ask(key_expr, timeout)
+                self._take(self._changes)  # what went while all were asked for
+            addresses = sorted(self._addresses.values())
         vehicles: dict[str, list[Address]] = {}
-        for address in sorted(self._addresses.copy().values()):
+        for address in addresses:
             vehicles.setdefault(address.vehicle, []).append(address)
         return vehicles
 
     def _ask(self, key_expr: str, timeout: float) -> None:
         keys, complete = ask_alive_keys(self._session, key_expr, timeout=timeout)
         for key in keys:
-            if key not in self._gone:
-                self._on_change(key, True)
-        self._gone.clear()
+            self._change(key, alive=True)
         self._next_ask = float("inf") if complete else time.monotonic() + _ASK_AGAIN
         if not complete:
             _log.warning(
@@ -62,11 +61,16 @@ class VehicleDirectory:
                 extra=about("incomplete"),
             )
 
-    def _on_change(self, key: str, alive: bool) -> None:
+    def _take(self, changes: AliveChanges) -> None:
+        for key, alive in changes.take():
+            self._change(key, alive=alive)
+        if changes.missed:
+            self._addresses.clear()
+            self._next_ask = float("-inf")
+
+    def _change(self, key: str, *, alive: bool) -> None:
         if not alive:
             self._addresses.pop(key, None)
-            if self._asking.locked() and len(self._gone) < MAX_ANSWERS:
-                self._gone.add(key)
         elif len(self._addresses) < MAX_ANSWERS:
             try:
                 self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)

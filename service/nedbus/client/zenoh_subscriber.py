@@ -169,6 +169,8 @@ class ZenohSubscriber:
         if self._queue.ended:
             return
         self._misses.announce(self._queue)
+        if self._recovery is not None:
+            self._recovery.notice_links()
         try:
             self._queue.put(batch, overflowed=len(batch) >= full)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader

@@ -141,7 +141,9 @@ class Daemon:
             self._log_router()
         self._session = session
         settings, queries = self._settings, QueryServer(session)
-        registry = self._registry = PublisherRegistry(session, queries, prefix=self._settings.prefix)
+        registry = self._registry = PublisherRegistry(
+            session, queries, prefix=self._settings.prefix, is_client=self.role == "client"
+        )
         try:
             queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
             router = session if self.role == "router" else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import queue
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
@@ -33,7 +34,9 @@ from .source import Rejection, SourceContext, SourceMessage
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
+_CHANNEL: Final = 4096  # samples that arrive until a thread of ours takes them
 _MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
+_JOIN: Final = 3.0  # s
 _TICK: Final = 0.25  # s
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 _MAX_PAYLOAD: Final = 1024  # bytes
@@ -53,7 +56,6 @@ class Px4ZenohSource:
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
         """Receive; raise SourceError when no router answers."""
-        inbox = _Inbox()
         with ExitStack() as closing:
             if router is not None and self._is_own:
                 # A link between the router and a client of its own would drop what does not fit its queue.
@@ -63,33 +65,21 @@ class Px4ZenohSource:
                 closing.callback(session.close)
             node = Px4ZenohNode(session)
             decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle), node)
+            inbox = _Inbox(self._name)
+            closing.callback(inbox.close)
             with while_open():
                 for name in map(dds_type, ROS2_TYPES):
-                    self._subscribe(session, name, inbox, closing)
+                    inbox.subscribe(session, name, domain=self._options.domain)
             closing.callback(node.close)
             yield None
             while True:  # until this iterator is closed: a session that lost its router connects again by itself
-                yield from inbox.overflow(self._name)
-                try:
+                yield from inbox.overflow()
+                sample: zenoh.Sample | None = None
+                with suppress(queue.Empty):
                     sample = inbox.pending.get(timeout=_TICK)
-                except queue.Empty:
-                    yield None
-                else:
-                    yield decoder.decode(sample)
-
-    def _subscribe(self, session: Session, dds_type: str, inbox: _Inbox, closing: ExitStack) -> None:
-        """Receive the messages of a type, and before them the tokens of those who publish them."""
-        domain = self._options.domain
-        tokens = session.liveliness().declare_subscriber(
-            publishers_of_type_key_expr(domain, dds_type),
-            zenoh.handlers.Callback(inbox.put_token, indirect=False),
-            history=True,
-        )
-        closing.callback(_undeclare, tokens)
-        messages = session.declare_subscriber(
-            f"{'*' if domain is None else domain}/**/{dds_type}/*", zenoh.handlers.Callback(inbox.put, indirect=False)
-        )
-        closing.callback(_undeclare, messages)
+                for token in inbox.tokens():  # those that came before the message are here by now
+                    decoder.follow(token)
+                yield None if sample is None else decoder.decode(sample)
 
     @property
     def _name(self) -> str:
@@ -103,41 +93,71 @@ class Px4ZenohSource:
             raise SourceError(self._name, reason) from exc
 
 
-def _undeclare(subscriber: zenoh.Subscriber[None]) -> None:
-    with suppress(zenoh.ZError):  # its session may be closed already
-        subscriber.undeclare()
-
-
 class _Inbox:
-    """What arrived and waits to be decoded, in order; Zenoh's threads put it there."""
+    """What arrived and waits to be decoded, in order.
 
-    def __init__(self) -> None:
+    Zenoh puts it into channels in Rust, which threads of ours empty: a callback would wait for the interpreter's lock.
+    """
+
+    def __init__(self, name: str) -> None:
         self.pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._name = name
+        self._subscribers: list[zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = []
+        self._tokens: list[zenoh.Handler[zenoh.Sample]] = []
+        self._threads: list[threading.Thread] = []
         self._dropped = self._reported = 0
-        self._is_full = False
 
-    def put(self, sample: zenoh.Sample) -> None:
-        """Put a message."""
-        if self.pending.qsize() < _MAX_PENDING:
-            self.pending.put(sample)
-        else:
-            self._dropped += 1
+    def subscribe(self, session: Session, dds_type: str, *, domain: int | None) -> None:
+        """Receive the messages of a type, and before them the tokens of those who publish them."""
+        tokens = session.liveliness().declare_subscriber(
+            publishers_of_type_key_expr(domain, dds_type),
+            zenoh.handlers.RingChannel(_MAX_PENDING_TOKENS),
+            history=True,
+        )
+        self._subscribers.append(tokens)
+        self._tokens.append(tokens.handler)
+        key_expr = f"{'*' if domain is None else domain}/**/{dds_type}/*"
+        messages = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_CHANNEL))
+        self._subscribers.append(messages)
+        thread = threading.Thread(target=self._receive, args=[messages.handler], name="nedbus-px4", daemon=True)
+        thread.start()
+        self._threads.append(thread)
 
-    def put_token(self, sample: zenoh.Sample) -> None:
-        """Put a liveliness token."""
-        if self.pending.qsize() < _MAX_PENDING_TOKENS:
-            self.pending.put(sample)
-        else:
-            self._is_full = True
+    def tokens(self) -> Iterator[zenoh.Sample]:
+        """Yield the liveliness tokens that changed; raise SourceError if some were dropped."""
+        for handler in self._tokens:
+            with while_open():
+                for _ in range(_MAX_PENDING_TOKENS):
+                    token = handler.try_recv()
+                    if token is None:
+                        break
+                    yield token
+                else:
+                    raise SourceError(self._name, "publishers come and go faster than they can be followed")
 
-    def overflow(self, name: str) -> Iterator[Rejection]:
-        """Yield how many messages were dropped since the last call; raise SourceError for tokens."""
-        if self._is_full:
-            raise SourceError(name, "publishers come and go faster than they can be followed")
+    def overflow(self) -> Iterator[Rejection]:
+        """Yield how many messages were dropped since the last call."""
         dropped = self._dropped
         if dropped > self._reported:
             yield Rejection("queue", "messages arrive faster than they are decoded", count=dropped - self._reported)
             self._reported = dropped
+
+    def close(self) -> None:
+        """Receive no more."""
+        for subscriber in self._subscribers:
+            with suppress(zenoh.ZError):  # its session may be closed already
+                subscriber.undeclare()
+        for thread in self._threads:
+            thread.join(_JOIN)
+
+    def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
+        with suppress(zenoh.ZError):  # undeclared
+            while True:
+                sample = handler.recv()
+                if self.pending.qsize() < _MAX_PENDING:
+                    self.pending.put(sample)
+                else:
+                    self._dropped += 1
 
 
 class _Decoder:
@@ -151,9 +171,6 @@ class _Decoder:
     def decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
         key = str(sample.key_expr)
         now = time.monotonic()
-        if key.startswith("@"):
-            self._follow(key, now, is_alive=sample.kind == zenoh.SampleKind.PUT)
-            return None
         if sample.kind != zenoh.SampleKind.PUT:
             return None
         stream = self._streams.find(key)
@@ -178,13 +195,15 @@ class _Decoder:
             _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
         return SourceMessage(0.0, stream.address, fields, lost, rebooted)
 
-    def _follow(self, text: str, now: float, *, is_alive: bool) -> None:
+    def follow(self, sample: zenoh.Sample) -> None:
+        """Note that a publisher appeared, or is gone, by its liveliness token."""
+        now = time.monotonic()
         try:
-            token = PublisherToken.parse(text)
+            token = PublisherToken.parse(str(sample.key_expr))
             split_ros2_topic(token.key.topic)
         except (AddressError, DecodeError):
             return  # what it publishes is rejected
-        if is_alive:
+        if sample.kind == zenoh.SampleKind.PUT:
             self._streams.add_publisher(token, now)
             self._node.subscribe(token)
         else:

@@ -1,15 +1,15 @@
 """Queries: what is answered on a key expression, and which liveliness tokens there are.
 
-Replies are collected by a callback: a channel of Zenoh's holds 256 of them, and blocks the query for ever when it is
-full. The wait for the last reply is Python's, so Ctrl-C ends it, and so does its timeout. Only where many questions are
-asked while much arrives, in `ask_kept`, there is a channel, which somebody empties all the time.
+Answers and changes wait in channels in Rust until a thread of ours takes them: a Python callback, or its drop, would
+wait for the interpreter's lock on a thread of Zenoh's, for a liveliness query even while that thread holds the lock of
+the session, and whatever else needs that lock stops the process.
 """
 
 from __future__ import annotations
 
 import re
-import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
 from typing import Final
@@ -24,54 +24,120 @@ Heartbeats = dict[tuple[str, str], int]
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
+_MAX_BYTES: Final = 2**25  # of the payloads that are kept of one query
+_CHANNEL: Final = 1024  # answers that wait; while there are more, the session waits for whoever asked
+_TOKENS: Final = 131_072  # tokens that wait; Zenoh must never wait for room while it holds the lock of its session
+_CHANGES: Final = 16_384  # of tokens, that wait until somebody takes them
 _HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
 _HEARTBEAT: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
 _LONGEST: Final = 1024  # characters of the key of a heartbeat, which is remembered
 _NUMBER: Final = 4  # bytes of a heartbeat
 _SPARE: Final = 64  # answers that nobody asked for, of others or of more publishers
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
+_PAUSES: Final = (0.0005, 0.01)  # s between two looks for answers: the first, and the longest
+
+
+class Answers:
+    """The answers to one query, for the thread of whoever asked, which takes them by polling."""
+
+    def __init__(self, handler: zenoh.Handler[zenoh.Reply]) -> None:
+        self.ended = False
+        """Whether the last answer was taken: all have answered, or the timeout has passed."""
+        self._handler = handler
+
+    def take(self) -> list[zenoh.Reply]:
+        """Return the answers that came since the last call."""
+        taken: list[zenoh.Reply] = []
+        try:
+            while len(taken) < MAX_ANSWERS and (reply := self._handler.try_recv()) is not None:
+                taken.append(reply)
+        except zenoh.ZError:  # it is empty, and closed
+            self.ended = True
+        return taken
+
+    def wait(self, timeout: float) -> Iterator[zenoh.Reply]:
+        """Yield the answers as they come, until the query has ended, or its timeout has passed."""
+        end = time.monotonic() + _zenoh_timeout(timeout) + _GRACE
+        pause, longest = _PAUSES
+        while not self.ended and time.monotonic() < end:
+            taken = self.take()
+            yield from taken
+            if not taken and not self.ended:
+                time.sleep(pause)
+                pause = min(2 * pause, longest)
+
+
+def ask(
+    session: Session,
+    selector: str,
+    *,
+    timeout: float,
+    priority: zenoh.Priority | None = None,
+    congestion_control: zenoh.CongestionControl | None = None,
+) -> Answers:
+    """Query all that answer on a selector, and return at once."""
+    with while_open():
+        handler = session.get(
+            selector,
+            zenoh.handlers.FifoChannel(_CHANNEL),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=_zenoh_timeout(timeout),
+            priority=priority,
+            congestion_control=congestion_control,
+        )
+    return Answers(handler)
 
 
 def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
-    """Return what is answered within `timeout` seconds, at most 10,000: the newest answer for each key, or all."""
-    mode = zenoh.ConsolidationMode.LATEST if newest else zenoh.ConsolidationMode.NONE
-    collector = _Collector()
-    with while_open():
-        session.get(
-            key_expr,
-            collector.handler,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=mode,
-            timeout=_zenoh_timeout(timeout),
-        )
-    return [reply.ok for reply in collector.wait(timeout) if reply.ok is not None]
+    """Return what is answered within `timeout` seconds: the newest answer for each key, or all.
+
+    At most 10,000 answers of 32 MB in all are kept, whoever sends them.
+    """
+    kept: dict[object, RawSample] = {}
+    size = 0
+    for reply in ask(session, key_expr, timeout=timeout).wait(timeout):
+        sample = reply.ok
+        if sample is None:
+            continue
+        key: object = str(sample.key_expr) if newest else len(kept)
+        other = kept.get(key)
+        if other is not None and not _is_newer(sample, other):
+            continue
+        new_size = size + _size(sample) - (_size(other) if other is not None else 0)
+        if new_size <= _MAX_BYTES and (other is not None or len(kept) < MAX_ANSWERS):
+            kept[key], size = sample, new_size
+    return list(kept.values())
+
+
+def _is_newer(sample: RawSample, other: RawSample) -> bool:
+    mine, others = sample.timestamp, other.timestamp
+    return others is None or (mine is not None and mine.get_time() > others.get_time())
+
+
+def _size(sample: RawSample) -> int:
+    return len(sample.payload) + len(str(sample.key_expr))
 
 
 class KeptAnswers:
-    """What a publisher answers of its messages `numbers`; for the thread of whoever asked, which takes it by polling.
+    """What a publisher answers of its messages `numbers`, for the thread of whoever asked."""
 
-    No callback does: Zenoh's thread, on which everything arrives, would wait for the interpreter's lock at each answer.
-    """
-
-    def __init__(self, handler: zenoh.Handler[zenoh.Reply], key: str, publisher: str, numbers: range) -> None:
-        self.ended = False
-        """Whether the last answer was taken, or the timeout has passed."""
-        self._handler = handler
+    def __init__(self, answers: Answers, key: str, publisher: str, numbers: range) -> None:
+        self._answers = answers
         self._key = key
         self._publisher = publisher
         self._numbers = numbers
 
+    @property
+    def ended(self) -> bool:
+        """Whether the last answer was taken, or the timeout has passed."""
+        return self._answers.ended
+
     def take(self) -> dict[int, RawSample]:
         """Return what came since the last call, by its number."""
         taken: dict[int, RawSample] = {}
-        try:
-            for _ in range(MAX_ANSWERS):
-                reply = self._handler.try_recv()
-                if reply is None:
-                    break
-                self._add(taken, reply.ok)
-        except zenoh.ZError:  # it is empty, and closed
-            self.ended = True
+        for reply in self._answers.take():
+            self._add(taken, reply.ok)
         return taken
 
     def _add(self, taken: dict[int, RawSample], sample: RawSample | None) -> None:
@@ -98,7 +164,7 @@ def ask_kept(session: Session, key: str, publisher: str, numbers: range, *, time
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=_zenoh_timeout(timeout),
         )
-    return KeptAnswers(handler, key, publisher, numbers)
+    return KeptAnswers(Answers(handler), key, publisher, numbers)
 
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
@@ -138,54 +204,41 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 
 def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
     """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
-    collector = _Collector()
     with while_open():
-        session.liveliness().get(key_expr, collector.handler, timeout=_zenoh_timeout(timeout))
-    answers = collector.wait(timeout)
-    keys = sorted({str(reply.ok.key_expr) for reply in answers if reply.ok is not None})
-    failed = any(reply.ok is None for reply in answers)  # Zenoh reports a timeout as an error
-    return keys, collector.complete and not failed and len(answers) < MAX_ANSWERS
+        channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_TOKENS)
+        answers = Answers(session.liveliness().get(key_expr, channel, timeout=_zenoh_timeout(timeout)))
+    keys: set[str] = set()
+    failed = False  # Zenoh reports a timeout as an error
+    size = 0
+    for reply in answers.wait(timeout):
+        key = "" if reply.ok is None else str(reply.ok.key_expr)
+        size += len(key)
+        failed |= not key or len(keys) >= MAX_ANSWERS or size > _MAX_BYTES
+        if key and len(keys) < MAX_ANSWERS and size <= _MAX_BYTES:
+            keys.add(key)
+    return sorted(keys), answers.ended and not failed
 
 
-def follow_alive_keys(
-    session: Session, key_expr: str, on_change: Callable[[str, bool], object]
-) -> Callable[[], object]:
-    """Call `on_change` with the key of each liveliness token that appears (True) or goes (False) from now on.
+class AliveChanges:
+    """The liveliness tokens that appear and go from now on, for the thread of whoever follows them."""
 
-    It is called on a thread of Zenoh's, where it must not wait. Returns a function that ends it.
-    """
+    def __init__(self, session: Session, key_expr: str) -> None:
+        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANGES)
+        with while_open():
+            subscriber = session.liveliness().declare_subscriber(key_expr, channel)
+        self.missed = False
+        """Whether more tokens changed than are kept until they are taken: all have to be asked for again."""
+        self.close = subscriber.undeclare
+        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
 
-    def on_sample(sample: zenoh.Sample) -> None:
-        on_change(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-    with while_open():
-        subscriber = session.liveliness().declare_subscriber(
-            key_expr, zenoh.handlers.Callback(on_sample, indirect=False)
-        )
-    return subscriber.undeclare
-
-
-class _Collector:
-    """Keep the replies to one query, in a bounded amount of memory."""
-
-    def __init__(self) -> None:
-        self._replies: list[zenoh.Reply] = []
-        self._ended = threading.Event()
-        self.handler = zenoh.handlers.Callback(self._add, self._ended.set, indirect=False)
-
-    @property
-    def complete(self) -> bool:
-        """Whether the query has ended."""
-        return self._ended.is_set()
-
-    def wait(self, timeout: float) -> list[zenoh.Reply]:
-        """Return what came until the query ended, or its timeout has passed."""
-        self._ended.wait(_zenoh_timeout(timeout) + _GRACE)
-        return self._replies[:MAX_ANSWERS]
-
-    def _add(self, reply: zenoh.Reply) -> None:
-        if len(self._replies) < MAX_ANSWERS:
-            self._replies.append(reply)
+    def take(self) -> list[tuple[str, bool]]:
+        """Return the key of each token that changed since the last call, and whether it appeared, in order."""
+        changes: list[tuple[str, bool]] = []
+        with suppress(zenoh.ZError):  # the session is closed
+            while len(changes) < _CHANGES and (sample := self._handler.try_recv()) is not None:
+                changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        self.missed = len(changes) == _CHANGES
+        return changes
 
 
 def _zenoh_timeout(timeout: float) -> float:

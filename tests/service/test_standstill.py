@@ -1,0 +1,17 @@
+"""A process in which publishers come and go, while others ask and subscribe, never stands still."""
+
+from __future__ import annotations
+
+import sys
+
+from tests.conftest import Start, free_port
+
+
+def test_process_never_stands_still_while_publishers_come_and_go(start: Start) -> None:
+    """No Python code runs on Zenoh's threads, and none holds the interpreter's lock while it waits for Zenoh's.
+
+    A stop lasts 10 s, or for good: 5 s tell it from a machine that is busy.
+    """
+    options = ["--seconds", "15", "--restart", "6", "--busy", "0", "--limit", "5"]
+    process = start("-m", "tests.stress", *options, "--port", str(free_port()), PYTHONPATH=":".join(sys.path))
+    assert process.wait(110.0) == 0, process.out + process.err

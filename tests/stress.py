@@ -1,0 +1,165 @@
+"""A process in which everything happens at once, which must never stand still: python -m tests.stress --seconds 600.
+
+It opens and closes publishers in one thread, while others put, call `vehicles()` and `latest()`, and subscribe, with
+`max_rate` too. Its router is killed and started again; other processes keep the processor busy. A thread ticks every
+50 ms. The bar: no tick comes a second late, and the process ends.
+
+Whenever ticks stay away for a second, faulthandler prints the stacks of all threads, on stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import faulthandler
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+import nedbus
+from nedbus import NedbusError
+from nedbus.transport import alive_keys, open_router
+from nedbus_msgs import alive_key_expr
+
+TICK: Final = 0.05  # s
+GRACE: Final = 60.0  # s that the process has to end
+VEHICLES: Final = 8
+
+
+def main() -> None:
+    """Run for so many seconds, print what happened, and exit with 1 when it stood still."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--restart", type=float, default=20.0, help="seconds between two deaths of the router")
+    parser.add_argument("--busy", type=int, default=2, help="processes that compute")
+    parser.add_argument("--limit", type=float, default=1.0, help="seconds that a tick may be late")
+    parser.add_argument("--port", type=int, default=17_447)
+    parser.add_argument("--part", choices=["router", "stress"], help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.part == "router":
+        with open_router(listen=(f"tcp/127.0.0.1:{arguments.port}",)):
+            signal.pause()
+    elif arguments.part == "stress":
+        json.dump(_stress(f"tcp/127.0.0.1:{arguments.port}", arguments.seconds), sys.stdout)
+    else:
+        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(arguments.busy)]
+        try:
+            found = measure(arguments.seconds, arguments.restart, arguments.port)
+        finally:
+            _kill(*busy)
+        sys.stdout.write(json.dumps(found) + "\n")
+        sys.exit(found.get("latest tick", float("inf")) >= arguments.limit)
+
+
+def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
+    """Run the process beside a router that comes and goes; return its counts, and how late a tick came [s].
+
+    Of a process that does not end there is nothing to return; the stacks of its threads are printed.
+    """
+    router = _start("router", port)
+    stress = _start("stress", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
+    deadline, next_restart = time.monotonic() + seconds + GRACE, time.monotonic() + restart
+    try:
+        while stress.poll() is None and time.monotonic() < deadline:
+            with suppress(subprocess.TimeoutExpired):
+                stress.wait(0.1)
+            if time.monotonic() >= next_restart:
+                next_restart += restart
+                _kill(router)
+                router = _start("router", port)
+        if stress.poll() is None:
+            stress.send_signal(signal.SIGABRT)  # Python writes the stacks of all threads
+        with suppress(subprocess.TimeoutExpired):
+            stress.wait(5.0)
+        said = stress.communicate()[0] if stress.returncode == 0 else ""
+    finally:
+        _kill(stress, router)
+    found: dict[str, float] = json.loads(said or "{}")
+    return found
+
+
+def _start(part: str, port: int, *arguments: str, stdout: int | None = None) -> subprocess.Popen[str]:
+    command = [sys.executable, "-X", "faulthandler", "-m", "tests.stress", "--part", part, "--port", str(port)]
+    return subprocess.Popen([*command, *arguments], stdout=stdout, text=True)
+
+
+def _kill(*processes: subprocess.Popen[str] | subprocess.Popen[bytes]) -> None:
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+def _stress(endpoint: str, seconds: float) -> dict[str, float]:
+    counts: Counter[str] = Counter()
+    stop = threading.Event()
+    with nedbus.connect(endpoint, timeout=30.0) as bus:
+
+        def repeat(what: str, action: Callable[[], object]) -> threading.Thread:
+            def run() -> None:
+                while not stop.is_set():
+                    with suppress(NedbusError):
+                        action()
+                        counts[what] += 1
+
+            thread = threading.Thread(target=run, name=what, daemon=True)
+            thread.start()
+            return thread
+
+        publishers = [bus.publisher("vehicle_local_position", vehicle=f"p{number}") for number in range(VEHICLES)]
+        message = nedbus.VehicleLocalPosition(timestamp=1)
+
+        def put() -> None:
+            for publisher in publishers:
+                publisher.publish(message)
+            stop.wait(0.01)
+
+        def open_and_close() -> None:
+            with bus.publisher("vehicle_local_position", vehicle=f"c{counts['closed'] % VEHICLES}") as publisher:
+                publisher.publish(message)
+
+        def subscribe(**options: object) -> Callable[[], None]:
+            def take_some() -> None:
+                with bus.subscribe(vehicle="*", **options) as samples:  # type: ignore[arg-type] # made for any option
+                    for _ in range(20):
+                        samples.receive(timeout=0.5)
+
+            return take_some
+
+        threads = [
+            repeat("closed", open_and_close),
+            repeat("put", put),
+            repeat("vehicles", lambda: alive_keys(bus._session, alive_key_expr(prefix=bus.prefix), timeout=1.0)),
+            repeat("followed", lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01))),
+            repeat("latest", lambda: bus.latest(timeout=1.0)),
+            repeat("subscribed", subscribe()),
+            repeat("every", subscribe(mode="every")),
+            repeat("thinned", subscribe(max_rate=5.0)),
+        ]
+        latest = _tick(seconds)
+        stop.set()
+        for thread in threads:
+            thread.join(GRACE / 2)
+            counts["threads that did not end"] += thread.is_alive()
+    return {**counts, "latest tick": round(latest, 3)}
+
+
+def _tick(seconds: float) -> float:
+    """Tick for so many seconds, and return how late the latest tick was [s]."""
+    end, latest, last = time.monotonic() + seconds, 0.0, time.monotonic()
+    while last < end:
+        faulthandler.dump_traceback_later(1.0 + TICK, exit=False)
+        time.sleep(TICK)
+        now = time.monotonic()
+        latest, last = max(latest, now - last - TICK), now
+    faulthandler.cancel_dump_traceback_later()
+    return latest
+
+
+if __name__ == "__main__":
+    main()
