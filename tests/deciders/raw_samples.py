@@ -92,7 +92,7 @@ def miss(count: int, publisher: str = "a") -> zenoh.ext.Miss:
 
 def make_queue(mode: Mode, *, layouts: Mapping[int, Sequence[str]] | None = None) -> ReceiveQueue:
     """Return an empty queue that knows these layouts besides PX4's."""
-    return ReceiveQueue(mode, Decoder(LayoutLookup((layouts or {}).get), prefix="nedbus"), name="queue")
+    return ReceiveQueue(mode, Decoder(LayoutLookup(lambda: layouts or {}), prefix="nedbus"), name="queue")
 
 
 def drain(receive_queue: ReceiveQueue) -> list[nedbus.Sample]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
 from typing import cast
 
 import msgpack
@@ -11,6 +13,7 @@ import nedbus
 from nedbus import Counts, Mode
 from nedbus.client.layout_lookup import LayoutLookup
 from nedbus_msgs import decode_row, encoding_of
+from tests.conftest import DEADLINE, wait_for
 
 from .raw_samples import INVALID, OTHER_KEY, drain, junk, make_queue, miss, raw, timestamps
 
@@ -91,23 +94,59 @@ def test_junk_does_not_supersede_a_valid_sample() -> None:
 
 
 def test_unknown_layout_is_looked_up() -> None:
-    """A layout that a publisher explains is read by name."""
+    """A layout that a publisher explains is read by name, from its answer on."""
     receive_queue = make_queue("every", layouts={9: ("timestamp", "brand_new", "x")})
-    receive_queue.put([junk(msgpack.packb([9, 4, True, 2.5])), junk(msgpack.packb([8, 4, True, 2.5]))])
-    [sample] = drain(receive_queue)
+    payloads = [msgpack.packb([layout, 4, True, 2.5]) for layout in (9, 8)]
+
+    def put() -> int:
+        receive_queue.put(list(map(junk, payloads)))
+        return receive_queue.waiting
+
+    wait_for(put, what="the answer")
+    sample = drain(receive_queue)[0]
     assert (sample.message.timestamp, sample.message.x) == (4, 2.5)
-    assert receive_queue.counts.invalid == 1
+    assert receive_queue.counts.invalid >= 2
 
 
-def test_unexplained_layout_is_asked_for_again_after_a_while() -> None:
-    """Not for every message, and not only once: its publisher may come later."""
-    now, asked = [0.0], list[int]()
-    lookup = LayoutLookup(asked.append, now=lambda: now[0])
-    payload = msgpack.packb([9, 1, 2])
-    for now[0] in (0.0, 1.0, 9.0, 11.0, 12.0):
-        with pytest.raises(nedbus.UnknownLayoutError):
-            lookup.check(payload)
-    assert asked == [9, 9]
+def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
+    """One question for all, not for every message, and not only once: their publishers may come later."""
+    now, asked = 0.0, list[float]()
+
+    def find() -> dict[int, Sequence[str]]:
+        asked.append(now)
+        return {}
+
+    lookup = LayoutLookup(find, now=lambda: now)
+    while now < 250.0:
+        lookup.learn(msgpack.packb([layout, 1, 2]) for layout in range(9, 200))
+        now += 0.5
+    assert asked == [0.0, 2.0, 7.0, 17.0, 47.0, 107.0, 167.0, 227.0]
+
+
+def test_only_layouts_that_are_needed_are_remembered() -> None:
+    """An answer may explain thousands: what nobody sends does not keep a layout out that somebody does."""
+    known = dict.fromkeys(range(9, 2000), ("timestamp", "x"))
+    lookup = LayoutLookup(lambda: known)
+    for layout in range(1500, 1600):
+        lookup.learn([msgpack.packb([layout, 1, 2.0])])
+    assert list(lookup.newer) == list(range(1500, 1516))
+
+
+def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
+    """A peer that never answers holds up nobody; the lookup is closed all the same."""
+    answering = threading.Event()
+
+    def find() -> dict[int, Sequence[str]]:
+        answering.wait(DEADLINE)
+        return {9: ("timestamp", "x")}
+
+    lookup = LayoutLookup(find)
+    with pytest.raises(nedbus.UnknownLayoutError):
+        lookup.check(msgpack.packb([9, 1, 2.0]))
+    assert not lookup.newer
+    answering.set()
+    lookup.close()
+    lookup.check(msgpack.packb([9, 1, 2.0]))
 
 
 def test_provenance_is_that_of_each_sample() -> None:

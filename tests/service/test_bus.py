@@ -28,7 +28,16 @@ from nedbus import Mode
 from nedbus.client.receive_queue import CAPACITY
 from nedbus.transport import Session, ask_alive_keys, open_router
 from nedbus_msgs import TOPICS, Address, encode
-from tests.conftest import DEADLINE, Client, Start, free_endpoint, message, wait_for, wait_for_reader
+from tests.conftest import (
+    DEADLINE,
+    Client,
+    Start,
+    free_endpoint,
+    message,
+    repeating,
+    wait_for,
+    wait_for_reader,
+)
 
 VLP = "vehicle_local_position"
 BOTH: list[Mode] = ["latest", "every"]
@@ -312,7 +321,7 @@ def test_invalid_payload_never_ends_an_iteration(
 def test_newer_layout_is_read_with_its_publishers_schema(
     client: Client, raw: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An unknown layout is looked up once; what is known by name is read, what is not is said once."""
+    """An unknown layout is looked up once, while its messages are invalid; unknown fields are said once."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     answer = json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]})
     asked = []
@@ -327,12 +336,12 @@ def test_newer_layout_is_read_with_its_publishers_schema(
     )
     subscription = client.subscribe(VLP, mode="every")
     wait_for_reader(raw, "nedbus/1/vehicle_local_position")
-    for timestamp in (1, 2):
-        raw.put("nedbus/1/vehicle_local_position", msgpack.packb([9, timestamp, True, 2.5]))
-    taken = subscription.take(2)
-    assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(1, 2.5), (2, 2.5)]
+    with repeating(lambda: raw.put("nedbus/1/vehicle_local_position", msgpack.packb([9, 4, True, 2.5]))):
+        taken = subscription.take(2)
+    assert [(sample.message.timestamp, sample.message.x) for sample in taken] == [(4, 2.5), (4, 2.5)]
+    assert subscription.counts.invalid > 0
     assert len(asked) == 1
-    assert [text for text in caplog.messages if "layout 9" in text] == [
+    assert [text for text in caplog.messages if "not read" in text] == [
         "layout 9 is newer than this reader; not read: brand_new"
     ]
     queryable.undeclare()
@@ -569,6 +578,25 @@ def test_unknown_layout_does_not_hold_the_reader(client: Client, raw: Session, b
     for layout in range(100, 120):
         raw.put("nedbus/2/vehicle_local_position", msgpack.packb([layout, 1, 2]))
     wait_for(lambda: subscription.counts.invalid == 20, what="twenty invalid payloads")
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, raw: Session, mode: Mode) -> None:
+    """It sends unknown layouts, and holds the question for them: others are read meanwhile, and it is asked once."""
+    held = raw.declare_queryable("nedbus/@schema/VehicleLocalPosition", zenoh.handlers.RingChannel(100))
+    publisher = bus.publisher(VLP, vehicle="1")
+    subscription = bus.subscribe(VLP, mode=mode)
+    wait_for_reader(raw, "nedbus/2/vehicle_local_position")
+    for layout in range(100, 150):
+        raw.put("nedbus/2/vehicle_local_position", msgpack.packb([layout, 1, 2]))
+    wait_for(lambda: subscription.waiting or subscription.counts.invalid, what="the first of them")
+    publisher.publish(message(1))
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    wait_for(lambda: subscription.counts.invalid == 50, what="all of them")
+    questions = []
+    while (question := held.handler.try_recv()) is not None:
+        questions.append(question)
+    assert len(questions) <= 1
 
 
 def test_hostile_answers_do_not_reach_a_script(client: Client, raw: Session) -> None:

@@ -10,11 +10,11 @@ from typing import Self
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, decode, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, PAYLOAD_SIZE, Address, Selection, decode, vehicle_name
 
 from .closing import Finalizer
 from .decoder import Decoder
-from .discovery import find_layout, find_services
+from .discovery import find_layouts, find_services
 from .layout_lookup import LayoutLookup
 from .publisher import Publisher
 from .publisher_registry import LIVE, PublisherRegistry
@@ -44,8 +44,9 @@ class Bus:
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(session, prefix=prefix)
+        self._layouts = LayoutLookup(partial(find_layouts, session, prefix=prefix))
         self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
-        self._finalizer = Finalizer(self, partial(_close, session, self._queries, self._subscribers))
+        self._finalizer = Finalizer(self, partial(_close, session, self._queries, self._layouts, self._subscribers))
 
     @property
     def connected(self) -> bool:
@@ -99,7 +100,9 @@ class Bus:
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = self._make_decoder()
         newest: dict[Address, Sample] = {}
-        for raw in query(self._session, key_expr, timeout=timeout, newest=False):
+        answers = query(self._session, key_expr, timeout=timeout, newest=False)
+        self._layouts.learn(raw.payload.to_bytes() for raw in answers if len(raw.payload) != PAYLOAD_SIZE)
+        for raw in answers:
             for arrival in decoder.admit([raw]):
                 sample = decoder.decode(arrival, decode)
                 if sample is None:
@@ -200,8 +203,7 @@ class Bus:
         return subscriber
 
     def _make_decoder(self) -> Decoder:
-        layouts = LayoutLookup(partial(find_layout, self._session, prefix=self.prefix))
-        return Decoder(layouts, prefix=self.prefix)
+        return Decoder(self._layouts, prefix=self.prefix)
 
 
 def _rank(sample: Sample) -> tuple[bool, int]:
@@ -209,8 +211,11 @@ def _rank(sample: Sample) -> tuple[bool, int]:
     return not sample.stored, sample.sent or 0
 
 
-def _close(session: Session, queries: QueryServer, subscribers: weakref.WeakSet[ZenohSubscriber]) -> None:
+def _close(
+    session: Session, queries: QueryServer, layouts: LayoutLookup, subscribers: weakref.WeakSet[ZenohSubscriber]
+) -> None:
     with ExitStack() as closing:  # whatever fails, the rest is closed as well
+        closing.callback(layouts.close)  # which ends with the session
         closing.callback(session.close)
         closing.callback(queries.close)
         for subscriber in list(subscribers):

@@ -23,16 +23,18 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict
     return [status for raw in answers if isinstance(status := _parse_json(raw), dict)]
 
 
-def find_layout(session: Session, number: int, *, prefix: str) -> Sequence[str] | None:
-    """Ask publishers for the field names of a layout; None if none knows it."""
+def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
+    """Ask publishers for the field names of all layouts, by number; of different answers for one the first counts."""
+    found: dict[int, Sequence[str]] = {}
     for raw in query(session, schema_key(prefix=prefix), timeout=0.5, newest=False):
         content = _parse_json(raw)
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts if isinstance(layouts, list) else ():
-            names = _field_names(layout, number)
-            if names is not None:
-                return names
-    return None
+            number = layout.get("wire") if isinstance(layout, dict) else None
+            names = _field_names(layout)
+            if isinstance(number, int) and names is not None:
+                found.setdefault(number, names)
+    return found
 
 
 def _parse_json(raw: RawSample) -> object:
@@ -45,9 +47,9 @@ def _parse_json(raw: RawSample) -> object:
         return None
 
 
-def _field_names(layout: object, number: int) -> Sequence[str] | None:
-    """Return the field names of this layout, if it is the one with that number and well formed."""
-    if not isinstance(layout, dict) or layout.get("wire") != number or not isinstance(layout.get("fields"), list):
+def _field_names(layout: object) -> Sequence[str] | None:
+    """Return the field names of a layout that is well formed."""
+    if not isinstance(layout, dict) or not isinstance(layout.get("fields"), list):
         return None
     named = [field.get("name") for field in layout["fields"] if isinstance(field, dict)]
     names = [name for name in named if isinstance(name, str)]

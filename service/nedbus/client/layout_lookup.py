@@ -1,56 +1,98 @@
-"""Layouts that are newer than this reader: which are known by now, and when to ask for an unknown one."""
+"""Layouts that are newer than this reader: which are known by now, and when to ask for those that are not."""
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
+from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus_msgs import FIELD_TYPES, UnknownLayoutError, decode
+from nedbus_msgs import FIELD_TYPES, DecodeError, UnknownLayoutError, decode
 
 _log = logging.getLogger(__name__)
 
-_MAX_LAYOUTS: Final = 16  # unknown layouts that are remembered
-_ASK_AGAIN: Final = 10.0  # s until a layout that no publisher explained is asked for again
+_MAX_LAYOUTS: Final = 16  # newer layouts that are remembered
+_MAX_UNKNOWN: Final = 256  # numbers that are asked for at once
+_PAUSES: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # s between two questions that explained nothing new; then the last one
+_JOIN: Final = 3.0  # s
 
-
-FindLayout = Callable[[int], Sequence[str] | None]
-"""From the number of a layout to its field names; None if no publisher knows it."""
+FindLayouts = Callable[[], Mapping[int, Sequence[str]]]
+"""Ask publishers for the field names of all layouts that they know, by the number of the layout."""
 
 
 class LayoutLookup:
-    """Ask publishers, through `find`, for the field names of layouts that are not known here; each at most every 10 s.
+    """Ask publishers, through `find`, for layouts that are not known here: one question for all, in its own thread.
+
+    A message of such a layout is invalid until the answer is there: whoever receives never waits for it, as any peer
+    can send messages of unknown layouts, and leave questions unanswered.
 
     `newer`: the field names that were found, by the number of the layout, as `decode` takes them.
     """
 
-    def __init__(self, find: FindLayout, *, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, find: FindLayouts, *, now: Callable[[], float] = time.monotonic) -> None:
         self.newer: Mapping[int, Sequence[str]] = {}
         self._find = find
         self._now = now
-        self._next_ask: dict[int, float] = {}
+        self._asking = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self._unknown: set[int] = set()  # numbers of layouts, since the last question
+        self._in_vain = 0
+        self._next_ask = float("-inf")
 
     def check(self, payload: bytes) -> None:
-        """Decode a payload, asking for its layout if that is unknown; raise DecodeError for what is not a message."""
+        """Decode a payload; raise DecodeError for what is not a message, or of a layout that is not known yet."""
         try:
             decode(payload, newer=self.newer)
         except UnknownLayoutError as exc:
-            self._ask(exc.layout)
-            if exc.layout not in self.newer:
-                raise
+            if len(self._unknown) < _MAX_UNKNOWN:
+                self._unknown.add(exc.layout)
+            self._ask()
+            raise
 
-    def _ask(self, layout: int) -> None:
-        if layout not in self._next_ask and len(self._next_ask) >= _MAX_LAYOUTS:
+    def learn(self, payloads: Iterable[bytes]) -> None:
+        """Ask for the layouts of these payloads, and wait for the answer: for a thread on which nothing arrives."""
+        for payload in payloads:
+            with suppress(DecodeError):
+                self.check(payload)
+        if self._thread is not None:
+            self._thread.join(_JOIN)
+
+    def close(self) -> None:
+        """Ask no more, and wait for the end of an open question."""
+        with self._asking:
+            self._closed = True
+        if self._thread is not None:
+            self._thread.join(_JOIN)
+
+    def _ask(self) -> None:
+        if self._now() < self._next_ask:
             return
-        if self._now() < self._next_ask.get(layout, float("-inf")):
-            return
-        fields = self._find(layout)
-        self._next_ask[layout] = self._now() + _ASK_AGAIN
-        if fields is not None:
-            self.newer = {**self.newer, layout: fields}
-            unread = [name for name in fields if name not in FIELD_TYPES]
-            names = ", ".join(unread) or "nothing"
-            extra = about("newer-layout")
-            _log.warning("layout %d is newer than this reader; not read: %s", layout, names, extra=extra)
+        with self._asking:
+            if self._now() < self._next_ask or self._closed or len(self.newer) >= _MAX_LAYOUTS:
+                return
+            self._next_ask = float("inf")  # while it is open
+            self._thread = threading.Thread(target=self._run, name="nedbus-layouts", daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        found: Mapping[int, Sequence[str]] = {}
+        unknown, self._unknown = self._unknown, set()
+        try:
+            with suppress(NedbusError):  # the session is closed
+                found = self._find()
+        finally:
+            new = {number: found[number] for number in found.keys() & unknown if number not in self.newer}
+            for number, names in new.items():
+                if len(self.newer) < _MAX_LAYOUTS:
+                    self.newer = {**self.newer, number: names}
+                    unread = ", ".join(name for name in names if name not in FIELD_TYPES) or "nothing"
+                    extra = about("newer-layout")
+                    _log.warning("layout %d is newer than this reader; not read: %s", number, unread, extra=extra)
+            self._in_vain = 0 if new else self._in_vain + 1
+            pause = _PAUSES[min(self._in_vain, len(_PAUSES)) - 1] if self._in_vain else 0.0
+            self._next_ask = self._now() + pause
