@@ -5,11 +5,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
+ARGS = --source sim: --http 127.0.0.1:9464
 
 .PHONY: run check quick test compose-test wheel bench clean
 
-run: $(READY)  ## the service with a simulated flight; it prints what to type in a second terminal
-	$(BIN)/nedbus serve --source sim: --http 127.0.0.1:9464
+run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
+	$(info $(BIN)/nedbus serve $(ARGS))
+	@trap : INT; $(BIN)/nedbus serve $(ARGS); code=$$?; case $$code in \
+	130) exit 0 ;; \
+	1) echo 'for other options: make run ARGS="--source sim: --vehicle 2 --connect tcp/127.0.0.1:7447"' >&2 ;; \
+	esac; exit $$code
 
 check: $(DEV)  ## lint and types
 	$(BIN)/ruff check .

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -24,8 +25,9 @@ from nedbus.cli.live_table import LiveTable
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT_TOPIC, TOPICS
-from tests.conftest import DEADLINE, Start, free_endpoint, message, unmeasured, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, free_port, message, unmeasured, wait_for
 
+ROOT = Path(__file__).parents[2]
 VLP = DEFAULT_TOPIC
 EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
 
@@ -490,3 +492,33 @@ def test_closed_terminal_ends_no_service(bus: nedbus.Bus, endpoint: str) -> None
         assert terminal.popen.poll() is None
         terminal.popen.send_signal(signal.SIGTERM)
         assert terminal.popen.wait(DEADLINE) == 0
+
+
+@pytest.mark.process
+def test_make_run(tmp_path: Path) -> None:
+    """A second one says that a nedbus runs already, and how to choose; Ctrl-C ends the first without make's error."""
+    program = tmp_path / "venv" / "bin" / "nedbus"
+    program.parent.mkdir(parents=True)
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
+    program.chmod(0o755)
+    (tmp_path / "venv" / ".ready").touch()
+    options = f"-s sim: -l {free_endpoint()} --http 127.0.0.1:{free_port()}"
+    command = ["make", "-C", str(ROOT), "run", f"VENV={tmp_path}/venv", f"ARGS={options}"]
+    log = tmp_path / "log"
+    with log.open("w") as written:
+        first = subprocess.Popen(command, stdout=written, stderr=written, env=unmeasured(), start_new_session=True)
+    try:
+        wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
+        second = subprocess.run(
+            command, capture_output=True, check=False, text=True, timeout=DEADLINE, env=unmeasured()
+        )
+        assert second.returncode == 2
+        assert "(a nedbus runs there already): end it, or choose another address with --http\n" in second.stderr
+        assert 'make run ARGS="' in second.stderr
+        os.killpg(first.pid, signal.SIGINT)
+        assert first.wait(DEADLINE) in {0, -signal.SIGINT}
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(first.pid, signal.SIGKILL)
+    assert "ending: SIGINT" in log.read_text()
+    assert "***" not in log.read_text()

@@ -6,12 +6,14 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from http.client import HTTPConnection, HTTPException
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from nedbus import __version__
 from nedbus.client import Bus
+from nedbus.errors import ListenError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("nedbus")
 
 DEFAULT_HTTP: Final = "127.0.0.1:9464"
+_ANSWER_TIMEOUT: Final = 1.0  # s
 
 
 @contextmanager
@@ -32,7 +35,13 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
     """Serve pages on HOST:PORT for as long as this is entered."""
     from nedbus.monitoring import HttpServer
 
-    server = HttpServer(where, pages)
+    try:
+        server = HttpServer(where, pages)
+    except ListenError as exc:
+        if not _is_nedbus(where):
+            raise
+        hint = "end it, or choose another address with --http"
+        raise ListenError([f"http://{where}"], "a nedbus runs there already", hint=hint) from exc
     host, _ = split_http(where)
     _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where, extra=about("http"))
     if not is_loopback(host):
@@ -41,6 +50,18 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
         yield
     finally:
         server.close()
+
+
+def _is_nedbus(where: str) -> bool:
+    """Return whether a command of ours serves pages on HOST:PORT."""
+    connection = HTTPConnection(*split_http(where), timeout=_ANSWER_TIMEOUT)
+    try:
+        connection.request("HEAD", "/")
+        return connection.getresponse().getheader("Server", "").startswith("nedbus")
+    except (OSError, HTTPException):
+        return False
+    finally:
+        connection.close()
 
 
 @on_bus
