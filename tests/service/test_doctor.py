@@ -384,8 +384,8 @@ def test_write_permission_is_probed(run_router: Run, pki: Path) -> None:
     endpoint = run_router()
     expected: list[tuple[str, str, State, str]] = [
         ("vehicle-1", "1", "ok", "a probe came back"),
-        ("vehicle-1", "2", "wrong", "the router drops what this client publishes as vehicle 2, without an error"),
-        ("reader", "1", "wrong", "the router drops"),
+        ("vehicle-1", "2", "warning", "the router drops what this client publishes as vehicle 2, without an error"),
+        ("reader", "1", "warning", "the router drops"),
     ]
     for name, vehicle, state, text in expected:
         found(look(endpoint, files(pki, name), vehicle=vehicle), "write", state, text)
@@ -393,6 +393,27 @@ def test_write_permission_is_probed(run_router: Run, pki: Path) -> None:
     assert is_well(own), own  # it cannot read, which is as it should be
     older = run_router(**{"@doctor": "@probe"})  # rules that know nothing of probes
     found(look(older, files(pki, "vehicle-1"), vehicle="1"), "write", "unknown", "cannot be told")
+
+
+def test_reader_that_looks_at_a_vehicle(run_router: Run, pki: Path, run_nedbus: Start) -> None:
+    """A vehicle that flies is well for a reader and for itself; another vehicle may neither read nor write it."""
+    endpoint = run_router()
+
+    def flags(name: str) -> list[str]:
+        return ["-c", endpoint, *(f"--{key.replace('_', '-')}={path}" for key, path in files(pki, name).items())]
+
+    run_nedbus("serve", *flags("vehicle-1"), "-s", "sim:?vehicle=1")
+    ready = run_nedbus("echo", "--wait", "--once", *flags("reader"))
+    assert ready.wait() == 0, ready.err
+    for name, vehicle, write, code in (
+        ("reader", "1", "ok", 0),
+        ("vehicle-1", "1", "ok", 0),
+        ("vehicle-1", "2", "wrong", 1),
+    ):
+        doctor = run_nedbus("doctor", "--json", "--vehicle", vehicle, *flags(name))
+        assert doctor.wait() == code, doctor.out
+        states = {each["check"]: each["state"] for each in json.loads(doctor.out)["findings"]}
+        assert states["write"] == write, name
 
 
 def test_service_that_may_not_write_its_vehicle(run_router: Run, pki: Path, run_nedbus: Start) -> None:

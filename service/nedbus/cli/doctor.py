@@ -38,7 +38,7 @@ _INDENT: Final = " " * 9
 def doctor(
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Probe whether this client may write this vehicle")
+        str | None, typer.Option("--vehicle", "-v", help="Look at this vehicle, and whether this client may write it")
     ] = None,
     mavlink: Annotated[
         str | None, typer.Option("--mavlink", metavar="LINK", help="Listen here too, such as udpin:0.0.0.0:14550")

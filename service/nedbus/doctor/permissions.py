@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
-from .finding import Finding, list_names
+from .finding import Finding, State, list_names
 from .observation import Observation
 from .services import reported
 from .write_probe import Verdict
 
 _RULES = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
+_DENIED: Final[dict[State, State]] = {"ok": "ok", "unknown": "warning"}
+"""How bad it is that a vehicle may not be written, by the state of reading: no fault of a reader."""
 
 
 def check_permissions(seen: Observation, vehicle: str | None, verdict: Verdict | None) -> Iterator[Finding]:
     """Yield whether this client may read, by what it gets, and may write a vehicle, by what a probe showed."""
-    yield _reading(seen, verdict)
+    reading = _reading(seen, verdict)
+    yield reading
     if vehicle is None or verdict is None:
         advice = "with --vehicle it is: 'nedbus doctor --vehicle 1'"
         yield Finding("write", "", "unknown", "whether a vehicle may be written is not probed", advice)
@@ -22,7 +26,8 @@ def check_permissions(seen: Observation, vehicle: str | None, verdict: Verdict |
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe came back")
     elif verdict == "denied":
         seen_text = f"the router drops what this client publishes as vehicle {vehicle}, without an error"
-        yield Finding("write", vehicle, "wrong", seen_text, f"use the certificate of that vehicle; {_RULES}")
+        advice = f"a reader needs no more; to publish, use the certificate of that vehicle; {_RULES}"
+        yield Finding("write", vehicle, _DENIED.get(reading.state, "wrong"), seen_text, advice)
     else:
         seen_text = f"cannot be told: the router does not let this client read a probe of vehicle {vehicle}"
         advice = f"allow {seen.prefix}/*/@doctor/* as config/router-secure.json5 does, or look from a reader"
