@@ -13,6 +13,7 @@ from nedbus.settings import load_settings
 from nedbus.sources import parse_source
 from nedbus.transport import make_authority, make_certificate
 from tests.conftest import Start, free_endpoint
+from tests.ulogs import write_log
 
 ROOT = Path(__file__).parents[2]
 
@@ -83,14 +84,90 @@ def test_variable_carries_options_with_commas(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_all_mistakes_are_said_at_once(run_nedbus: Start, tmp_path: Path) -> None:
-    """Values that cannot be read come first: until they are right, nothing else can be judged."""
-    file = tmp_path / "nedbus.toml"
-    file.write_text('prefix = "a//b"\nconect = 1\nvehicle = "a b"\n')
-    for command, given in ((("check",), file), (("serve", "--check", "--config"), file)):
-        lines = check(run_nedbus, given, command=command)
-        assert sorted(line.partition(": ")[0] for line in lines) == [
-            f"{file}, line {line}, column 1" for line in (1, 2, 3)
-        ]
+    """No mistake hides another one, of whatever kind: settings, items of a list, sources, their options and links."""
+    file, closed = tmp_path / "nedbus.toml", free_endpoint()
+    file.write_text(
+        f'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\nconnect = ["here", "{closed}"]\n'
+        'listen = ["tcp/127.0.0.1:99999", "tcp/192.0.2.1:1"]\nuntil_done = "maybe"\ntls_ca = "gone.crt"\n'
+        'source = ["foo:", "mavlink:udpin:0.0.0.0:99999?sed=1&baud=0", "ulog:gone.ulg?sed=1"]\n'
+    )
+    expected = [
+        (1, 1, "prefix 'a//b' is not valid"),
+        (2, 1, "there is no setting 'conect'"),
+        (3, 1, "vehicle 'a b' is not valid"),
+        (4, 1, "'127.0.0.1:99999' is not an address"),
+        (5, 1, "'here' is not an endpoint"),
+        (5, 1, f"{closed}: nothing answers"),
+        (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
+        (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is no address of this host"),
+        (7, 1, "until_done: "),
+        (8, 1, "gone.crt cannot be read"),
+        (9, 12, "source 'foo:': there is no kind 'foo'"),
+        (9, 20, "source 'mavlink:udpin:0.0.0.0:99999?sed=1&baud=0': there is no option 'sed'"),
+        (9, 20, "source 'mavlink:udpin:0.0.0.0:99999?sed=1&baud=0': baud=0 is invalid"),
+        (9, 20, "source 'mavlink:udpin:0.0.0.0:99999': 'udpin:0.0.0.0:99999' is not a link"),
+        (9, 64, "source 'ulog:gone.ulg?sed=1': there is no option 'sed'"),
+        (9, 64, "source 'ulog:gone.ulg': gone.ulg: no such file"),
+    ]
+    for command in (("check",), ("serve", "--check", "--config")):
+        lines = check(run_nedbus, file, command=command)
+        for line, column, text in expected:
+            start = f"{file}, line {line}, column {column}: {text}"
+            assert any(each.startswith(start) for each in lines), (start, lines)
+        assert len(lines) == len(expected)
+
+
+def test_file_that_cannot_be_read_hides_nothing(run_nedbus: Start, tmp_path: Path) -> None:
+    """Flags and variables are checked all the same; what the file may have said is not called missing."""
+    broken = tmp_path / "broken.toml"
+    broken.write_text("source = [\n")
+    for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
+        flags = ("--listen", "tcp/192.0.2.1:1", "--tls-key", "gone.key")
+        lines = check(run_nedbus, file, *flags, command=("serve", "--check", "--config"))
+        assert [reason in lines[0], len(lines)] == [True, 3], lines
+        assert lines[1].startswith("tls_key: gone.key cannot be read")
+        assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is no address of this host")
+
+
+def test_two_sources_of_one_vehicle(run_nedbus: Start, tmp_path: Path) -> None:
+    """Sources that publish the same address keep each other from it: replays, and live ones that name a vehicle."""
+    file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
+    named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
+    file.write_text(
+        f'source = ["sim:", "ulog:{log}?vehicle=7", "sim:?seed=2", "ulog:{log}?vehicle=7&speed=2", "sim:", "{named}",'
+        f' "sim:?vehicle=wing", "sim:?vehicle=8", "px4-zenoh:"]\n'
+    )
+    reasons = [line.partition(": ")[2] for line in check(run_nedbus, file)]
+    advice = "give one of the two another vehicle"
+    sims = [
+        f"source 'sim:?seed=2': it publishes 1/vehicle_local_position, as source 'sim:' does: {advice}",
+        f"source 'sim:': it publishes 1/vehicle_local_position, as source 'sim:' does: {advice}",
+        f"source 'sim:?vehicle=wing': it publishes wing/vehicle_local_position, as source '{named}' does: {advice}",
+    ]
+    first = f"as source 'ulog:{log}?vehicle=7' does: {advice}"
+    logs = f"source 'ulog:{log}?vehicle=7&speed=2': it publishes 7/vehicle_local_position, {first}"
+    assert reasons == [sims[0], logs, *sims[1:]]
+    assert [line.partition(": ")[2] for line in check(run_nedbus, "--offline", file)] == sims
+
+
+def test_router_file_that_settings_name(run_nedbus: Start, tmp_path: Path) -> None:
+    """It is checked with them, but for the endpoints that they replace."""
+    file, router = tmp_path / "nedbus.toml", tmp_path / "router.json5"
+    router.write_text(
+        '{ listen: { endpoints: ["tls/192.0.2.1:7447"] },\n transport: { link: { tls: {\n'
+        '  listen_private_key: "/no/such.key", listen_certificate: "/no/such.crt" } } } }\n'
+    )
+    file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\n')
+    lines = check(run_nedbus, file)
+    assert sorted(line.partition(": ")[0] for line in lines) == [
+        f"{file}, line 2, column 12",
+        f"{router}, line 1, column 26",
+        f"{router}, line 3, column 24",
+        f"{router}, line 3, column 60",
+    ]
+    assert len(check(run_nedbus, "--offline", file)) == 1
+    file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\nlisten = "{free_endpoint()}"\n')
+    assert len(check(run_nedbus, file)) == 3
 
 
 def test_sources_endpoints_and_files_are_tried(run_nedbus: Start, tmp_path: Path) -> None:

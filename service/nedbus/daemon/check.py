@@ -6,24 +6,26 @@ import datetime as dt
 import logging
 import os
 import socket
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from nedbus.errors import ConfigError, NedbusError, SourceError
+from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
-from nedbus.sources import LiveSource
-from nedbus.transport import Certificate, read_router_config
+from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
+from nedbus.transport import Certificate, Tls, check_pem, read_router_config, router_endpoints
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .plan import plan_sources
+from .plan import Planned, plan_sources
 
 _log = logging.getLogger(__name__)
 
 _PATIENCE: Final = 2.0  # s for an endpoint to answer
 _STREAMS: Final = frozenset({"tcp", "tls", "ws"})  # protocols whose endpoints can be tried by connecting
+_TLS_FILES: Final = {"tls_ca": "CERTIFICATE", "tls_certificate": "CERTIFICATE", "tls_key": "PRIVATE KEY"}
 
 
 def check_service(
@@ -34,11 +36,16 @@ def check_service(
     `offline`: only the text counts, and not what this host has: files, certificates, endpoints.
     """
     settings, mistakes = find_mistakes(file, **(given or {}))
-    return mistakes if settings is None else list(_check_settings(settings, offline=offline))
+    return [*mistakes, *_check_settings(settings, offline=offline)]
 
 
-def check_router_file(path: Path, *, offline: bool = False) -> list[ConfigError]:
-    """Return all mistakes in a router's configuration file; `offline` as in `check_service`."""
+def check_router_file(
+    path: Path, *, offline: bool = False, replaced: Collection[str] = frozenset()
+) -> list[ConfigError]:
+    """Return all mistakes in a router's configuration file; `offline` as in `check_service`.
+
+    `replaced`: of `listen` and `connect` what is given elsewhere, in place of what the file says.
+    """
     try:
         config = read_router_config(path)
     except ConfigError as exc:
@@ -46,7 +53,10 @@ def check_router_file(path: Path, *, offline: bool = False) -> list[ConfigError]
     if offline:
         return []
     text = path.read_text(errors="replace")
-    found = [*_try_listen(config.listen), *_try_connect(config.connect)]
+    found = [
+        *_try_listen(config.listen if "listen" not in replaced else ()),
+        *_try_connect(config.connect if "connect" not in replaced else ()),
+    ]
     for name, file in config.tls_files.items():
         if not os.access(file, os.R_OK):
             found.append((str(file), f"{name}: {file} cannot be read: does it exist, and may this user read it?"))
@@ -60,28 +70,62 @@ def check_router_file(path: Path, *, offline: bool = False) -> list[ConfigError]
 
 
 def _check_settings(settings: Settings, *, offline: bool) -> Iterator[ConfigError]:
-    endpoints: tuple[str, ...] = settings.connect
-    if not settings.is_client:
+    endpoints = settings.connect if settings.is_client else settings.listen
+    if settings.router_config is not None:
+        replaced = {name for name in ("listen", "connect") if getattr(settings, name)}
+        yield from check_router_file(settings.router_config, offline=offline, replaced=replaced)
         try:
-            endpoints = settings.router_endpoints
+            of_file = router_endpoints((), settings.router_config)
         except ConfigError as exc:
             yield exc
-    plan, mistakes = plan_sources(settings, endpoints)
+        else:
+            endpoints = endpoints or of_file
+    plan, mistakes = plan_sources(settings, endpoints or router_endpoints())
     yield from mistakes
+    yield from _check_sources(settings, plan, offline=offline)
     if offline:
         return
     yield from _check_tls(settings)
-    for planned in plan:
-        if isinstance(planned.source, LiveSource):
-            continue
-        try:
-            with closing(planned.source.open().messages):  # type: ignore[type-var] # each is a generator
-                pass
-        except (SourceError, OSError) as exc:
-            yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", str(exc)))
-    for name, tried in (("connect", _try_connect(settings.connect)), ("listen", _try_listen(settings.listen))):
+    for name, tried in (
+        ("connect", _try_connect(settings.connect)),
+        ("listen", _try_listen(settings.listen)),
+        ("http", _try_listen((f"http/{settings.http}",) if settings.http else ())),
+    ):
         for _, reason in tried:
             yield locate_setting(settings, name, reason)
+
+
+def _check_sources(settings: Settings, plan: Iterable[Planned], *, offline: bool) -> Iterator[ConfigError]:
+    """Yield each source that cannot be opened, or publishes what another one does."""
+    publishers: dict[Address, Planned] = {}
+    for planned in plan:
+        where = f"source {planned.text!r}"
+        try:
+            addresses = _addresses(planned, offline=offline)
+        except (NedbusError, OSError) as exc:
+            yield locate_source(settings, planned.index, ConfigError(where, str(exc)))
+            continue
+        same = next((address for address in addresses if address in publishers), None)
+        if same is not None and "vehicle" not in settings.left_out:
+            reason = (
+                f"it publishes {same}, as source {publishers[same].text!r} does: give one of the two another vehicle"
+            )
+            yield locate_source(settings, planned.index, ConfigError(where, reason))
+        for address in addresses:
+            publishers.setdefault(address, planned)
+
+
+def _addresses(planned: Planned, *, offline: bool) -> Collection[Address]:
+    """Return what a source publishes: what is in a replay, or the vehicles that a live source names."""
+    spec = parse_source(planned.text)
+    if isinstance(planned.source, LiveSource):
+        named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
+        return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
+    if offline and SOURCE_KINDS[spec.kind].target == "FILE":
+        return ()
+    run = planned.source.open()
+    with closing(run.messages):  # type: ignore[type-var] # each is a generator
+        return run.addresses
 
 
 def _judge_certificate(path: str | Path) -> str | None:
@@ -102,17 +146,30 @@ def _judge_certificate(path: str | Path) -> str | None:
 
 
 def _check_tls(settings: Settings) -> Iterator[ConfigError]:
+    """Yield what is wrong with each file, and with all of them together if none is."""
+    is_whole = not settings.left_out & _TLS_FILES.keys()
+    for name, kind in _TLS_FILES.items():
+        path = getattr(settings, name)
+        if path is None:
+            continue
+        try:
+            check_pem(path, kind)
+        except ConfigError as exc:
+            is_whole = False
+            yield locate_setting(settings, name, exc.reason)
+        else:
+            if kind == "CERTIFICATE" and (reason := _judge_certificate(path)):
+                yield locate_setting(settings, name, reason)
+    if settings.tls_ca is None or not is_whole or (settings.tls_certificate is None) != (settings.tls_key is None):
+        return
+    tls = Tls(settings.tls_ca, settings.tls_certificate, settings.tls_key)
     try:
-        tls = settings.tls
-        if tls is not None:
-            tls.zenoh_settings()
-            if reason := tls.explain():
-                yield locate_setting(settings, "tls_certificate", reason)
-            for name, path in (("tls_ca", tls.ca), ("tls_certificate", tls.certificate)):
-                if path is not None and (reason := _judge_certificate(path)):
-                    yield locate_setting(settings, name, reason)
+        tls.zenoh_settings()
     except ConfigError as exc:
-        yield locate_setting(settings, "tls_ca", exc.reason)
+        yield locate_setting(settings, "tls_key", exc.reason)
+        return
+    if reason := tls.explain():
+        yield locate_setting(settings, "tls_certificate" if tls.certificate else "tls_ca", reason)
 
 
 def _try_connect(endpoints: Iterable[str]) -> Iterator[tuple[str, str]]:

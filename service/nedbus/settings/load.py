@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import logging
 import os
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +17,7 @@ from pydantic_settings import BaseSettings, InitSettingsSource, PydanticBaseSett
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
 
-from .model import Settings
+from .model import Settings, split_sources, split_values
 from .toml_file import find_key, find_source, read_text, read_toml
 
 _log = logging.getLogger(__name__)
@@ -33,27 +34,35 @@ def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     Raises ConfigError, with file, line and column or the name of the flag or variable.
     """
     settings, mistakes = find_mistakes(file, **given)
-    if settings is None:
+    if mistakes:
         raise mistakes[0]
     return settings
 
 
-def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings | None, list[ConfigError]]:
-    """Return the settings as `load_settings` does, and no mistakes, or None and all mistakes."""
+def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings, list[ConfigError]]:
+    """Return the settings as `load_settings` does, and all mistakes; what is wrong is left out of the settings."""
     flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    mistakes: list[ConfigError] = []
+    path, content = None, dict[str, object]()
     try:
         path = _settings_file(file)
         content = read_toml(path) if path else {}
     except ConfigError as exc:
-        return None, [exc]
+        mistakes.append(exc)
+    is_read, wrong = not mistakes, set[str]()
     try:
         settings = _with_file(content)(**flags)
     except ValidationError as exc:
-        return None, [_setting_error(path, flags, detail) for detail in exc.errors()]
+        details = exc.errors()
+        mistakes += [_setting_error(path, flags, detail) for detail in details]
+        wrong = {str(detail["loc"][0]) for detail in details}
+        rest = {name: value for name, value in content.items() if name not in wrong}
+        settings = _with_file(rest)(**_without_mistakes(content, flags, details))
     _warn_of_misspelt_variables()
     settings._set_by.update({name: _set_by(name, path, flags) for name in settings.model_fields_set})
     settings._file = path
-    return settings, []
+    settings._left_out = frozenset(wrong if is_read else wrong | (Settings.model_fields.keys() - settings._set_by))
+    return settings, mistakes
 
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
@@ -70,7 +79,7 @@ def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigE
     setter = settings.set_by("source")
     if settings.file is None or setter != str(settings.file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
-    line, column = find_source(read_text(settings.file), index, settings.source[index], error.key)
+    line, column = find_source(read_text(settings.file), settings.source, index, error.key)
     return ConfigError.in_file(settings.file, str(error), line=line, column=column)
 
 
@@ -80,6 +89,24 @@ def _settings_file(given: str | Path | None) -> Path | None:
     if path is not None and not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     return path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
+
+
+def _without_mistakes(
+    content: Mapping[str, object], flags: Mapping[str, Any], details: Sequence[ErrorDetails]
+) -> dict[str, Any]:
+    """Return the flags, with the default of each wrong setting in its place, or with what is right of a list."""
+    wrong: dict[str, set[int | str]] = defaultdict(set)
+    for detail in details:
+        wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
+    kept = {name: value for name, value in flags.items() if name not in wrong}
+    for name in wrong.keys() & Settings.model_fields.keys():
+        value = flags.get(name) or os.environ.get(f"NEDBUS_{name.upper()}") or content.get(name)
+        items = split_sources(value) if name == "source" else split_values(value)
+        if wrong[name] and isinstance(items, list | tuple):
+            kept[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
+        else:
+            kept[name] = Settings.model_fields[name].default
+    return kept
 
 
 def _set_by(name: str, path: Path | None, flags: Mapping[str, object]) -> str:

@@ -14,7 +14,7 @@ from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoin
 from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
 
 
-def _split_sources(value: object) -> object:
+def split_sources(value: object) -> object:
     """Split at semicolons and line breaks; without any, at commas before KIND: that are no part of an option."""
     if not isinstance(value, str):
         return value
@@ -22,12 +22,13 @@ def _split_sources(value: object) -> object:
     return tuple(part.strip() for part in parts if part.strip())
 
 
-def _split(value: object) -> object:
+def split_values(value: object) -> object:
+    """Split at commas what is one text."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
-def _endpoints(value: tuple[str, ...]) -> tuple[str, ...]:
-    check_endpoints(value, where="endpoint")
+def _endpoint(value: str) -> str:
+    check_endpoints((value,), where="endpoint")
     return value
 
 
@@ -64,7 +65,7 @@ def _vehicle(value: str) -> str:
     return value
 
 
-Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_split), AfterValidator(_endpoints)]
+Endpoints = Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], NoDecode, BeforeValidator(split_values)]
 
 
 class Settings(BaseSettings):
@@ -86,7 +87,7 @@ class Settings(BaseSettings):
     vehicle: Annotated[str, BeforeValidator(_text), AfterValidator(_vehicle)] = Field(
         "1", description="Vehicle of sources that name none"
     )
-    source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(_split_sources)] = Field(
+    source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
         (), description="What is published: texts, or tables of TOML"
     )
     http: Annotated[str, AfterValidator(_http)] | None = Field(
@@ -96,6 +97,7 @@ class Settings(BaseSettings):
 
     _set_by: dict[str, str] = PrivateAttr(default_factory=dict)
     _file: Path | None = PrivateAttr(None)
+    _left_out: frozenset[str] = PrivateAttr(frozenset())
 
     @property
     def routers(self) -> tuple[str, ...]:
@@ -120,6 +122,11 @@ class Settings(BaseSettings):
     def set_by(self, name: str) -> str:
         """Return what sets a setting: the name of a flag, an environment variable, or a file; "" for a default."""
         return self._set_by.get(name, "")
+
+    @property
+    def left_out(self) -> frozenset[str]:
+        """The settings of which `find_mistakes` left something out, as it is wrong or cannot be read."""
+        return self._left_out
 
     @property
     def tls(self) -> Tls | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 
 from nedbus.errors import ConfigError
@@ -44,16 +45,21 @@ def find_key(text: str, name: str) -> Place:
     return place_at(text, found.start(1))
 
 
-def find_source(text: str, index: int, source: object, key: str = "") -> Place:
+def find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> Place:
     """Return line and column of the source with this index, or of an option of it: a table, or a text in a list."""
+    source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):
         start = headers[index].start(1)
         end = headers[index + 1].start() if index + 1 < len(headers) else len(text)
         option = re.search(rf"^[ \t]*(\"?{re.escape(key)}\"?)[ \t]*=", text[start:end], re.MULTILINE) if key else None
         return place_at(text, start + option.start(1) if option else start)
-    found = text.find(source) if isinstance(source, str) else -1
-    return find_key(text, "source") if found < 0 else place_at(text, found)
+    if isinstance(source, str):
+        found = [each.start(1) for each in re.finditer(rf"(?<=[\"'])({re.escape(source)})[\"']", text)]
+        before = sources[:index].count(source)
+        if before < len(found):
+            return place_at(text, found[before])
+    return find_key(text, "source")
 
 
 def place_at(text: str, start: int) -> Place:

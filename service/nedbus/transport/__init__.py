@@ -47,7 +47,7 @@ from .session import (
     translate_error,
     while_open,
 )
-from .tls import Tls
+from .tls import Tls, check_pem
 from .uplink import UPLINK_POLL, Uplinks
 
 if TYPE_CHECKING:
@@ -100,6 +100,7 @@ __all__ = [
     "ask_routers",
     "certificate_name",
     "check_endpoints",
+    "check_pem",
     "dial_endpoint",
     "entity_name",
     "follow_heartbeats",

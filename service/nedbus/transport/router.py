@@ -72,6 +72,7 @@ def open_router(
                 _names(plugins),
                 extra=about("router"),
             )
+        _check_tls_files(config_file, config)
         insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
     if tls is not None and not json.loads(config.get_json("transport/link/tls")).get("root_ca_certificate"):
         files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
@@ -146,13 +147,16 @@ def _read_config(path: Path) -> zenoh.Config:
     if required:
         reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
         raise ConfigError.in_file(path, reason)
+    return config
+
+
+def _check_tls_files(path: Path, config: zenoh.Config) -> None:
     for name, value in json.loads(config.get_json("transport/link/tls")).items():
         # Zenoh would report only that there is no such file, and not which.
         if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
             raise ConfigError.in_file(
                 path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
             )
-    return config
 
 
 def _parse_config(path: Path) -> zenoh.Config:

@@ -46,11 +46,11 @@ class Tls:
 
         Raises ConfigError for a file that cannot be read or is none of its kind, and for a key that does not fit.
         """
-        _check_pem(self.ca, "CERTIFICATE")
+        check_pem(self.ca, "CERTIFICATE")
         settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}
         if self.certificate is not None and self.key is not None:
-            _check_pem(self.certificate, "CERTIFICATE")
-            _check_pem(self.key, "PRIVATE KEY")
+            check_pem(self.certificate, "CERTIFICATE")
+            check_pem(self.key, "PRIVATE KEY")
             _load_pair(ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), self.certificate, self.key)
             own = {"connect_certificate": str(self.certificate), "connect_private_key": str(self.key)}
             settings |= {**own, "enable_mtls": True}
@@ -75,7 +75,7 @@ class Tls:
         return f"{self.ca} has expired" if until < time.time() else None
 
 
-def _check_pem(path: str | Path, kind: str) -> None:
+def check_pem(path: str | Path, kind: str) -> None:
     """Raise ConfigError unless a file can be read and holds a certificate, or a private key, as PEM."""
     if not os.access(path, os.R_OK) or not Path(path).is_file():
         raise ConfigError("tls", f"{path} cannot be read: does it exist, and may this user read it?")
