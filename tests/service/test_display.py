@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ import pytest
 
 from nedbus.cli.progress import what_to_type
 from nedbus.transport import DEFAULT_ENDPOINT
-from tests.conftest import DEADLINE, free_endpoint, wait_for
+from tests.conftest import DEADLINE, Start, free_endpoint, free_port, wait_for
 from tests.ulogs import write_log
 
 
@@ -26,6 +27,22 @@ def test_hint_needs_no_flag_that_it_lacks() -> None:
     for endpoint in ("tls/a:1", "quic/a:1"):
         hint = f"Readers at {endpoint} need a certificate of their own: docs/security.md"
         assert what_to_type([endpoint]) == hint
+
+
+def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
+    """This host gets a command with loopback, other hosts one with an address of this host, and both work."""
+    port = free_port()
+    service = run_nedbus("serve", "--listen", f"tcp/0.0.0.0:{port}", "-s", "sim:")
+    wait_for(lambda: "On another host" in service.err, what="the hint")
+    here, elsewhere = re.findall(r"nedbus list -c (\S+)", service.err)
+    assert here == f"tcp/127.0.0.1:{port}"
+    assert not re.search(r"/(0\.0\.0\.0|127\.|localhost)", elsewhere)
+    for endpoint in (here, elsewhere):
+        listed = run_nedbus("get", "--wait", "-c", endpoint)
+        assert listed.wait() == 0, listed.err
+    assert " list  what" in what_to_type(["tcp/0.0.0.0:7447"])
+    assert re.search(r"^  nedbus list -c tcp/\S+:7448$", what_to_type(["tcp/[::]:7448"]).splitlines()[-1])
+    assert "On another host" not in what_to_type(["tcp/192.0.2.1:7447"])
 
 
 @pytest.mark.process

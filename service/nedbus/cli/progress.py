@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import socket
 import sys
 import time
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from nedbus.daemon import Daemon, SourceStatus
 from nedbus.log_event import about
-from nedbus.transport import DEFAULT_ENDPOINT
+from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 from nedbus_msgs import DEFAULT_TOPIC
 
 from .format import to_line, to_text
@@ -32,6 +33,9 @@ _HINT: Final = """In a second terminal:
   {nedbus} echo{where}  messages as they arrive, a line each
   {nedbus} hz{where}    rate, jitter, latency, loss
   {nedbus} get{where}   all fields of the last message"""
+_ELSEWHERE: Final = """
+On another host:
+  nedbus list -c {endpoint}"""
 _TLS_HINT: Final = "Readers at {endpoint} need a certificate of their own: docs/security.md"
 _ENCRYPTED: Final = ("tls/", "quic/")
 
@@ -144,12 +148,25 @@ class Display:
 
 def what_to_type(endpoints: Sequence[str]) -> str:
     """Return what to type in a second terminal; it has not the certificate of this service, and must not need it."""
-    if DEFAULT_ENDPOINT in endpoints:
-        return _HINT.format(nedbus=_program(), where="")
     plain = [each for each in endpoints if not each.startswith(_ENCRYPTED)]
     if not plain:
         return _TLS_HINT.format(endpoint=endpoints[0])
-    return _HINT.format(nedbus=_program(), where=f" -c {plain[0]}")
+    here = [dial_endpoint(each) for each in plain]
+    hint = _HINT.format(nedbus=_program(), where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")
+    anywhere = next((each for each, dialled in zip(plain, here, strict=True) if each != dialled), None)
+    return hint if anywhere is None else hint + _ELSEWHERE.format(endpoint=_from_elsewhere(anywhere))
+
+
+def _from_elsewhere(endpoint: str) -> str:
+    """Return where another host connects to what listens on all addresses: at that of the default route, if any."""
+    family, target, wildcard = socket.AF_INET, "192.0.2.1", "/0.0.0.0:"
+    if "/[::]:" in endpoint:
+        family, target, wildcard = socket.AF_INET6, "2001:db8::1", "/[::]:"
+    host = socket.gethostname()
+    with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((target, 9))  # of UDP: nothing is sent
+        host = str(probe.getsockname()[0])
+    return endpoint.replace(wildcard, f"/[{host}]:" if ":" in host else f"/{host}:")
 
 
 def _program() -> str:
