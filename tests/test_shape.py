@@ -25,7 +25,7 @@ FLOORS = [
 # Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
 ONLY: dict[str, set[str]] = {
     "zenoh": {
-        "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries",
+        "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries", "nedbus/transport/refusals",
         "nedbus/client/channels", "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
         "nedbus/client/acknowledgement", "nedbus/client/recovery", "nedbus/client/rejections",

@@ -6,6 +6,7 @@ import re
 import stat
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -273,6 +274,44 @@ def test_missing_certificate_is_named(run_nedbus: Start, tmp_path: Path) -> None
     router = run_nedbus("router", str(file))
     assert router.wait() == 2
     assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: does it exist", router.err)
+
+
+@pytest.mark.parametrize(
+    ("command", "environment"),
+    [(("router",), {}), (("serve", "-s", "sim:", "--router-config"), {"RUST_LOG": "zenoh=info"})],
+    ids=["router", "service"],
+)
+def test_refused_clients_are_logged(
+    run_nedbus: Start, pki: Path, tmp_path: Path, *, command: tuple[str, ...], environment: dict[str, str]
+) -> None:
+    """A router tells why it refuses a client, on stderr as all its log; what RUST_LOG asks of Zenoh is on stdout."""
+    file, endpoint = tmp_path / "secure.json5", free_endpoint().replace("tcp/", "tls/")
+    text = (CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(pki))
+    file.write_text(text.replace("tls/0.0.0.0:7447", endpoint))
+    router = run_nedbus(*command, str(file), **environment)
+    wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
+    with nedbus.connect(endpoint, tls=nedbus.Tls(pki / "ca.crt", pki / "reader.crt", pki / "reader.key")) as bus:
+        assert bus.connected
+    assert "refused" not in router.err
+
+    def logged(line: str) -> bool:
+        return line in router.err
+
+    for name, ca, reason in (
+        ("foreign/reader", "ca.crt", "its certificate is of another authority"),
+        ("expired", "ca.crt", "its certificate has expired"),
+        (None, "ca.crt", "it shows no certificate"),
+        ("reader", "foreign/ca.crt", "it does not accept the certificate of this router"),
+    ):
+        own = (pki / f"{name}.crt", pki / f"{name}.key") if name else (None, None)
+        with pytest.raises(nedbus.ConnectError):
+            nedbus.connect(endpoint, tls=nedbus.Tls(pki / ca, *own), timeout=0.1)
+        wait_for(partial(logged, f"WARNING a client is refused: {reason}\n"), what=reason)
+    with pytest.raises(nedbus.ConnectError):
+        nedbus.connect(endpoint.replace("tls/", "tcp/"), timeout=0.1)
+    wait_for(partial(logged, "a client is refused: it does not speak TLS\n"), what="the client without TLS")
+    assert ("Zenoh can be reached at" in router.out) == bool(environment)
+    assert "certificate" not in router.out
 
 
 def test_open_router_file_works() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ from nedbus.log_event import about
 from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, open_router, router_endpoints
+from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
 
 from .check import report_mistakes
 from .http import serve_pages
@@ -88,6 +88,8 @@ def serve(
         return
     settings = load_settings(config, **given)
     daemon = Daemon(settings, version=__version__)
+    if daemon.role == "router":
+        _log_refusals(daemon.endpoints)
     with ExitStack() as closing:
         if settings.http is not None:
             closing.enter_context(serve_pages(settings.http, service_pages(daemon)))
@@ -107,6 +109,12 @@ def serve(
         )
     if exit_code is not None:
         raise typer.Exit(exit_code)
+
+
+def _log_refusals(endpoints: Sequence[str]) -> None:
+    """Log whom a router refuses that listens here, if any of these endpoints asks for certificates."""
+    if any(endpoint.startswith("tls/") for endpoint in endpoints):
+        log_refusals()
 
 
 def _reload(daemon: Daemon, notifier: Notifier, config: Path | None, given: Mapping[str, object]) -> None:
@@ -144,9 +152,11 @@ def router(
     tls = settings.tls if routers else None
 
     def run(stop: threading.Event) -> None:
+        where = router_endpoints(endpoints, config_file)
+        _log_refusals(where)
         session = open_router(listen=endpoints, connect=routers, config_file=config_file, tls=tls)
         joining = f", joining {', '.join(routers)}" if routers else ""
-        _log.info("router on %s%s", ", ".join(router_endpoints(endpoints, config_file)), joining, extra=about("router"))
+        _log.info("router on %s%s", ", ".join(where), joining, extra=about("router"))
         uplinks = Uplinks(session, routers, tls=tls)
         while not stop.wait(UPLINK_POLL if routers else None):
             uplinks.check()

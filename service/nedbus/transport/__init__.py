@@ -20,6 +20,7 @@ from .queries import (
     follow_heartbeats,
     query,
 )
+from .refusals import log_refusals
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     NO_HASH,
@@ -107,6 +108,7 @@ __all__ = [
     "gid_of_token",
     "is_forked",
     "list_certificates",
+    "log_refusals",
     "make_authority",
     "make_bundle",
     "make_certificate",
