@@ -1,19 +1,36 @@
-"""Raise an alarm when a vehicle has no valid position, or when nothing arrives for 1 s; say when it is good again."""
+"""Raise an alarm when a vehicle's position is in doubt, or nothing arrives for 1 s; say when it is good again."""
 
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 
 import nedbus
 
-vehicle = sys.argv[1] if len(sys.argv) > 1 else "1"
-state = ""
-with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe(vehicle=vehicle) as subscription:
-    while True:  # the subscription outlives its service, and its router: it goes on when they are back
-        try:
-            message = subscription.receive(timeout=1.0).message
-            found = "good" if message.xy_valid else "ALARM: xy_valid is false"
-        except nedbus.NoDataError:
-            found = "ALARM: nothing arrived for 1 s"
-        if found != state:
-            state = found
-            print(f"vehicle {vehicle}: {state}", flush=True)
+GOOD = {"xy_valid": True, "z_valid": True, "v_xy_valid": True, "v_z_valid": True, "dead_reckoning": False}
+
+
+def states(vehicle: str) -> Iterator[str]:
+    """Yield the state of a vehicle with each of its messages, and for each second without one."""
+    try:
+        bus = nedbus.connect()
+    except nedbus.ConnectError as exc:
+        yield f"ALARM: {exc}"
+        bus = nedbus.connect(timeout=None)  # until there is a router
+    with bus, bus.subscribe(vehicle=vehicle) as subscription:
+        while True:  # the subscription outlives its service, and its router: it goes on when they are back
+            try:
+                message = subscription.receive(timeout=1.0).message
+            except nedbus.NoDataError:
+                yield "ALARM: nothing arrived for 1 s"
+            else:
+                doubts = [f"{flag} is {not good}" for flag, good in GOOD.items() if getattr(message, flag) != good]
+                yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
+
+
+with suppress(KeyboardInterrupt):
+    watched = sys.argv[1] if len(sys.argv) > 1 else "1"
+    shown = ""
+    for state in states(watched):
+        if state != shown:
+            shown = state
+            print(f"vehicle {watched}: {state}", flush=True)

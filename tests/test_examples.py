@@ -72,7 +72,7 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
 
 
 def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
-    """examples/alarm.py: the service, which is the router too, is killed and started again; alarm, then good again."""
+    """examples/alarm.py waits for the service, which is the router too, at its start and when it was killed."""
     endpoint = free_endpoint()
     states = ["vehicle 1: good", "vehicle 1: ALARM: nothing arrived for 1 s", "vehicle 1: good"]
 
@@ -81,8 +81,9 @@ def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Pat
         wait_for(lambda: "router on" in service.err, what="the router")
         return service
 
-    service = serve()
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
+    wait_for(lambda: f"vehicle 1: ALARM: nothing answers at {endpoint}" in alarm.out, what="the alarm of no router")
+    service = serve()
     wait_for(lambda: alarm.out.splitlines()[-1:] == states[:1], what="the first message")
     service.kill()
     wait_for(lambda: alarm.out.splitlines()[-2:] == states[:2], what="the alarm")
@@ -93,17 +94,25 @@ def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Pat
 
 
 def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
-    """examples/alarm.py: xy_valid goes false and true again, and each is said once."""
+    """examples/alarm.py names each flag that casts doubt on a position, once."""
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
     publisher = bus.publisher("vehicle_local_position", vehicle="1")
+    numbers = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
+    valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
 
-    def is_said(text: str, *, valid: bool) -> bool:
-        publisher.publish(message(1, x=0.0, y=0.0, xy_valid=valid))
+    def is_said(text: str, flags: dict[str, bool]) -> bool:
+        publisher.publish(message(1, **numbers, **valid | flags))
         return alarm.out.rstrip().endswith(text)
 
-    for text, valid in (("good", True), ("ALARM: xy_valid is false", False), ("good", True)):
-        wait_for(lambda text=text, valid=valid: is_said(text, valid=valid), what=text)  # type: ignore[misc]
-    assert alarm.out.count("xy_valid is false") == 1
+    for text, flags in (
+        ("good", {}),
+        ("ALARM: xy_valid is false", {"xy_valid": False}),
+        ("good", {}),
+        ("ALARM: z_valid is false, dead_reckoning is true", {"z_valid": False, "dead_reckoning": True}),
+        ("ALARM: v_xy_valid is false, v_z_valid is false", {"v_xy_valid": False, "v_z_valid": False}),
+    ):
+        wait_for(lambda text=text, flags=flags: is_said(text, flags), what=text)  # type: ignore[misc]
+    assert alarm.out.count("xy_valid is false") == 2
 
 
 def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:

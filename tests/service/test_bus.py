@@ -16,6 +16,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import cast
 
@@ -405,6 +406,28 @@ def test_nothing_listening_is_a_clear_error() -> None:
     ) as info:
         nedbus.connect(where, timeout=0.1)
     assert isinstance(info.value, ConnectionError)
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
+    """`timeout=None` waits for a router, for as long as it takes."""
+    where = free_endpoint()
+
+    async def connect_async() -> bool:
+        async with nedbus.connect_async(where, timeout=None) as bus:
+            return bus.connected
+
+    def connect() -> bool:
+        with nedbus.connect(where, timeout=None) as bus:
+            return bus.connected
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit((lambda: asyncio.run(connect_async())) if is_async else connect)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.5)
+        router = open_router(listen=(where,))
+        assert waiting.result(DEADLINE)
+    router.close()
 
 
 def test_second_endpoint_is_taken_when_the_first_is_dead(endpoint: str) -> None:

@@ -119,13 +119,28 @@ for sample in subscription:
     assert time.monotonic() - signalled < LIMIT
 
 
-def test_signal_ends_a_script_that_waits_for_a_router(start: Start) -> None:
+WAITS = {
+    "connect": """
+print("ready", flush=True)
+nedbus.connect("tcp/127.0.0.1:1", timeout=TIMEOUT)""",
+    "connect_async": """
+async def main():
+    print("ready", flush=True)
+    async with nedbus.connect_async("tcp/127.0.0.1:1", timeout=TIMEOUT):
+        pass
+asyncio.run(main())""",
+}
+
+
+@pytest.mark.parametrize("timeout", [600, None])
+@pytest.mark.parametrize("how", WAITS)
+def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, timeout: float | None) -> None:
     """Ctrl-C ends the wait for a router that is not there."""
-    code = 'import nedbus; nedbus.connect; print("ready", flush=True); nedbus.connect("tcp/127.0.0.1:1", timeout=600)'
-    process = start("-c", code, measured=False)
+    code = "import asyncio, nedbus; nedbus.connect"
+    process = start("-c", code + WAITS[how].replace("TIMEOUT", repr(timeout)), measured=False)
     wait_for(lambda: "ready" in process.out, what="the script")
     process.signal(signal.SIGINT)
-    assert process.wait() == -signal.SIGINT
+    assert process.wait() == -signal.SIGINT, process.err
 
 
 def test_vehicle_of_a_killed_script_is_gone(start: Start, endpoint: str, bus: nedbus.Bus) -> None:

@@ -147,7 +147,7 @@ def _open_bus(
         if not wait:
             raise
         write_stderr(f"{exc}; waiting")
-    return connect_with(settings, timeout=float("inf"))
+    return connect_with(settings, timeout=None)
 
 
 _BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Callable
 from typing import Self
 
@@ -22,7 +23,7 @@ class AsyncBus:
     Of `open_session` there is no twin, as Zenoh's sessions block.
     """
 
-    def __init__(self, open_bus: Callable[[], Bus]) -> None:
+    def __init__(self, open_bus: Callable[[threading.Event], Bus]) -> None:
         self._open_bus = open_bus
         self._bus: Bus | None = None
 
@@ -103,7 +104,12 @@ class AsyncBus:
             await asyncio.to_thread(self._bus.close)
 
     async def __aenter__(self) -> Self:
-        self._bus = await asyncio.to_thread(self._open_bus)
+        cancelled = threading.Event()
+        try:
+            self._bus = await asyncio.to_thread(self._open_bus, cancelled)
+        except asyncio.CancelledError:
+            cancelled.set()  # the thread would try on, and Python waits for it
+            raise
         return self
 
     async def __aexit__(self, *exc: object) -> None:

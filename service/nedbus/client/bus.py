@@ -153,7 +153,7 @@ class Bus:
         self._publishers.is_alive(address)  # what was declared before an answer came is known to whoever gave it
         return publisher
 
-    def open_session(self, endpoint: str | None = None, *, timeout: float = 3.0) -> Session:
+    def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
         """Open another Zenoh session at the same routers, or at another one; the caller closes it."""
         return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
 

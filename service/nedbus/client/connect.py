@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from nedbus.settings import Settings, load_settings
@@ -16,7 +16,7 @@ from .bus import Bus
 def connect(
     endpoint: str | Sequence[str] | None = None,
     *,
-    timeout: float = 3.0,
+    timeout: float | None = 3.0,
     prefix: str | None = None,
     tls: Tls | None = None,
     config: str | Path | None = None,
@@ -26,7 +26,8 @@ def connect(
     `endpoint` is Zenoh's, such as tcp/192.168.1.5:7447, or several of which the first that answers is taken.
     Without it, NEDBUS_CONNECT or `connect` in nedbus.toml decides, else the router that `nedbus serve` starts on this
     host.
-    `timeout` is how long to try, in seconds; later breaks of the link are reconnected by themselves.
+    `timeout` is how long to try, in seconds; None waits for a router for ever, until Ctrl-C.
+    Later breaks of the link are reconnected by themselves.
     `tls` is for tls/ endpoints; without it, the settings decide.
     `config` names a file instead of nedbus.toml.
 
@@ -38,16 +39,27 @@ def connect(
 def connect_async(
     endpoint: str | Sequence[str] | None = None,
     *,
-    timeout: float = 3.0,
+    timeout: float | None = 3.0,
     prefix: str | None = None,
     tls: Tls | None = None,
     config: str | Path | None = None,
 ) -> AsyncBus:
     """Return a bus for asyncio, to be opened with `async with`; arguments and errors are those of `connect`."""
-    return AsyncBus(partial(connect, endpoint, timeout=timeout, prefix=prefix, tls=tls, config=config))
+
+    def open_bus(stop: threading.Event) -> Bus:
+        settings = load_settings(config, connect=endpoint, prefix=prefix)
+        return connect_with(settings, timeout=timeout, tls=tls, stop=stop)
+
+    return AsyncBus(open_bus)
 
 
-def connect_with(settings: Settings, *, timeout: float, tls: Tls | None = None) -> Bus:
-    """Connect as settings say, with `tls` in place of theirs if it is given; errors are those of `connect`."""
+def connect_with(
+    settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
+) -> Bus:
+    """Connect as settings say, with `tls` in place of theirs if it is given; errors are those of `connect`.
+
+    Setting `stop` ends the wait for a router, with ConnectError.
+    """
     routers, tls = settings.routers, tls or settings.tls
-    return Bus(open_client(routers, timeout=timeout, tls=tls), routers=routers, prefix=settings.prefix, tls=tls)
+    session = open_client(routers, timeout=timeout, tls=tls, stop=stop)
+    return Bus(session, routers=routers, prefix=settings.prefix, tls=tls)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import re
@@ -78,14 +79,14 @@ def open_session(config: zenoh.Config) -> Session:
 
 
 def open_client(
-    endpoints: Sequence[str], *, timeout: float, tls: Tls | None = None, stop: threading.Event | None = None
+    endpoints: Sequence[str], *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
 ) -> Session:
     """Open a session as a client of the first router that answers; Ctrl-C, or setting `stop`, ends the wait.
 
     It reconnects by itself whenever the link breaks.
 
-    Raises ConnectError when no endpoint answers within `timeout` seconds, ConfigError for a malformed endpoint or a
-    TLS file that cannot be read.
+    Raises ConnectError when no endpoint answers within `timeout` seconds (never, if it is None), ConfigError for a
+    malformed endpoint or a TLS file that cannot be read.
     """
     check_endpoints(endpoints, where="connect")
     settings: dict[str, object] = {
@@ -100,6 +101,7 @@ def open_client(
         "transport/link/rx/max_message_size": 2**18,
     }
     start, reason = time.monotonic(), ""
+    timeout = math.inf if timeout is None else timeout
     stop = stop or threading.Event()
     for pause in chain(_PAUSES, repeat(1.0)):
         # An endpoint that accepts and then sends nothing may not use up much more than the time that there is; but the
