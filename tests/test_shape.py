@@ -252,6 +252,18 @@ def test_what_is_not_used_is_not_loaded(start: Start, program: str, absent: str)
     assert process.wait() == 0, process.err
 
 
+def test_names_are_completed_before_they_are_loaded(start: Start) -> None:
+    """dir() of a fresh import has all public names, and loads nothing, so that a plain REPL completes them."""
+    program = """
+import sys, nedbus, rlcompleter
+assert [name for name in dir(nedbus) if name[:2] != "__"] == sorted(nedbus.__all__) and "__version__" in dir(nedbus)
+assert "zenoh" not in sys.modules
+assert rlcompleter.Completer(globals()).complete("nedbus.connect_", 0).startswith("nedbus.connect_async")
+"""
+    process = start("-c", program)
+    assert process.wait() == 0, process.err
+
+
 def test_error_tree_is_drawn() -> None:
     """The docstring of nedbus.errors draws every error, with the built-in error that each one also is."""
     errors = importlib.import_module("nedbus.errors")

@@ -211,7 +211,10 @@ def vehicle_name(vehicle: str | int) -> str:
 
 def check_vehicle(vehicle: object) -> None:
     """Raise AddressError for an invalid name of a vehicle."""
-    if not isinstance(vehicle, str) or not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
+    if not isinstance(vehicle, str):
+        expected = 'one name, such as "7": several vehicles need a call each, or "*" where all are read'
+        raise AddressError("vehicle", vehicle, expected)
+    if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
 
 

@@ -168,6 +168,11 @@ _WITH_NUMPY = {
 }
 
 
+def __dir__() -> list[str]:
+    """Return the public names, loaded or not, for completion."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
+
+
 if not TYPE_CHECKING:  # else type checkers would accept any name
 
     def __getattr__(name: str) -> object:

@@ -394,6 +394,10 @@ def test_wrong_names_are_refused_before_anything_is_sent(client: Client) -> None
         client.subscribe("vehicle_local_positon")
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
+    with pytest.raises(
+        nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .* several vehicles need a call each"
+    ):
+        client.subscribe(vehicle=["1", "2"])  # type: ignore[arg-type] # that is the mistake
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")
 

@@ -46,6 +46,7 @@ def test_recording_is_an_array(flight: Path) -> None:
     assert len(array) == len(expected) == 2000
     assert all(to_message(element) == each for element, each in zip(array[::100], expected[::100], strict=True))
     assert nedbus.read(flight, "estimator_local_position", instance=1)["timestamp"][0] == array["timestamp"][0]
+    assert nedbus.read(flight, vehicle=1).tobytes() == array.tobytes()
 
 
 @pytest.mark.logs
@@ -64,8 +65,8 @@ def test_real_log_is_an_array(log: Path) -> None:
 def test_frames_have_named_columns(flight: Path) -> None:
     """A data frame of either package has all columns, with the same values and types."""
     array = nedbus.read(flight)
-    panda = nedbus.read(flight, frame="pandas")
-    bear = nedbus.read(flight, frame="polars")
+    panda = nedbus.read(flight, dataframe="pandas")
+    bear = nedbus.read(flight, dataframe="polars")
     assert isinstance(panda, pd.DataFrame)
     assert isinstance(bear, pl.DataFrame)
     assert list(panda.columns) == bear.columns
@@ -150,7 +151,7 @@ def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.Mo
     """Without pandas, or without mcap, the error names the package to install."""
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):
-        nedbus.read(flight, frame="pandas")
+        nedbus.read(flight, dataframe="pandas")
     for name in ("reader", "chunks"):
         monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
@@ -296,8 +297,8 @@ def test_missing_fields_are_named(tmp_path: Path) -> None:
     assert not {"x", "xy_valid", "hagl_max_z", "hagl_max_xy"} & missing
     for kept in (array[1:3], array[array["x"] > 0], array.copy(), np.sort(array, order="timestamp"), array[0]):
         assert nedbus.missing_of(kept) == missing
-    panda = nedbus.read(path, frame="pandas")
-    bear = nedbus.read(path, frame="polars")
+    panda = nedbus.read(path, dataframe="pandas")
+    bear = nedbus.read(path, dataframe="polars")
     assert panda.attrs["missing"] == sorted(missing)
     for name in ("dead_reckoning", "heading_var", "dist_bottom_reset_counter"):
         assert panda[name].isna().all()
@@ -317,8 +318,8 @@ def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
         for row, provenance in zip((array[:1], array[1:]), (Provenance("sim"), without), strict=True):
             writer.write(row, [(Address("1", VLP), provenance)], logged=[1], published=[1])
     assert nedbus.missing_of(nedbus.read(path)) == without.missing
-    assert nedbus.read(path, frame="pandas")["dead_reckoning"].isna().tolist() == [False, True]
-    bear = nedbus.read(path, frame="polars")
+    assert nedbus.read(path, dataframe="pandas")["dead_reckoning"].isna().tolist() == [False, True]
+    bear = nedbus.read(path, dataframe="polars")
     assert bear["delta_xy[1]"].is_null().to_list() == [False, True]
     assert bear["eph"].to_list() == [1.0, None]
 
@@ -339,7 +340,7 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     scope: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", recordings, re.DOTALL):
         exec(block, scope)  # noqa: S102 - our own page
-    assert isinstance(scope["frame"], pd.DataFrame)
+    assert isinstance(scope["estimates"], pd.DataFrame)
     assert pd.read_csv(flight.with_name("flight.csv"))["x"].tolist() == [2.5]
     assert 0.0 < float(str(scope["rms"])) < 30.0
 
@@ -375,7 +376,7 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_unknown_frame_is_refused(flight: Path) -> None:
     """A misspelt frame is not something to install."""
     with pytest.raises(ConfigError, match="'foo' is neither pandas nor polars"):
-        nedbus.read(flight, frame="foo")  # type: ignore[call-overload] # that is the mistake
+        nedbus.read(flight, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
 
 
 def test_plot_that_cannot_be_written_is_an_error(run_nedbus: Start, flight: Path, tmp_path: Path) -> None:

@@ -379,11 +379,11 @@ def test_recording_of_nothing_is_said(run_nedbus: Start, endpoint: str, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["convert", "a.ulg", "x.csv"], '; for a table: nedbus.read("a.ulg", frame="pandas").to_csv("x.csv")'),
+        (["convert", "a.ulg", "x.csv"], '; for a table: nedbus.read("a.ulg", dataframe="pandas").to_csv("x.csv")'),
         (["convert", "a.ulg", "b.png"], "; for a picture: nedbus plot a.ulg -o b.png"),
         (["convert", "a.ulg", "b"], ""),
         (["record", "-o", "a.txt"], ""),
-        (["record", "-o", "a.csv"], '; for a table: nedbus.read("flight.mcap", frame="pandas").to_csv("a.csv")'),
+        (["record", "-o", "a.csv"], '; for a table: nedbus.read("flight.mcap", dataframe="pandas").to_csv("a.csv")'),
     ],
 )
 def test_other_suffix_is_refused(

@@ -78,8 +78,8 @@ async def read_and_publish() -> None:
 
 def read() -> None:
     """An array, or a frame of the library that is asked for."""
-    assert_type(nedbus.read("flight.ulg"), nedbus.MessageArray)
-    assert_type(nedbus.read("flight.ulg", frame="pandas"), pd.DataFrame)
-    nedbus.read("flight.ulg", frame="arrow")  # type: ignore[call-overload] # pandas or polars
+    assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)
+    assert_type(nedbus.read("flight.ulg", dataframe="pandas"), pd.DataFrame)
+    nedbus.read("flight.ulg", dataframe="arrow")  # type: ignore[call-overload] # pandas or polars
     nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # tls=Tls(...)
     nedbus.raed  # type: ignore[attr-defined] # no such name

@@ -27,6 +27,7 @@ from nedbus_msgs import (
     decode_cdr,
     upgrade,
     upgraded_names,
+    vehicle_name,
 )
 from nedbus_msgs.arrays import DTYPE, MessageArray, decode_cdr_array, to_array, valid_mask
 
@@ -52,44 +53,54 @@ Absent = Mapping[str, _Mask]
 
 @overload
 def read(
-    path: str | Path, topic: str = ..., *, vehicle: str = ..., instance: int | None = ..., frame: None = None
+    path: str | Path, topic: str = ..., *, vehicle: str | int = ..., instance: int | None = ..., dataframe: None = None
 ) -> MessageArray: ...
 @overload
 def read(
-    path: str | Path, topic: str = ..., *, vehicle: str = ..., instance: int | None = ..., frame: Literal["pandas"]
+    path: str | Path,
+    topic: str = ...,
+    *,
+    vehicle: str | int = ...,
+    instance: int | None = ...,
+    dataframe: Literal["pandas"],
 ) -> pd.DataFrame: ...
 @overload
 def read(
-    path: str | Path, topic: str = ..., *, vehicle: str = ..., instance: int | None = ..., frame: Literal["polars"]
+    path: str | Path,
+    topic: str = ...,
+    *,
+    vehicle: str | int = ...,
+    instance: int | None = ...,
+    dataframe: Literal["polars"],
 ) -> pl.DataFrame: ...
 def read(
     path: str | Path,
     topic: str = DEFAULT_TOPIC,
     *,
-    vehicle: str = ANY,
+    vehicle: str | int = ANY,
     instance: int | None = None,
-    frame: Literal["pandas", "polars"] | None = None,
+    dataframe: Literal["pandas", "polars"] | None = None,
 ) -> Any:
     """Return one topic of a .ulg log or an .mcap recording as a structured array, one element a message.
 
     Its columns are the fields of VehicleLocalPosition with PX4's types (`nedbus.DTYPE`).
     Fields that a layout or a source lacks are NaN, false or 0, and `nedbus.missing_of` names them.
     Invalid messages are left out, and so is what is damaged; both are logged.
-    With `frame` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
+    With `dataframe` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
     missing fields are null; that of pandas names them in `attrs["missing"]`.
 
     Raises SourceError for a file that cannot be read, AddressError when no stream, or more than one, matches topic,
     vehicle and instance, ConfigError when the package that reads the file is not installed.
     """
-    if frame not in (None, "pandas", "polars"):
-        raise ConfigError("frame", f"{frame!r} is neither pandas nor polars")
+    if dataframe not in (None, "pandas", "polars"):
+        raise ConfigError("dataframe", f"{dataframe!r} is neither pandas nor polars")
     path = Path(path).expanduser()
-    selection = Selection(topic, vehicle, instance)
+    selection = Selection(topic, vehicle_name(vehicle), instance)
     with Flight(path) as flight:
         messages, absent = flight.read(the_one(path, flight.addresses, selection))
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
-    return messages if frame is None else _frame(messages, absent, frame)
+    return messages if dataframe is None else _to_dataframe(messages, absent, dataframe)
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
@@ -201,8 +212,8 @@ def _decode(chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, npt.NDArray
     return array, valid
 
 
-def _frame(messages: MessageArray, absent: Absent, frame: str) -> Any:
-    package = needs(frame, frame)
+def _to_dataframe(messages: MessageArray, absent: Absent, library: str) -> Any:
+    package = needs(library, library)
     columns: dict[str, Any] = {}
     for name, kind in FIELD_TYPES.items():
         parts = [f"{name}[0]", f"{name}[1]"] if kind == "float32[2]" else [name]
@@ -210,11 +221,11 @@ def _frame(messages: MessageArray, absent: Absent, frame: str) -> Any:
             column = np.ascontiguousarray(values)
             if name not in absent:
                 columns[part] = column
-            elif frame == "polars":
+            elif library == "polars":
                 columns[part] = package.Series(column).scatter(np.flatnonzero(absent[name]), None)
             else:
                 columns[part] = package.Series(column, dtype=_NULLABLE.get(kind, column.dtype)).mask(absent[name])
     data = package.DataFrame(columns)
-    if frame == "pandas":
+    if library == "pandas":
         data.attrs["missing"] = sorted(absent)
     return data

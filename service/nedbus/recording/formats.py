@@ -28,7 +28,7 @@ def check_recording(path: Path, *, flight: str) -> None:
     if SUFFIXES.get(path.suffix) == "mcap":
         return
     hints = {
-        ".csv": f'; for a table: nedbus.read("{flight}", frame="pandas").to_csv("{path.name}")',
+        ".csv": f'; for a table: nedbus.read("{flight}", dataframe="pandas").to_csv("{path.name}")',
         **dict.fromkeys((".png", ".svg", ".pdf"), f"; for a picture: nedbus plot {flight} -o {path.name}"),
     }
     raise ConfigError(str(path), f"expected a recording: a file that ends with .mcap{hints.get(path.suffix, '')}")
