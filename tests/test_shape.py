@@ -51,11 +51,11 @@ ONLY: dict[str, set[str]] = {
     "pydantic": {
         "nedbus_msgs/position", "nedbus_msgs/px4_types", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
         "nedbus/settings/model", "nedbus/settings/load", "nedbus/sources/options", "nedbus/sources/spec",
-        "nedbus/daemon/output",
-        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status", "nedbus/web/playback",
+        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status",
     },
     "pydantic_core": {
-        "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus/client/publisher_registry",
+        "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
+        "nedbus/client/publisher_registry",
         "nedbus/settings/load",
     },
     "pydantic_settings": {"nedbus/settings/model", "nedbus/settings/load"},

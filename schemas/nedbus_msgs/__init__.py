@@ -1,7 +1,15 @@
 """The contract of nedbus: the message, its layouts, its topics and its wire format; no I/O, no Zenoh."""
 
 from .cdr import decode_cdr, encode_cdr
-from .errors import AddressError, DecodeError, EncodeError, LayoutError, NedbusError, UnknownLayoutError
+from .errors import (
+    AddressError,
+    DecodeError,
+    EncodeError,
+    InvalidMessageError,
+    LayoutError,
+    NedbusError,
+    UnknownLayoutError,
+)
 from .flags import DOUBT_FLAGS, FLAGS, Flag, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
@@ -36,7 +44,7 @@ from .provenance import Provenance, encoding_of, provenance_of
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2_topics import ros2_topic_of, split_ros2_topic
 from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, message_definition, type_hash
-from .rows import FIELD_TYPES, Row
+from .rows import FIELD_TYPES, Row, explain_unknown_field
 from .schema import json_schema, layout_table
 from .topics import (
     ANY,
@@ -85,6 +93,7 @@ __all__ = [
     "EncodeError",
     "Flag",
     "GlobalPosition",
+    "InvalidMessageError",
     "Layout",
     "LayoutError",
     "MapProjection",
@@ -119,6 +128,7 @@ __all__ = [
     "encode_row",
     "encoding_of",
     "enu_to_ned",
+    "explain_unknown_field",
     "find_layout",
     "flu_to_frd",
     "frd_to_flu",

@@ -15,13 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from .cdr import cdr_offsets
+from .errors import InvalidMessageError
 from .flags import FLAGS
 from .layouts import CURRENT
 from .position import VehicleLocalPosition
 from .px4_types import TypeName
 from .rows import FIELD_TYPES, NAMES, Values
 from .rules import NOT_NEGATIVE, RULED_FIELDS, WITHIN, make_fast_check
-from .wire import PAYLOAD_SIZE, TAG_MASK, TAGS, value_offsets
+from .wire import PAYLOAD_SIZE, TAG_MASK, TAGS, encode_row, value_offsets
 
 MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
@@ -165,6 +166,15 @@ def valid_mask(array: MessageArray) -> npt.NDArray[np.bool_]:
     for name, bound in WITHIN.items():
         invalid |= np.abs(array[name]) > bound
     return ~invalid
+
+
+def require_valid(array: MessageArray) -> None:
+    """Raise InvalidMessageError for the first message that breaks a rule between fields, with its index."""
+    for index in np.flatnonzero(~valid_mask(array)).tolist():
+        try:
+            encode_row(to_row(array[index]))
+        except InvalidMessageError as exc:
+            raise InvalidMessageError(exc.reason, exc.violations, index=index) from exc
 
 
 def to_array(messages: Sequence[VehicleLocalPosition]) -> MessageArray:

@@ -56,6 +56,21 @@ class UnknownLayoutError(DecodeError):
         self.known = tuple(known)
 
 
+class InvalidMessageError(NedbusError, ValueError):
+    """Raised when a message that is published has a wrong type, an unknown field, or breaks a rule.
+
+    `reason` is one line: each field, what is wrong with it, and its value.
+    `violations` has the field and the rule of each, without the value; `index` is the message's in an array.
+    """
+
+    def __init__(self, reason: str, violations: Sequence[tuple[str, str]], *, index: int | None = None) -> None:
+        where = "" if index is None else f" at index {index}"
+        super().__init__(f"not a valid VehicleLocalPosition{where}: {reason}")
+        self.reason = reason
+        self.violations = tuple(violations)
+        self.index = index
+
+
 class EncodeError(NedbusError, ValueError):
     """Raised when values do not fit the types of their fields, because validation was bypassed."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from operator import itemgetter
 from typing import Final, NamedTuple, cast, get_type_hints
@@ -92,6 +93,14 @@ NAMES: Final = Row._fields
 
 values_of: Final = cast("Callable[[Mapping[str, object]], Values]", itemgetter(*NAMES))
 """Return the values of all fields in PX4's order from a mapping that has them; raise KeyError if it lacks one."""
+
+
+def explain_unknown_field(name: str) -> str:
+    """Return what to say of a name that no field has: the names that may have been meant, if there are any."""
+    near = difflib.get_close_matches(name.lower(), FIELD_TYPES, 3, 0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else "'nedbus schema' lists them"
+    return f"there is no field {name!r}: {hint}"
+
 
 TEMPLATE: Final[dict[str, object]] = dict.fromkeys(NAMES)
 """All names in PX4's order: a copy that is filled takes less time than a dict that grows."""

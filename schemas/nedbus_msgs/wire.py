@@ -13,13 +13,14 @@ from typing import Final, cast
 
 import msgpack
 from pydantic import ValidationError
+from pydantic_core import ErrorDetails
 
-from .errors import DecodeError, EncodeError, UnknownLayoutError
+from .errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
 from .fast_path import check_row, passes_rules, row_of
 from .layouts import CURRENT, WIRE_LAYOUTS, upgrade
 from .position import VehicleLocalPosition, message_of
 from .px4_types import TypeName
-from .rows import FIELD_TYPES, NAMES, Row, Values
+from .rows import FIELD_TYPES, NAMES, Row, Values, explain_unknown_field
 
 PAYLOAD_SIZE: Final = 244
 """Bytes of every payload that `encode` returns."""
@@ -72,23 +73,23 @@ def encode(message: VehicleLocalPosition) -> bytes:
 def encode_fields(fields: Mapping[str, object]) -> bytes:
     """Return the 244 bytes of the message with these fields, validated without making a model of them.
 
-    Raises pydantic.ValidationError for an invalid message.
+    Raises InvalidMessageError for an invalid message.
     """
     row = row_of(fields)
-    return encode(VehicleLocalPosition.model_validate(fields)) if row is None else _encode_valid_row(row)
+    return encode(_to_model(fields)) if row is None else _encode_valid_row(row)
 
 
 def encode_row(values: Sequence[object] | Row) -> bytes:
     """Return the 244 bytes of the message with these values of all fields, validated without making a model of them.
 
     The values are in PX4's order.
-    Raises EncodeError for another number of values, pydantic.ValidationError for an invalid message.
+    Raises EncodeError for another number of values, InvalidMessageError for an invalid message.
     """
     values = tuple(values)
     if len(values) != len(NAMES):
         raise EncodeError(f"{len(values)} values, where a row has {len(NAMES)}")
     row = check_row(values)
-    return encode(_to_model(values)) if row is None else _encode_valid_row(row)
+    return encode(_to_model(dict(zip(NAMES, values, strict=True)))) if row is None else _encode_valid_row(row)
 
 
 def decode(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = None) -> VehicleLocalPosition:
@@ -112,10 +113,16 @@ def decode_row(payload: bytes, *, newer: Mapping[int, Sequence[str]] | None = No
 
 def describe(error: ValidationError) -> str:
     """Return a validation error in one line: each field, the reason, and its value."""
-    return "; ".join(
-        f"{'.'.join(map(str, detail['loc']))}: {detail['msg']} (is {detail['input']!r:.40})"
-        for detail in error.errors()
-    )
+    return "; ".join(map(_describe, error.errors(include_url=False)))
+
+
+def _describe(detail: ErrorDetails) -> str:
+    text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+    if detail["type"] == "missing":
+        return text
+    if detail["type"] == "extra_forbidden":
+        text = explain_unknown_field(str(detail["loc"][0]))
+    return f"{text} (is {detail['input']!r:.40})"
 
 
 def _pack(row: Values) -> bytes:
@@ -130,11 +137,15 @@ def _encode_valid_row(row: Values) -> bytes:
     try:
         return _pack(row)
     except OverflowError:  # beyond float32: the model raises the error for it
-        return encode(_to_model(row))
+        return encode(_to_model(dict(zip(NAMES, row, strict=True))))
 
 
-def _to_model(row: Values) -> VehicleLocalPosition:
-    return VehicleLocalPosition.model_validate(dict(zip(NAMES, row, strict=True)))
+def _to_model(fields: Mapping[str, object]) -> VehicleLocalPosition:
+    try:
+        return VehicleLocalPosition.model_validate(dict(fields))
+    except ValidationError as exc:
+        violations = [(str(detail["loc"][0]), detail["msg"]) for detail in exc.errors(include_url=False)]
+        raise InvalidMessageError(describe(exc), violations) from exc
 
 
 def _decode_full_width(payload: bytes) -> Values | None:

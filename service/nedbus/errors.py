@@ -4,6 +4,7 @@
     ├── the caller's arguments
     │   ├── AddressError (ValueError)        a vehicle, topic, instance, key or prefix that is invalid
     │   ├── LayoutError (ValueError)         field names that fit no layout
+    │   ├── InvalidMessageError (ValueError) a message to publish that breaks a rule of its fields
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
     │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
@@ -20,7 +21,7 @@
         │   └── UnknownLayoutError           ... because its layout is newer than this reader
         └── SourceError                      a source that cannot be opened or read
 
-A message that breaks the model's rules raises pydantic.ValidationError where it is made.
+`VehicleLocalPosition(...)` and `to_message` raise Pydantic's own ValidationError, which is a ValueError too.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from nedbus_msgs import (
     AddressError,
     DecodeError,
     EncodeError,
+    InvalidMessageError,
     LayoutError,
     NedbusError,
     UnknownLayoutError,
@@ -48,6 +50,7 @@ __all__ = [
     "DecodeError",
     "EncodeError",
     "ForkError",
+    "InvalidMessageError",
     "LayoutError",
     "ListenError",
     "NedbusError",

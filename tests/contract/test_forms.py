@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import msgpack
@@ -17,9 +19,11 @@ from nedbus_msgs import (
     FIELD_TYPES,
     DecodeError,
     EncodeError,
+    InvalidMessageError,
     VehicleLocalPosition,
     decode,
     decode_row,
+    describe,
     downgrade,
     encode,
     encode_cdr,
@@ -64,10 +68,14 @@ def payload_by_model(fields: Mapping[str, object]) -> bytes | None:
 
 
 def reasons(encode_values: Callable[[Any], bytes], values: object) -> str:
-    """Return the reasons for which these values are rejected."""
-    with pytest.raises(ValidationError) as info:
+    """Return the reasons for which these values are rejected, by the model or by what encodes them."""
+    with pytest.raises((ValidationError, InvalidMessageError)) as info:
         encode_values(values)
-    return str(info.value)
+    error = info.value
+    if isinstance(error, InvalidMessageError):
+        return error.reason
+    assert isinstance(error, ValidationError)
+    return describe(error)
 
 
 @given(messages(), CHANGES)
@@ -99,6 +107,29 @@ def test_model_decides_what_the_fast_path_does_not_accept(changes: dict[str, obj
     )
     if "hagl" not in changes:
         assert reasons(encode_row, list(fields.values())) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"eph": -1.0}, "eph: must not be negative (is -1.0)"),
+        ({"x": "1", "xy_reset_counter": 300}, "x: Input should be a valid number (is '1'); xy_reset_counter: "),
+        ({"delta_xy": (0.0, None)}, "delta_xy.1: Input should be a valid number (is None)"),
+        ({"z_dervi": 1.0}, "there is no field 'z_dervi': did you mean z_deriv or "),
+        ({"Heading": 1.0}, "there is no field 'Heading': did you mean heading or "),
+        ({"temperature": 20.0}, "there is no field 'temperature': 'nedbus schema' lists them (is 20.0)"),
+        ({"timestamp": None}, "timestamp: Field required"),
+    ],
+)
+def test_invalid_message_is_explained(changes: dict[str, object], told: str) -> None:
+    """An error of ours, and a ValueError, names each field, its rule and value, and the field that was meant."""
+    fields = {name: value for name, value in {"timestamp": 1, **changes}.items() if name != "timestamp" or value}
+    with pytest.raises(InvalidMessageError) as info:
+        encode_fields(MappingProxyType(fields))
+    assert str(info.value).startswith(f"not a valid VehicleLocalPosition: {told}")
+    assert isinstance(info.value, ValueError)
+    assert [field for field, _ in info.value.violations] == list(changes)
+    assert str(pickle.loads(pickle.dumps(info.value))) == str(info.value)
 
 
 @given(st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=3)), min_size=1, max_size=5))

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 import msgpack
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 import nedbus
 from nedbus import Batch
@@ -213,12 +212,35 @@ def test_latest_in_batches(bus: nedbus.Bus, endpoint: str) -> None:
                 break
 
 
+def test_invalid_message_is_an_error_of_ours(bus: nedbus.Bus, endpoint: str) -> None:
+    """Every way to publish, blocking or awaited, raises NedbusError for an invalid message, and sends nothing."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    fields = {**message(1).model_dump(), "eph": -1.0}
+    array = to_array([VehicleLocalPosition.model_construct(**fields)])
+    calls: list[tuple[str, object]] = [
+        ("publish", fields), ("publish_row", tuple(fields.values())), ("publish_many", array)
+    ]  # fmt: skip
+    for name, given in calls:
+        with pytest.raises(nedbus.NedbusError, match=r"eph: must not be negative \(is -1.0\)"):
+            getattr(publisher, name)(given)
+
+    async def publish() -> int:
+        async with nedbus.connect_async(endpoint) as other:
+            twin = await other.publisher(VLP, vehicle="2")
+            for name, given in calls:
+                with pytest.raises(nedbus.NedbusError, match=r"eph: must not be negative \(is -1.0\)"):
+                    await getattr(twin, name)(given)
+            return twin.published
+
+    assert publisher.published == asyncio.run(publish()) == 0
+
+
 def test_array_that_is_refused_sends_nothing(bus: nedbus.Bus) -> None:
     """One bad message, or another dtype: an error, and none of the array is sent."""
     publisher = bus.publisher(VLP, vehicle="1")
     messages = to_array([message(1), message(2)])
     messages["eph"][1] = -1.0
-    with pytest.raises(ValidationError, match="eph"):
+    with pytest.raises(nedbus.InvalidMessageError, match=r"at index 1: eph: must not be negative \(is -1.0\)"):
         publisher.publish_many(messages)
     with pytest.raises(TypeError, match="astype"):
         publisher.publish_many(np.zeros(3, [("x", "f4")]))

@@ -170,14 +170,16 @@ def test_rejections_are_counted_by_rule(serve: Serve, pages: Pages, tmp_path: Pa
     log = tmp_path / "flight.ulg"
     writer = UlogWriter()
     writer.define([VLP])
-    for number, fields in enumerate(({}, {"eph": -1.0}, {"epv": -1.0}, {"eph": -2.0}), 1):
+    wrong: tuple[dict[str, object], ...] = ({}, {"eph": -1.0}, {"timestamp_sample": 9}, {"eph": -2.0})
+    for number, fields in enumerate(wrong, 1):
         writer.add(VLP, VehicleLocalPosition.model_construct(**{**message(number).__dict__, **fields}))
     writer.write(log)
     source = f"ulog:{log}"
     serve(source)
     wait_for(lambda: pages.values("nedbus_source_rejected_total", source=source) == [3], what="the rejections")
     rejected = pages.families()["nedbus_messages_rejected"].samples
-    assert {sample.labels["rule"].partition(":")[0]: sample.value for sample in rejected} == {"eph": 2, "epv": 1}
+    rules = {"eph: must not be negative": 2, "timestamp_sample: must not be later than timestamp": 1}
+    assert {sample.labels["rule"]: sample.value for sample in rejected} == rules
     assert pages.values("nedbus_messages_published_total") == [1]
 
 

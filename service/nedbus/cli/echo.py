@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ import typer
 
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
-from nedbus_msgs import ANY, FIELD_TYPES, Address
+from nedbus_msgs import ANY, FIELD_TYPES, Address, explain_unknown_field
 
 from .follow import Link, follow
 from .format import shorten_address, to_csv, to_csv_head, to_fields, to_json, to_line
@@ -117,9 +116,7 @@ def _parse_fields(text: str | None) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
     for name in names:
         if name not in FIELD_TYPES:
-            near = difflib.get_close_matches(name, FIELD_TYPES, 3, 0.5)
-            hint = f"did you mean {' or '.join(near)}?" if near else "'nedbus schema' lists them"
-            raise ConfigError("--field", f"there is no field {name!r}: {hint}")
+            raise ConfigError("--field", explain_unknown_field(name))
     return names
 
 

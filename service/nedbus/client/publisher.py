@@ -104,7 +104,7 @@ class Publisher:
         A message that exists was validated when it was made; it is not validated again.
         Readers see which fields it was made without: `sample.missing`.
 
-        Raises pydantic.ValidationError for invalid fields, EncodeError for a message whose validation was bypassed,
+        Raises InvalidMessageError for invalid fields, EncodeError for a message whose validation was bypassed,
         ClosedError once the publisher or its bus is closed.
         """
         if isinstance(message, VehicleLocalPosition):
@@ -122,14 +122,13 @@ class Publisher:
     def publish_many(self, messages: MessageArray) -> None:
         """Validate messages in a structured array of shape (n,) and dtype DTYPE, and publish them; all or none.
 
-        Raises TypeError for another dtype, pydantic.ValidationError for the first message that is invalid.
+        Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`.
         """
-        from nedbus_msgs.arrays import DTYPE, encode_array, to_message, valid_mask
+        from nedbus_msgs.arrays import DTYPE, encode_array, require_valid
 
         if messages.dtype != DTYPE:
             raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
-        for element in messages[~valid_mask(messages)]:
-            to_message(element)  # raises, with the reason
+        require_valid(messages)
         if self._publisher is None:
             raise ClosedError
         require_unforked()

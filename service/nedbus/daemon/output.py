@@ -9,13 +9,11 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from pydantic import ValidationError
-
 from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
-from nedbus.errors import AddressInUseError
+from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.log_event import about
 from nedbus.sources import Rejection, SourceMessage
-from nedbus_msgs import Address, describe, upgrade_fields
+from nedbus_msgs import Address, upgrade_fields
 
 from .clock import Clock
 from .status import StreamStatus
@@ -128,8 +126,8 @@ class SourceOutput:
         try:
             fields = upgrade_fields(message.fields)
             stream.publisher.publish(fields)
-        except ValidationError as exc:
-            self._reject_invalid(message, _rule_of(exc), describe(exc))
+        except InvalidMessageError as exc:
+            self._reject_invalid(message, _rule_of(exc), exc.reason)
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
@@ -218,7 +216,7 @@ class SourceOutput:
         self._registry.reject(message.address, report)
 
 
-def _rule_of(error: ValidationError) -> str:
+def _rule_of(error: InvalidMessageError) -> str:
     """Return which rule a message violates, the first of several: its field, and the rule without any value."""
-    detail = error.errors(include_input=False, include_url=False)[0]
-    return f"{detail['loc'][0]}: {detail['msg'].partition(' (')[0]}" if detail["loc"] else detail["type"]
+    field, rule = error.violations[0]
+    return f"{field}: {rule.partition(' (')[0]}"

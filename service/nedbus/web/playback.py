@@ -13,13 +13,12 @@ from typing import Any, Final, cast
 from bokeh.layouts import row
 from bokeh.models import Row
 from bokeh.models.widgets import Select, Slider, Toggle
-from pydantic import ValidationError
 
 from nedbus.client import Monitor, RejectionReport, Sample
-from nedbus.errors import NedbusError
+from nedbus.errors import InvalidMessageError, NedbusError
 from nedbus.log_event import about
 from nedbus.sources import ReplaySource, parse_source, source_text_of_file
-from nedbus_msgs import Address, decode_row, describe, encode_fields, upgrade_fields
+from nedbus_msgs import Address, decode_row, encode_fields, upgrade_fields
 
 from .fleet import Fleet
 
@@ -66,8 +65,8 @@ def _encode(fields: Mapping[str, object]) -> bytes | str:
     """Return a message as bytes, or why it is none."""
     try:
         return encode_fields(upgrade_fields(fields))
-    except ValidationError as exc:
-        return describe(exc)
+    except InvalidMessageError as exc:
+        return exc.reason
 
 
 class Player:
