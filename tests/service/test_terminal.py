@@ -20,7 +20,8 @@ import pytest
 from rich.console import Console
 
 import nedbus
-from nedbus.cli.format import printable, to_line, to_text
+from nedbus.cli.format import printable, to_text
+from nedbus.cli.lines import Lines
 from nedbus.cli.live_table import LiveTable
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
@@ -102,41 +103,84 @@ def sample(address: nedbus.Address) -> nedbus.Sample:
     return nedbus.Sample(message(99_999_123_456, **position), address, 0, lost=3)
 
 
-def test_line_leaves_out_columns_in_order() -> None:
+ALL_TOPICS = [nedbus.Address("1", topic, 0 if topic.startswith("estimator") else None) for topic in TOPICS]
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
+    """Return what makes lines of all topics for a terminal of a width, and of 24 lines."""
+    monkeypatch.setenv("LINES", "24")
+
+    def make(width: int) -> Lines:
+        monkeypatch.setattr("nedbus.cli.lines.terminal_width", lambda: width)
+        return Lines(nedbus.Selection())
+
+    return make
+
+
+def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None:
     """Narrower and narrower: eph goes first, then heading, then velocity; position, doubts and loss never."""
     one = sample(nedbus.Address("1", VLP))
-    complete = to_line(one)
-    assert to_line(one, width=len(complete)) == complete
     seen: list[list[str]] = []
-    for width in range(len(complete) - 1, 83, -1):
-        line = to_line(one, width=width)
+    for width in range(150, 73, -1):
+        head, line = lines(width)(one).splitlines()
+        assert len(head) <= width
         assert len(line) <= width
-        assert all(text in line for text in ("1/veh", "-1234.57", "  z vxy vz invalid", "[3 lost]"))
-        columns = [name for name in (" v ", " hdg ", " eph ") if name in line]
+        assert all(text in line for text in ("1/veh", "-1234.5", "  z vxy vz invalid", "[3 lost]"))
+        columns = [name for name in ("Z m", "VZ m/s", "HDG deg", "EPH m", "STATE") if name in head]
         if not seen or seen[-1] != columns:
             seen.append(columns)
-    assert seen == [[" v ", " hdg ", " eph "], [" v ", " hdg "], [" v "], []]
+    most = ["Z m", "VZ m/s", "HDG deg", "EPH m"]
+    assert seen == [[*most[:count], "STATE"] for count in (4, 3, 2, 1)]
 
 
-def test_short_addresses_remain_different() -> None:
+def test_addresses_are_cut_only_where_nothing_is_free(lines: Callable[[int], Lines]) -> None:
+    """The middle of a topic is left out as far as its line has no room for it, and a narrow one has no free columns."""
+    for width in range(74, 110):
+        line = lines(width)(sample(nedbus.Address("1", "vehicle_local_position_groundtruth"))).splitlines()[1]
+        assert len(line) == width or "1/vehicle_local_position_groundtruth " in line
+    flags = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
+    fine = message(1, **flags, **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0))
+    to_line = lines(80)
+    for address in ALL_TOPICS:
+        assert f"{address} " in to_line(nedbus.Sample(fine, address, 0))
+
+
+def test_short_addresses_remain_different(lines: Callable[[int], Lines]) -> None:
     """The four topics of a vehicle are told apart where only a part of their names has room."""
-    addresses = [nedbus.Address("1", topic, 0 if topic.startswith("estimator") else None) for topic in TOPICS]
-    lines = {to_line(sample(address), width=1).split()[0] for address in addresses}
-    assert len(lines) == len(TOPICS)
-    assert "1/veh…tion" in lines
+    for width in (1, 80, 85, 90):
+        to_line = lines(width)
+        shown = {to_line(sample(address)).splitlines()[-1].split()[0] for address in ALL_TOPICS}
+        assert len(shown) == len(TOPICS)
+        assert width > 1 or "1/veh…tion" in shown
+
+
+def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
+    """There is one at first, one in each screenful, and one when the columns change; every state is below STATE."""
+    to_line, headed, state = lines(150), [], 0
+    for number in range(80):
+        *head, line = to_line(sample(nedbus.Address("1" if number < 40 else "wing", VLP))).splitlines()
+        if head:
+            headed.append(number)
+            state = head[0].index("STATE")
+        assert line.index("z vxy vz invalid") == state
+    assert headed == [0, 22, 40, 62]
+    of_fields = lines(150)(sample(nedbus.Address("1", VLP)), ["x", "eph"]).splitlines()
+    assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]
 
 
 @pytest.mark.process
 def test_echo_fits_a_terminal(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """At 80 columns a line is a line; the addresses of two vehicles are a column."""
+    """At 80 columns a line is a line, below a heading; the addresses of two vehicles are a column, and whole."""
     run_nedbus("serve", "-c", endpoint, "-s", "sim:", "-s", "sim:?vehicle=wing")
     wait_for(lambda: len(bus.latest()) == 2, what="two vehicles")
     with on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
         assert terminal.popen.wait(DEADLINE) == 0
-    lines = [line for line in terminal.shown.splitlines() if " ned " in line]
+    lines = [line for line in terminal.shown.splitlines() if "vehicle_local_position  " in line]
+    heads = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ")]
     assert len(lines) == 40
-    assert max(map(len, lines)) <= 80
-    assert len({line.index(" ned ") for line in lines[20:]}) == 1
+    assert max(map(len, [*lines, *heads])) <= 80
+    assert {line.index("  ok") + 2 for line in lines if "  ok" in line} == {heads[-1].index("STATE")}
 
 
 def test_info_names_what_is_gone(run_nedbus: Start, endpoint: str, raw: Session) -> None:

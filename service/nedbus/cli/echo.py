@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated
 
 import typer
 
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
-from nedbus.errors import ConfigError
-from nedbus_msgs import ANY, FIELD_TYPES, Address, explain_unknown_field
+from nedbus_msgs import ANY, Address
 
 from .follow import Link, follow
-from .format import shorten_address, to_csv, to_csv_head, to_fields, to_json, to_line
+from .format import to_csv, to_csv_head, to_fields, to_json
+from .lines import Lines
 from .options import (
     CountOption,
     CsvOption,
     DurationOption,
+    FieldOption,
     InstanceOption,
     JsonOption,
     PositionTopicOption,
@@ -27,11 +28,11 @@ from .options import (
     VehicleOption,
     choose,
     lazily_on_bus,
+    parse_fields,
     require_one,
     write,
     write_stderr,
 )
-from .table import terminal_width
 
 
 @lazily_on_bus
@@ -42,9 +43,7 @@ def echo(
     topic_option: PositionTopicOption = None,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
-    field: Annotated[
-        str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z; nedbus schema")
-    ] = None,
+    field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
     every: Annotated[
         bool,
@@ -71,10 +70,11 @@ def echo(
     """Print messages as they arrive, a line each; a terminal that is too slow skips to the newest (see --every)."""
     require_one({"--full": full, "--json": json_output, "--csv": csv_output})
     require_one({"--once": once, "--count": count is not None})
-    fields = _parse_fields(field)
+    fields = parse_fields(field)
     if max_rate is not None:
         check_max_rate(max_rate)
-    form = to_json if json_output else to_csv if csv_output else to_fields if full else _Lines()
+    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
     show: Callable[[Sample], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
 
@@ -87,7 +87,6 @@ def echo(
         write(show(sample))
         return True
 
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     mode: Mode = "every" if every else "latest"
     with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
         try:
@@ -97,27 +96,6 @@ def echo(
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
                 _write_counts(subscription)
-
-
-class _Lines:
-    """Samples as lines for the terminal, as wide as it is now, the addresses in a column; complete if it is none."""
-
-    def __init__(self) -> None:
-        self._widths = (0, 0)
-
-    def __call__(self, sample: Sample, fields: Sequence[str]) -> str:
-        address, (whole, shortened) = str(sample.address), self._widths
-        self._widths = max(whole, len(address)), max(shortened, len(shorten_address(address)))
-        return to_line(sample, fields, width=terminal_width(), address_widths=self._widths)
-
-
-def _parse_fields(text: str | None) -> list[str]:
-    """Return the names in `x,y,z`; raise ConfigError for one that no field has."""
-    names = [name.strip() for name in text.split(",") if name.strip()] if text else []
-    for name in names:
-        if name not in FIELD_TYPES:
-            raise ConfigError("--field", explain_unknown_field(name))
-    return names
 
 
 def _write_counts(subscription: Subscription) -> None:

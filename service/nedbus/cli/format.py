@@ -16,7 +16,6 @@ MAX_TEXT: Final = 1000
 """Characters that are shown of an error or a line of the log."""
 
 _MAX_CELL: Final = 120  # characters that are shown of a value that some peer sent
-_HEAD, _TAIL = 3, 4  # characters that are kept of a topic that is shortened
 _OLD: Final = 1.0  # s of latency from which on a line shows it: the last value of a stream that ended, or recovered
 
 
@@ -36,48 +35,27 @@ def to_text(value: object, limit: int = _MAX_CELL) -> str:
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
 
 
-def to_line(
-    sample: Sample, fields: Sequence[str] = (), *, width: int | None = None, address_widths: tuple[int, int] = (0, 0)
-) -> str:
-    """Return one line with these fields, or with the most important ones; NED, metres, degrees.
+def to_line(sample: Sample, fields: Sequence[str] = ()) -> str:
+    """Return one line with these fields, or with the most important ones; NED, metres, degrees."""
+    message = sample.message
+    start = f"{sample.address!s:<38} {message.timestamp / 1e6:12.3f} s"
+    if fields:
+        return "  ".join([start, *(f"{name} {to_value(sample, name)}" for name in fields)]) + _notes(sample)
+    position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
+    velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
+    heading = f"hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}"
+    return f"{start}  ned {position} m  v {velocity} m/s  {heading}  {to_state(sample)}"
 
-    What a `width` has no room for is left out in a fixed order: spaces, digits, eph, heading, velocity, and last the
-    middle of the topic; position, doubts and loss are never. `address_widths`: of the widest address before this one,
-    and of the widest one that was shortened.
-    """
-    message, address = sample.message, str(sample.address)
+
+def to_state(sample: Sample) -> str:
+    """Return what casts doubt on a sample, or "ok"; then its age, if it is old, and how many were lost before it."""
+    return message_doubts(sample.message) + _notes(sample)
+
+
+def _notes(sample: Sample) -> str:
     lost = f"  [{sample.lost} lost]" if sample.lost else ""
     old = f"  [{to_age(sample.latency)} old]" if sample.latency is not None and sample.latency > _OLD else ""
-    if fields:
-        columns = ["  ".join(f"{name} {_to_value(sample, name)}" for name in fields)]
-        short, tail = columns, f"{old}{lost}"
-    else:
-        columns, short = _columns(sample, 3), _columns(sample, 2)
-        tail = f"  {message_doubts(message)}{old}{lost}"
-    complete = "  ".join([f"{address:<38} {message.timestamp / 1e6:12.3f} s", *columns]) + tail
-    if width is None or len(complete) <= width:
-        return complete
-    narrow, narrowest = (
-        f"{text:<{least}} {message.timestamp / 1e6:9.2f} s"
-        for text, least in zip((address, shorten_address(address)), address_widths, strict=True)
-    )
-    lines = ["  ".join([narrow, *short[:count]]) + tail for count in range(len(short), 0, -1)]
-    return next((line for line in lines if len(line) <= width), "  ".join([narrowest, short[0]]) + tail)
-
-
-def _columns(sample: Sample, digits: int) -> list[str]:
-    """Return the columns of a line, the most important first."""
-    message = sample.message
-    position = " ".join(f"{value:{digits + 6}.{digits}f}" for value in (message.x, message.y, message.z))
-    velocity = " ".join(f"{value:{digits + 4}.{digits}f}" for value in (message.vx, message.vy, message.vz))
-    heading = f"hdg {math.degrees(message.heading):6.1f}"
-    return [f"ned {position} m", f"v {velocity} m/s", heading, f"eph {message.eph:6.2f}"]
-
-
-def shorten_address(address: str) -> str:
-    """Return an address without the middle of its topic; those of the four topics remain different."""
-    vehicle, _, topic = address.partition("/")
-    return f"{vehicle}/{topic[:_HEAD]}…{topic[-_TAIL:]}" if len(topic) > _HEAD + 1 + _TAIL else address
+    return f"{old}{lost}"
 
 
 def to_fields(sample: Sample, fields: Sequence[str] = ()) -> str:
@@ -87,7 +65,7 @@ def to_fields(sample: Sample, fields: Sequence[str] = ()) -> str:
     stored = ", only stored" if sample.stored else ""
     lines = [f"{sample.address}{age}{source}{stored}"]
     lines += [
-        f"  {name}: {_to_value(sample, name)}" + (" (not provided)" if name in sample.missing else "")
+        f"  {name}: {to_value(sample, name)}" + (" (not provided)" if name in sample.missing else "")
         for name in fields or FIELD_TYPES
     ]
     return "\n".join([*lines, "---"])
@@ -138,7 +116,8 @@ def csv_line(cells: Iterable[object]) -> str:
     return line.getvalue()
 
 
-def _to_value(sample: Sample, name: str) -> str:
+def to_value(sample: Sample, name: str) -> str:
+    """Return the value of a field as text."""
     return _to_number(name, getattr(sample.message, name))
 
 

@@ -21,7 +21,7 @@ from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, 
 from nedbus.log_event import about
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
-from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, TOPICS, Selection
+from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, FIELD_TYPES, TOPICS, Selection, explain_unknown_field
 
 from .format import MAX_TEXT, printable, to_text
 from .logs import logs_for_programs
@@ -53,6 +53,9 @@ PositionTopicOption = Annotated[
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
     int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position (default: all)")
+]
+FieldOption = Annotated[
+    str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z; nedbus schema")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
 CsvOption = Annotated[bool, typer.Option("--csv", help="CSV, with a line of names first")]
@@ -186,6 +189,15 @@ def require_one(flags: Mapping[str, bool]) -> None:
     given = [name for name, is_set in flags.items() if is_set]
     if len(given) > 1:
         raise ConfigError(given[1], f"cannot be combined with {given[0]}: remove one of the two")
+
+
+def parse_fields(text: str | None) -> list[str]:
+    """Return the names in `x,y,z`; raise ConfigError for one that no field has."""
+    names = [name.strip() for name in text.split(",") if name.strip()] if text else []
+    for name in names:
+        if name not in FIELD_TYPES:
+            raise ConfigError("--field", explain_unknown_field(name))
+    return names
 
 
 def choose(
