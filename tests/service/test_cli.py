@@ -44,6 +44,17 @@ def test_list_shows_what_is_published(run_nedbus: Start, flying: str) -> None:
     assert all(row["vehicle"] == "1" and row["age"] >= 0 for row in rows)
 
 
+def test_list_of_one_vehicle(run_nedbus: Start, flying: str, bus: nedbus.Bus) -> None:
+    """--vehicle lists one vehicle, also one of which nobody answers, and says when it is not there."""
+    bus.publisher(VLP, vehicle="2").publish(message(1))
+    bus.publisher(VLP, vehicle="silent")
+    for vehicle, count in (("1", 5), ("2", 1), ("silent", 1), ("3", 0)):
+        listed = run_nedbus("list", "-c", flying, "--vehicle", vehicle, "--json")
+        assert listed.wait() == 0, listed.err
+        assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
+        assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
+
+
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:
     """Rate, jitter, latency and loss of each stream; the rate of the estimate is near 100 Hz."""
     hz = run_nedbus("hz", "-c", flying, "--duration", "3")
@@ -73,6 +84,12 @@ def test_get_shows_the_last_message(run_nedbus: Start, flying: str) -> None:
     default = run_nedbus("get", "-c", flying, "--json")
     assert default.wait() == 0
     assert [json.loads(line)["topic"] for line in default.out.splitlines()] == [VLP]
+    chosen = run_nedbus("get", "-c", flying, "--field", "x,eph")
+    assert chosen.wait() == 0, chosen.err
+    assert [line.split(":")[0] for line in chosen.out.splitlines()[1:]] == ["  x", "  eph", "---"]
+    machine = run_nedbus("get", "-c", flying, "--json", "--field", "x")
+    assert machine.wait() == 0, machine.err
+    assert json.loads(machine.out)["message"].keys() == {"x"}
     nobody = run_nedbus("get", "-c", flying, "--vehicle", "99")
     assert nobody.wait() == 1
     assert f"nothing is published on nedbus/99/{VLP}" in nobody.err
@@ -146,6 +163,8 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
     [
         (["echo", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["echo", "vehicle_local_positon"], "topic 'vehicle_local_positon' is not valid: expected one of"),
+        (["get", "--field", "xx"], "--field: there is no field 'xx'"),
+        (["list", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
         (["list", "--connect", "nonsense"], "connect: 'nonsense' is not an endpoint"),
     ],

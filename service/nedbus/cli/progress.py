@@ -77,7 +77,8 @@ class Display:
             self._hinted = True
             for status in self._daemon.sources:
                 self._rate(status)  # measured from here on
-            if not self._daemon.until_done and (self._daemon.role == "router" or sys.stderr.isatty()):
+            is_read = not logs_for_programs() and (self._daemon.role == "router" or sys.stderr.isatty())
+            if is_read and not self._daemon.until_done:
                 self._print(what_to_type(self._daemon.endpoints))
         if self._progress is not None:
             for status in self._daemon.sources:

@@ -10,10 +10,11 @@ from typing import Annotated, Final
 import typer
 
 from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
-from nedbus_msgs import ANY, Address, json_schema, layout_table
+from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table
 
 from .format import to_fields, to_json, to_text
 from .options import (
+    FieldOption,
     InstanceOption,
     JsonOption,
     PositionTopicOption,
@@ -22,6 +23,7 @@ from .options import (
     choose,
     command,
     on_bus,
+    parse_fields,
     write,
     write_stderr,
 )
@@ -37,10 +39,11 @@ _MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
 
 @on_bus
-def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
+def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List the vehicles and topics that are published now, how old their last message is, and their state."""
-    published = {address for addresses in bus.vehicles().values() for address in addresses}
-    newest = {sample.address: sample for sample in bus.latest(ANY)}
+    selection = Selection(ANY, vehicle)
+    published = {each for addresses in bus.vehicles().values() for each in addresses if selection.matches(each)}
+    newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
     for address in sorted(published | newest.keys()):
         sample = newest.get(address)
@@ -63,7 +66,8 @@ def list_(bus: Bus, *, json_output: JsonOption = False) -> None:
             if bus.services()
             else "start a source with 'nedbus serve'"
         )
-        write_stderr(f"no vehicle is published at {' or '.join(bus.routers)}: {hint}")
+        what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
+        write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
 
 
 @on_bus
@@ -74,16 +78,18 @@ def get(
     topic_option: PositionTopicOption = None,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
+    field: FieldOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
     What only a storage kept is shown as such.
     """
+    fields = parse_fields(field)
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
-        write(to_json(sample) if json_output else to_fields(sample))
+        write(to_json(sample, fields) if json_output else to_fields(sample, fields))
     if not samples:
         write_stderr(f"nothing is published on {selection.key_expr(prefix=bus.prefix)}: 'nedbus list' shows what is")
     elif all(sample.stored for sample in samples):
