@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import zenoh
 
 import nedbus
 from nedbus.client.acknowledgement import WINDOW
@@ -18,6 +19,7 @@ from nedbus_msgs import Address, encode
 from nedbus_msgs.arrays import to_array
 from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
 from tests.service.test_max_rate import Clock, clock, publish, take, wait_for_demand
+from tests.service.test_px4_zenoh import Px4
 
 __all__ = ["clock"]
 
@@ -222,6 +224,26 @@ def test_health_of_a_vehicle_is_what_readers_get(secure: str, pki: Path, run_ned
     code, reason = health("2")
     assert code == 1
     assert "vehicle 2 is not published, though its service reports that it is" in reason
+
+
+def test_px4_reaches_the_secure_router_through_its_own(join: Join, secure: str, pki: Path, run_nedbus: Start) -> None:
+    """A PX4 without TLS is read through a service beside it that is its router; its own keys stay there."""
+    files = [f"--tls-ca={pki}/ca.crt", f"--tls-certificate={pki}/vehicle-1.crt", f"--tls-key={pki}/vehicle-1.key"]
+    beside = free_endpoint()
+    service = run_nedbus(
+        "serve", "--vehicle", "1", "-s", "px4-zenoh:", "--listen", beside, "--connect", secure, *files
+    )  # fmt: skip
+    wait_for(lambda: f"joined {secure}" in service.err, what="the secure link")
+    reader = join("reader")
+    beyond = reader._session.declare_subscriber("*/fmu/**", zenoh.handlers.RingChannel(10))
+    with reader.subscribe("*", mode="every") as subscription, nedbus.connect(beside) as on_vehicle:
+        px4 = Px4(on_vehicle._session)
+        for timestamp in range(1, 101):
+            px4.put(timestamp)
+        samples = [subscription.receive(DEADLINE) for _ in range(100)]
+    assert {(sample.vehicle, sample.topic, sample.source) for sample in samples} == {("1", VLP, "px4-zenoh")}
+    assert [sample.message.timestamp for sample in samples] == list(range(1, 101))
+    assert beyond.try_recv() is None
 
 
 def test_list_does_not_ask_for_a_source_that_is_there(secure: str, pki: Path, run_nedbus: Start) -> None:
