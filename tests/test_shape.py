@@ -61,8 +61,11 @@ ONLY: dict[str, set[str]] = {
     "pydantic_settings": {"nedbus/settings/model", "nedbus/settings/load"},
     "typing_extensions": {"nedbus/client/sample"},
     "pyulog": {"nedbus/recording/ulog"},
-    "mcap": {"nedbus/recording/writer", "nedbus/recording/reader", "nedbus/recording/chunks"},
-    "zstandard": {"nedbus/recording/chunks"},
+    "mcap": {
+        "nedbus/recording/writer", "nedbus/recording/reader", "nedbus/recording/chunks", "nedbus/recording/records",
+    },
+    "lz4": {"nedbus/recording/records"},
+    "zstandard": {"nedbus/recording/records"},
     "pandas": {"nedbus/recording/arrays"},
     "polars": {"nedbus/recording/arrays"},
     "matplotlib": {"nedbus/recording/plot"},

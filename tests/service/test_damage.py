@@ -14,15 +14,24 @@ import os
 import random
 import re
 import struct
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from zlib import crc32
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.records import Chunk, ChunkIndex, Footer
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC, Writer
 
 import nedbus
 from nedbus.errors import SourceError
@@ -265,6 +274,102 @@ def test_damaged_chunk_is_named(tmp_path: Path) -> None:
     assert re.fullmatch(r"chunk 3 \(10\.\d to 10\.\d s\) at byte \d+ is damaged: its 80 messages are left out", warning)
     assert run.damage is not None
     assert str(path) in run.damage
+
+
+def rewrite_index(path: Path, field: str, value: int) -> None:
+    """Change a field of the first two chunks in the index of a recording, and give it the CRC that fits."""
+    data = path.read_bytes()
+    start, _, _ = struct.unpack_from("<QQI", data, len(data) - 28)
+    builder = RecordBuilder()
+    left = 2
+    for record in StreamReader(BytesIO(data[start:]), skip_magic=True).records:
+        if isinstance(record, ChunkIndex) and left:
+            setattr(record, field, value)
+            left -= 1
+        if not isinstance(record, Footer):
+            record.write(builder)
+    index = builder.end() + struct.pack("<BQQQ", 2, 20, start, 0)
+    path.write_bytes(data[:start] + index + struct.pack("<I", crc32(index)) + data[-8:])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("chunk_start_offset", each) for each in (0, 100, 2**40, 2**62, 2**63, 2**64 - 1)]
+    + [("chunk_length", each) for each in (10_000, 2**40, 2**62, 2**63, 2**64 - 1)],
+)
+def test_index_that_points_elsewhere_is_not_used(tmp_path: Path, field: str, value: int) -> None:
+    """Chunks outside of the file, or two in one place: the file is read without its index, and nothing is lost."""
+    path = write_recording(tmp_path / "a.mcap", finish=True)
+    original = payloads_of(path)[0]
+    rewrite_index(path, field, value)
+    read, reader = payloads_of(path)
+    assert read == original
+    assert reader.warnings == ["its index is damaged: it is read without"]
+
+
+def add_chunk(path: Path, records: bytes, *, compression: str, in_index: bool = False) -> None:
+    """Add a chunk to the end of a recording that has no index, or make it the index."""
+    data = path.read_bytes()
+    end = len(data) - 50
+    packed = zstandard.compress(records) if compression == "zstd" else lz4.frame.compress(records)
+    builder = RecordBuilder()
+    Chunk(compression, packed, 1, 2, crc32(records), len(records)).write(builder)
+    if in_index:
+        footer = struct.pack("<BQQQ", 2, 20, end + 13, 0)
+        index = builder.end() + footer
+        path.write_bytes(data[: end + 13] + index + struct.pack("<I", crc32(index)) + data[-8:])
+    else:
+        path.write_bytes(data[:end] + builder.end() + data[end:])
+
+
+@pytest.mark.parametrize(
+    ("size", "compression", "in_index"), [(2**28, "zstd", False), (2**28, "lz4", False), (2**28, "zstd", True)]
+)
+def test_chunk_that_would_fill_the_memory_is_left_out(
+    tmp_path: Path, size: int, compression: str, *, in_index: bool
+) -> None:
+    """A chunk of 256 MiB that is packed into some kilobytes is not unpacked, in the index neither; the rest is read."""
+    path = write_recording(tmp_path / "a.mcap", finish=False)
+    original = payloads_of(path)[0]
+    add_chunk(path, bytes(size), compression=compression, in_index=in_index)
+    tracemalloc.start()
+    try:
+        read, reader = payloads_of(path)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert read == original
+    assert peak < size // 4
+    assert reader.damaged != in_index
+
+
+def test_chunk_of_zeros_is_damage(tmp_path: Path) -> None:
+    """No record is of zeros: where they begin, the rest of a chunk is left out, and that is reported."""
+    path = write_recording(tmp_path / "a.mcap", finish=False)
+    original = payloads_of(path)[0]
+    add_chunk(path, bytes(2**20), compression="zstd")
+    read, reader = payloads_of(path)
+    assert read == original
+    assert reader.damaged
+    assert reader.warnings == ["damaged: a chunk has an invalid record; the rest of that chunk is left out"]
+
+
+def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
+    """A file of a thousand damaged places causes a hundred warnings, and one that says that there are more."""
+    path = write_recording(tmp_path / "a.mcap", finish=False)
+    place = struct.pack("<BQ", Opcode.MESSAGE_INDEX, 6) + bytes(6)
+    path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
+    reader = payloads_of(path)[1]
+    assert len(reader.warnings) == 101
+    assert reader.warnings[-1] == "there is more damage"
+
+
+def test_word_at_the_beginning_is_no_chunk(tmp_path: Path) -> None:
+    """The name of a compression right behind the magic is no chunk that begins before the file."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(MCAP0_MAGIC + bytes(3) + b"\x04\x00\x00\x00zstd" + bytes(100))
+    with pytest.raises(SourceError, match="no message can be read: cut or damaged: everything from byte 8 of 119 on"):
+        RecordingReader(path, vehicle="1")
 
 
 def test_commands_read_the_rest_and_fail(run_nedbus: Start, tmp_path: Path) -> None:

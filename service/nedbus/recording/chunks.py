@@ -10,33 +10,23 @@ import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from io import BytesIO
 from pathlib import Path
 from typing import Final
 from zlib import crc32
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Chunk, McapRecord
-from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError, frame_content_size
 
 from nedbus.errors import SourceError
 
 from .formats import open_flight
+from .records import CHUNK_HEAD, READ_ERRORS, RECORD_HEAD, chunk_length, records_of, unpack_chunk
 
-READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryError, OverflowError, RuntimeError)
-"""What the mcap package and its decompressors raise for a damaged file."""
-
-_HEAD: Final = struct.Struct("<BQ")  # of a record: opcode and length
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
 _FOOTER: Final = struct.Struct("<QQI")
 _ZSTD: Final = b"\x04\x00\x00\x00zstd"  # in every chunk of ours
-_MAX_CHUNK: Final = 2**30  # bytes; a larger one is damage
+_MAX_WARNINGS: Final = 100
 _SEARCH: Final = 2**20  # bytes that are searched at a time
 _EPOCH: Final = 10**17  # ns: a later time is a date, an earlier one counts from a vehicle's start
 
@@ -94,8 +84,8 @@ class ChunkFile:
     def warn(self, warning: str, *, lost: bool = False) -> None:
         """Report something once; `lost` if it cost messages."""
         self.damaged |= lost
-        if warning not in self.warnings:
-            self.warnings.append(warning)
+        if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
+            self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "there is more damage")
 
     def _read(self, start: int, size: int) -> bytes:
         self._file.seek(start)
@@ -103,19 +93,18 @@ class ChunkFile:
 
     def _read_summary(self) -> Summary | None:
         """Return the summary if it is whole."""
-        tail = self._read(max(0, self._size - _HEAD.size - _FOOTER.size - 8), _HEAD.size + _FOOTER.size + 8)
-        if len(tail) < _HEAD.size + _FOOTER.size + 8 or not tail.endswith(MCAP0_MAGIC):
+        tail = self._read(max(0, self._size - RECORD_HEAD.size - _FOOTER.size - 8), RECORD_HEAD.size + _FOOTER.size + 8)
+        if len(tail) < RECORD_HEAD.size + _FOOTER.size + 8 or not tail.endswith(MCAP0_MAGIC):
             return None
-        opcode, length = _HEAD.unpack_from(tail)
-        start, _, checksum = _FOOTER.unpack_from(tail, _HEAD.size)
+        opcode, length = RECORD_HEAD.unpack_from(tail)
+        start, _, checksum = _FOOTER.unpack_from(tail, RECORD_HEAD.size)
         if (opcode, length) != (Opcode.FOOTER, _FOOTER.size) or not 8 <= start < self._size:
             return None
         covered = self._read(start, self._size - start - 4 - 8)
         try:
             if checksum and crc32(covered) != checksum:
                 raise ValueError(checksum)
-            self._file.seek(0)
-            return SeekingReader(self._file).get_summary()
+            return _parse_summary(covered[: 4 - RECORD_HEAD.size - _FOOTER.size], start)
         except READ_ERRORS:
             self.warn("its index is damaged: it is read without")
             return None
@@ -124,8 +113,7 @@ class ChunkFile:
         if self.summary is None or not self.summary.chunk_indexes:
             yield from self._follow()
             return
-        indexes = sorted(self.summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
-        for number, index in enumerate(indexes, 1):
+        for number, index in enumerate(self.summary.chunk_indexes, 1):
             channels = index.message_index_offsets.keys()  # a chunk that lists none may have any
             if only is None or not channels or not channels.isdisjoint(only):
                 start, times = index.chunk_start_offset, (index.message_start_time, index.message_end_time)
@@ -151,7 +139,7 @@ class ChunkFile:
             after_chunk = opcode == Opcode.CHUNK or (after_chunk and opcode == Opcode.MESSAGE_INDEX)
             if opcode == Opcode.CHUNK:
                 number += 1
-                start_time, end_time, *_ = _CHUNK_HEAD.unpack(self._read(offset + _HEAD.size, _CHUNK_HEAD.size))
+                start_time, end_time, *_ = CHUNK_HEAD.unpack(self._read(offset + RECORD_HEAD.size, CHUNK_HEAD.size))
                 yield _Place(opcode, offset, end, number, (start_time, end_time))
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}:
                 yield _Place(opcode, offset, end)
@@ -159,39 +147,40 @@ class ChunkFile:
 
     def _read_head(self, offset: int) -> tuple[int, int]:
         """Return the opcode of a record, 0 at the end of the file, and where the record ends."""
-        head = self._read(offset, _HEAD.size)
-        if len(head) < _HEAD.size:
+        head = self._read(offset, RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
             return 0, offset
-        opcode, length = _HEAD.unpack(head)
-        return opcode, offset + _HEAD.size + length
+        opcode, length = RECORD_HEAD.unpack(head)
+        return opcode, offset + RECORD_HEAD.size + length
 
     def _is_plausible(self, opcode: int, offset: int, end: int) -> bool:
         """Return whether a record's length fits the file and what the record says of itself."""
-        length = end - offset - _HEAD.size
+        length = end - offset - RECORD_HEAD.size
         if opcode == 0 or end > self._size:
             return False
         if opcode == Opcode.DATA_END:
             return length == 4
         if opcode == Opcode.FOOTER:
             return length == _FOOTER.size and end + len(MCAP0_MAGIC) == self._size
-        body = self._read(offset + _HEAD.size, min(length, 64))
+        body = self._read(offset + RECORD_HEAD.size, min(length, 64))
         if opcode == Opcode.MESSAGE_INDEX:
             return length >= 6 and struct.unpack_from("<I", body, 2) == (length - 6,)
         if opcode == Opcode.CHUNK:
-            return _chunk_size(body) == length
+            return chunk_length(body) == length
         return True
 
     def _find_chunk(self, start: int) -> int | None:
         """Return where the next chunk of ours begins."""
-        before = _HEAD.size + _CHUNK_HEAD.size - 4  # bytes of a chunk before the name of its compression
+        before = RECORD_HEAD.size + CHUNK_HEAD.size - 4  # bytes of a chunk before the name of its compression
         while block := self._read(start, _SEARCH):
             found = block.find(_ZSTD)
             if found < 0:
                 start += max(1, len(block) - len(_ZSTD) + 1)
                 continue
-            opcode, end = self._read_head(start + found - before)
-            if opcode == Opcode.CHUNK and self._is_plausible(opcode, start + found - before, end):
-                return start + found - before
+            offset = start + found - before
+            opcode, end = self._read_head(offset) if offset > 0 else (0, 0)
+            if opcode == Opcode.CHUNK and self._is_plausible(opcode, offset, end):
+                return offset
             start += found + 1
         return None
 
@@ -199,46 +188,46 @@ class ChunkFile:
         record = self._read(place.offset, place.end - place.offset)
         if place.opcode != Opcode.CHUNK:
             return record
-        length = len(record) - _HEAD.size
-        if _HEAD.unpack_from(record) != (Opcode.CHUNK, length) or _chunk_size(record[_HEAD.size :]) != length:
+        body = record[RECORD_HEAD.size :]
+        if RECORD_HEAD.unpack_from(record) != (Opcode.CHUNK, len(body)) or chunk_length(body) != len(body):
             raise ValueError(place)
-        chunk = Chunk.read(ReadDataStream(BytesIO(record[_HEAD.size :])))
-        size = chunk.uncompressed_size
-        if size > _MAX_CHUNK or (chunk.compression == "zstd" and frame_content_size(chunk.data) not in {-1, size}):
-            raise ValueError(size)  # before so much memory is taken
-        stream, found = get_chunk_data_stream(chunk, validate_crc=True)
-        if found != size:
-            raise ValueError(found)
-        return stream.read(size)
+        return unpack_chunk(body)
 
     def _count_messages(self, end: int, only: Collection[int] | None) -> int | None:
         """Return how many messages the indexes behind a chunk list, None where there are none."""
         count, listed = 0, False
         opcode, after = self._read_head(end)
         while opcode == Opcode.MESSAGE_INDEX and self._is_plausible(opcode, end, after):
-            [channel] = struct.unpack("<H", self._read(end + _HEAD.size, 2))
+            [channel] = struct.unpack("<H", self._read(end + RECORD_HEAD.size, 2))
             listed = True
             if only is None or channel in only:
-                count += (after - end - _HEAD.size - 6) // 16
+                count += (after - end - RECORD_HEAD.size - 6) // 16
             end = after
             opcode, after = self._read_head(end)
         return count if listed else None
 
 
-def records_of(part: bytes) -> list[McapRecord]:
-    """Return the schemas, channels and messages of a part of a file."""
-    return breakup_chunk(Chunk("", part, 0, 0, 0, len(part)))
-
-
-def _chunk_size(body: bytes) -> int | None:
-    """Return the length of a chunk's record as the chunk's own fields have it."""
-    if len(body) < _CHUNK_HEAD.size:
-        return None
-    *_, name_length = _CHUNK_HEAD.unpack_from(body)
-    before: int = _CHUNK_HEAD.size + name_length + 8
-    if name_length > 8 or len(body) < before:
-        return None
-    return before + int.from_bytes(body[before - 8 : before], "little")
+def _parse_summary(data: bytes, start: int) -> Summary:
+    """Return the summary that begins at `start`; raise ValueError if its chunks are not one after another before it."""
+    summary = Summary()
+    for record in records_of(data):
+        if isinstance(record, Schema):
+            summary.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            summary.channels[record.id] = record
+        elif isinstance(record, ChunkIndex):
+            summary.chunk_indexes.append(record)
+        elif isinstance(record, Statistics):
+            summary.statistics = record
+    summary.chunk_indexes.sort(key=lambda index: index.chunk_start_offset)
+    offset = len(MCAP0_MAGIC)
+    for index in summary.chunk_indexes:
+        if index.chunk_start_offset < offset:
+            raise ValueError(index)
+        offset = index.chunk_start_offset + index.chunk_length
+    if offset > start:
+        raise ValueError(offset)
+    return summary
 
 
 def _show_times(start: int, end: int) -> str:

@@ -22,7 +22,8 @@ from nedbus_msgs import (
     upgraded_names,
 )
 
-from .chunks import READ_ERRORS, ChunkFile, records_of
+from .chunks import ChunkFile
+from .records import READ_ERRORS, records_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,19 +107,20 @@ class RecordingReader:
         """Yield all messages of local position topics, or of one address, in the order of the file."""
         for part in self._file.parts(self._channels(only)):
             try:
-                records = records_of(part)
+                yield from self._messages_of(part, only)
             except READ_ERRORS:
-                self._file.warn("damaged: records without a CRC are left out", lost=True)
-                continue
-            for record in records:
-                if isinstance(record, Schema):
-                    self._schemas.setdefault(record.id, record)
-                elif isinstance(record, Channel):
-                    self._add(record)
-                elif isinstance(record, Message):
-                    stream = self._stream(record)
-                    if stream is not None and only in (None, stream.address):
-                        yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
+                self._file.warn("damaged: a chunk has an invalid record; the rest of that chunk is left out", lost=True)
+
+    def _messages_of(self, part: bytes, only: Address | None) -> Iterator[RecordedMessage]:
+        for record in records_of(part):
+            if isinstance(record, Schema):
+                self._schemas.setdefault(record.id, record)
+            elif isinstance(record, Channel):
+                self._add(record)
+            elif isinstance(record, Message):
+                stream = self._stream(record)
+                if stream is not None and only in (None, stream.address):
+                    yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
 
     def close(self) -> None:
         """Close the file."""
