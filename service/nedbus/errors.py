@@ -147,6 +147,7 @@ class OutputError(NedbusError, OSError):
         hints = {
             errno.EEXIST: "choose another name, or remove it",
             errno.ENOSPC: "free some space, or write elsewhere",
+            errno.ESTALE: "what was written is lost; write to a folder that nothing cleans up",
         }
         hint = hints.get(error.errno or 0, "check that its folder exists and that this user may write there")
         super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")

@@ -132,12 +132,12 @@ def test_power_cut_costs_a_second_at_most(run_nedbus: Start, endpoint: str, tmp_
 
 
 def test_file_is_complete_after_every_flush(tmp_path: Path) -> None:
-    """Between two flushes any reader finds all that was flushed, and a valid end."""
+    """From its opening on any reader finds all that was flushed, and a valid end, as after kill -9."""
     path = tmp_path / "a.mcap"
     with RecordingWriter(path) as writer:
         for count in range(1, 6):
             writer.write(to_array([message(count)]), [(ADDRESS, Provenance())], logged=[count], published=[count])
-            assert len(read_independently(path) if count > 1 else []) == count - 1
+            assert len(read_independently(path)) == count - 1
             writer.flush()
             assert [each.timestamp for *_, each in read_independently(path)] == list(range(1, count + 1))
     with path.open("rb") as file:
@@ -357,6 +357,28 @@ def test_record_ends_with_ctrl_c(run_nedbus: Start, endpoint: str, bus: nedbus.B
     found = read_independently(path)
     assert {topic for topic, *_ in found} == {f"/1/{VLP}"}
     assert f"{len(found)} messages" in recorder.err
+
+
+def test_deleted_recording_is_an_error(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
+    """A recording that is deleted while it is written ends at the next flush, with what is lost, and exit code 1."""
+    path = tmp_path / "a.mcap"
+    recorder = run_nedbus("record", "-c", endpoint, "-o", str(path))
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    wait_for(lambda: path.exists() and path.stat().st_size > 5000, what="messages")
+    path.unlink()
+    assert recorder.wait() == 1
+    reason = "it was deleted while it was written): what was written is lost; write to a folder that nothing cleans up"
+    assert f"{path} cannot be written ({reason}" in recorder.err
+    assert " messages" not in recorder.err
+
+
+def test_moved_recording_goes_on(tmp_path: Path) -> None:
+    """A recording that is given another name is written to its end."""
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path) as writer:
+        path.rename(tmp_path / "b.mcap")
+        writer.write(to_array([message(1)]), [(ADDRESS, Provenance())], logged=[1], published=[1])
+    assert len(read_independently(tmp_path / "b.mcap")) == 1
 
 
 @pytest.mark.parametrize("ended", ["by its duration", "by Ctrl-C"])

@@ -1,11 +1,12 @@
 """Write MCAP files that Foxglove, PlotJuggler and any MCAP reader open: CDR messages with their definition.
 
-A file is complete after every flush: its end is written behind the last chunk, and overwritten by the next one.
-So a power cut costs the messages since the last flush, and never the file.
+A file is complete from the beginning and after every flush: its end is written behind the last chunk, and overwritten
+by the next one. So a power cut costs the messages since the last flush, and never the file.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 from collections.abc import Iterable
@@ -34,7 +35,8 @@ class RecordingWriter:
     The file is in the layout of PX4 1.16 to main, one channel for each address and provenance.
     A chunk, of up to `chunk_size` bytes before compression, is what damage of one bit costs.
 
-    Raises OutputError when the file exists already, or cannot be written: then what was flushed can still be read.
+    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written: then what was flushed
+    can still be read.
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
@@ -47,6 +49,12 @@ class RecordingWriter:
         # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
         self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=chunk_size)
         self._writer.start(profile="ros2", library="nedbus")
+        try:
+            self.flush()
+        except OutputError:
+            self._file.close()
+            self.path.unlink(missing_ok=True)
+            raise
         self._schema = self._writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(CURRENT.name).encode())
         self._channels: dict[tuple[Address, Provenance], int] = {}
 
@@ -125,6 +133,7 @@ class _AppendFile:
     """A file for the MCAP writer that has a valid end after each `sync`."""
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = path.open("xb", buffering=0)
         self._pending = bytearray()
         self._offset = 0
@@ -155,6 +164,17 @@ class _AppendFile:
             raise
         os.fsync(self._file.fileno())
         self._offset += len(pending)
+        if self._is_deleted():
+            raise OSError(errno.ESTALE, "it was deleted while it was written")
+
+    def _is_deleted(self) -> bool:
+        file = os.fstat(self._file.fileno())
+        if file.st_nlink:  # also a file that was only moved
+            return False
+        try:  # some file systems do not count links
+            return not os.path.samestat(file, self._path.stat())
+        except OSError:
+            return True
 
     def _write_at_offset(self, data: bytes) -> None:
         rest = memoryview(data)
