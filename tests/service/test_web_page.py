@@ -6,6 +6,7 @@ import json
 import queue
 import re
 import signal
+import socket
 import threading
 import urllib.error
 import urllib.request
@@ -18,7 +19,7 @@ import pytest
 import websockets
 import zenoh
 from playwright.sync_api import Browser
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 import nedbus
 from nedbus.recording import RecordingWriter
@@ -438,15 +439,19 @@ def status_of(url: str, **headers: str) -> int:
             return exc.code
 
 
-def answers(url: str, origin: str) -> bool:
-    """Tell whether the page's socket says anything to a page from there, with the token of a page that it made."""
+def open_socket(url: str, origin: str) -> ClientConnection:
+    """Connect to the page's socket as a page from there, with the token of a page that it made."""
     with urllib.request.urlopen(url, timeout=DEADLINE) as page:  # noqa: S310 - our own address
         token = re.search(r'"token":"([^"]+)"', page.read().decode())
     assert token
     protocols = [websockets.Subprotocol("bokeh"), websockets.Subprotocol(token[1])]
+    return connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(origin), subprotocols=protocols)
+
+
+def answers(url: str, origin: str) -> bool:
+    """Tell whether the page's socket says anything to a page from there."""
     try:
-        socket = f"{url.replace('http', 'ws')}/ws"
-        with connect(socket, origin=websockets.Origin(origin), subprotocols=protocols) as connection:
+        with open_socket(url, origin) as connection:
             return bool(connection.recv(timeout=DEADLINE))
     except (websockets.InvalidHandshake, websockets.ConnectionClosed):
         return False
@@ -478,6 +483,39 @@ def test_nothing_can_be_sent_to_its_paths(web: Web, endpoint: str) -> None:
                 urllib.request.urlopen(request, timeout=DEADLINE)  # noqa: S310 - our own address
             with refused.value:
                 assert refused.value.code in {403, 405}
+
+
+@pytest.mark.parametrize(
+    "sent", [b"Content-Length: 100000000\r\n\r\n", b"Transfer-Encoding: chunked\r\n\r\n5f5e100\r\n"]
+)
+def test_bodies_are_not_kept(web: Web, endpoint: str, sent: bytes) -> None:
+    """A request that announces 100 MB is refused before it has sent them, under whatever name it came."""
+    _, url = web("-c", endpoint)
+    for host in (url.removeprefix("http://"), "evil.example"):
+        for method in (b"POST", b"PUT", b"GET"):
+            with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:
+                client.sendall(method + b" / HTTP/1.1\r\nHost: " + host.encode() + b"\r\n" + sent)
+                assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
+
+
+def test_browser_says_little_at_a_time(web: Web, endpoint: str) -> None:
+    """What comes through the socket of a page has a limit of 1 MiB, which ends it."""
+    _, url = web("-c", endpoint)
+    with open_socket(url, url) as connection:
+
+        def is_closed() -> bool:
+            try:
+                connection.recv(timeout=0.1)
+            except TimeoutError:
+                return False
+            except websockets.ConnectionClosed:
+                return True
+            return False
+
+        connection.send(" " * 2**20)
+        assert not is_closed()
+        connection.send(" " * (2**20 + 1))
+        wait_for(is_closed, what="the end of the page")
 
 
 def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, endpoint: str, tab: Open) -> None:

@@ -30,6 +30,8 @@ MAX_VIEWERS: Final = 32
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
 _PARTS: Final[list[Component]] = ["bokeh", "bokeh-widgets", "bokeh-tables"]
 _POLL: Final = 100  # ms until the end is noticed
+_MAX_BODY: Final = 2**16  # bytes of a request, which has none: Tornado keeps it before anybody looks at its Host
+_MAX_EVENT: Final = 2**20  # bytes of what a browser says of its page at a time
 _UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
 
 
@@ -63,7 +65,8 @@ class WebServer:
                 {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=port,
                 allow_websocket_origin=["*"], auth_provider=_Names(names),
                 unused_session_lifetime_milliseconds=_UNUSED, check_unused_sessions_milliseconds=_UNUSED // 3,
-                keep_alive_milliseconds=5000,
+                keep_alive_milliseconds=5000, websocket_max_message_size=_MAX_EVENT,
+                http_server_kwargs={"max_body_size": _MAX_BODY, "max_buffer_size": 2 * _MAX_EVENT},
                 extra_patterns=[(path, _Text, {"make": make, **texts}) for path, make in pages.items()],
             )  # fmt: skip
         except OSError as exc:
