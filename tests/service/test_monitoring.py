@@ -51,11 +51,11 @@ class Pages:
         self.port = port
         self.where = f"127.0.0.1:{port}"
 
-    def ask(self, path: str, method: str = "GET") -> tuple[int, str]:
+    def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
         """Return the status and the content of an answer; (0, "") if there is none."""
         connection = http.client.HTTPConnection(self.where, timeout=DEADLINE)
         try:
-            connection.request(method, path)
+            connection.request(method, path, headers=headers)
             answer = connection.getresponse()
             return answer.status, answer.read().decode()
         except (ConnectionError, http.client.HTTPException):
@@ -314,6 +314,39 @@ def test_nothing_can_be_changed(server: Pages) -> None:
     answer = connection.getresponse()
     assert (answer.headers["Content-Length"], answer.headers["X-Content-Type-Options"]) == ("7", "nosniff")
     connection.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "status", "elsewhere", "metrics"),
+    [
+        ("127.0.0.1:9464", 200, 200, 200),
+        ("192.0.2.1", 200, 200, 200),  # of a forwarded port
+        ("[::1]:9464", 200, 200, 200),
+        ("[fe80::1]", 200, 200, 200),
+        ("localhost:1234", 200, 200, 200),
+        ("LocalHost.", 200, 200, 200),
+        (f"{socket.gethostname()}:9464", 200, 200, 200),
+        (f"{socket.getfqdn()}:9464", 200, 200, 200),
+        ("vehicle-1:9464", 403, 200, 200),  # of a container
+        ("evil.example:9464", 403, 403, 200),
+        ("localhost.evil.example", 403, 403, 200),
+        ("127.0.0.1.evil.example", 403, 403, 200),
+        ("evil.example:9464@127.0.0.1", 403, 403, 200),
+        ("[evil.example]", 403, 403, 200),
+    ],
+)
+def test_foreign_names_get_nothing(host: str, status: int, elsewhere: int, metrics: int) -> None:
+    """A page of somebody else whose name leads here cannot read the status, and on loopback nothing at all.
+
+    Where other hosts may ask, a Prometheus and probes get metrics, health and readiness under any name.
+    """
+    content = {path: lambda: Page.text("content") for path in ("/metrics", "/healthz", "/readyz", "/status")}
+    with closing(HttpServer("127.0.0.1:0", content)) as local, closing(HttpServer("0.0.0.0:0", content)) as public:
+        for path in content:
+            assert Pages(local.port).ask(path, Host=host)[0] == status, path
+            assert Pages(public.port).ask(path, Host=host)[0] == (elsewhere if path == "/status" else metrics), path
+        refused = "/status is answered under an address or a name of this host only\n"
+        assert Pages(local.port).ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET /page HTTP/1.0\r\nHost:"], ids=["silent", "half a request"])

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import ipaddress
 import logging
 import socket
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Final, NamedTuple, cast
 
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
-from nedbus.settings import split_http
+from nedbus.settings import is_loopback, split_http
 
 _log = logging.getLogger(__name__)
 
 _CLIENTS: Final = 16  # that are answered at the same time
 _PATIENCE: Final = 5.0  # s that a client may take to ask, and to read the answer
+_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz"}  # a Prometheus or a probe calls a host as it likes
 
 
 class Page(NamedTuple):
@@ -36,6 +39,11 @@ class Page(NamedTuple):
 class HttpServer:
     """Serve pages by path on HOST:PORT, in threads of its own, until it is closed.
 
+    A page of somebody else in a browser on this network may make its own name lead here and read what is answered
+    under that name. So a page is answered under names that only lead here: addresses, localhost, the names of this
+    host and, for others than this host, names without a dot, as in Docker. Others may ask by any name for metrics,
+    health and readiness.
+
     Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
     """
 
@@ -45,7 +53,7 @@ class HttpServer:
         except ValueError as exc:
             raise ConfigError("--http", str(exc)) from exc
         try:
-            self._server = _Server((host, port), _make_handler(pages))
+            self._server = _Server((host, port), _make_handler(pages, local=is_loopback(host)))
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
@@ -111,7 +119,7 @@ class _Server(ThreadingHTTPServer):
         _log.debug("an HTTP client went away", exc_info=True)
 
 
-def _make_handler(pages: Mapping[str, Callable[[], Page]]) -> type[BaseHTTPRequestHandler]:
+def _make_handler(pages: Mapping[str, Callable[[], Page]], *, local: bool) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         timeout = _PATIENCE
         server_version = "nedbus"
@@ -132,7 +140,12 @@ def _make_handler(pages: Mapping[str, Callable[[], Page]]) -> type[BaseHTTPReque
             _log.debug(format, *args)
 
         def _answer(self) -> None:
-            page = _make_page(pages, self.path.partition("?")[0])
+            path = self.path.partition("?")[0]
+            host = self.headers.get("Host") or "localhost"  # every browser names it
+            if path in pages and (local or path not in _ANY_NAME) and not _leads_here(host, local=local):
+                page = Page.text(f"{path} is answered under an address or a name of this host only", status=403)
+            else:
+                page = _make_page(pages, path)
             self.send_response(page.status)
             self.send_header("Content-Type", page.content_type)
             self.send_header("Content-Length", str(len(page.content)))
@@ -143,6 +156,20 @@ def _make_handler(pages: Mapping[str, Callable[[], Page]]) -> type[BaseHTTPReque
                 self.wfile.write(page.content)
 
     return Handler
+
+
+def _leads_here(host: str, *, local: bool) -> bool:
+    """Return whether a Host is a name that nobody else can make lead to this host."""
+    name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
+    name = name.lower().removesuffix(".")
+    with suppress(ValueError):
+        return bool(ipaddress.ip_address(name))
+    return name == "localhost" or (not local and "." not in name) or name in _names()
+
+
+@cache
+def _names() -> set[str]:
+    return {socket.gethostname().lower(), socket.getfqdn().lower()}
 
 
 def _make_page(pages: Mapping[str, Callable[[], Page]], path: str) -> Page:
