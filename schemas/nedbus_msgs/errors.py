@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
+
+_MAX_SHOWN: Final = 200  # characters of a value: a peer's key has up to 64 kB
 
 
 class NedbusError(Exception):
@@ -24,7 +27,7 @@ class AddressError(NedbusError, ValueError):
     """Raised when a vehicle, topic, instance or key expression cannot name a stream."""
 
     def __init__(self, what: str, given: object, expected: str) -> None:
-        super().__init__(f"{what} {given!r} is not valid: expected {expected}")
+        super().__init__(f"{what} {given!r:.{_MAX_SHOWN}} is not valid: expected {expected}")
         self.given = given
 
 

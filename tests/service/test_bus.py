@@ -14,6 +14,7 @@ import pickle
 import signal
 import threading
 import time
+import tracemalloc
 import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -317,6 +318,29 @@ def test_invalid_payload_never_ends_an_iteration(
     warned = [record.message for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warned) == len({text.split(":")[0] for text in warned}), "each key is named once"
     assert any("garbage" in text or "one msgpack value" in text for text in warned)
+
+
+def test_long_keys_cost_a_reader_nothing(
+    client: Client, raw: Session, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """300 invalid keys of 60 kB are counted; the reader keeps none of them, and logs 100 short lines at most."""
+    publisher = bus.publisher(VLP, vehicle="1")
+    publisher.publish(message(1))
+    subscription = client.subscribe("*", mode="every")
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    tracemalloc.start()
+    try:
+        for number in range(300):
+            raw.put(f"nedbus/{number}/{'x' * 60_000}", b"", congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_for(lambda: subscription.counts.invalid == 300, what="all to be counted")
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 100 * 60_000
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warned) == 100
+    assert max(map(len, warned)) < 1000
+    assert [text.endswith("; further keys are only counted") for text in warned] == 99 * [False] + [True]
 
 
 def test_newer_layout_is_read_with_its_publishers_schema(
@@ -626,16 +650,20 @@ def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, raw: Sessio
     assert len(questions) <= 1
 
 
-def test_hostile_answers_do_not_reach_a_script(client: Client, raw: Session) -> None:
-    """A status that is no JSON, or nested without end, is left out."""
+def test_hostile_answers_do_not_reach_a_script(client: Client, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
+    """A status that is no JSON, or nested without end, is left out, with one line for all of them."""
 
     def reply(query: zenoh.Query) -> None:
         with query:
             query.reply("nedbus/@service/evil/status", b"[" * 100_000)
+            for number in range(20):
+                query.reply(f"nedbus/@service/{'x' * 30_000}{number}/status", b"junk")
 
-    queryable = raw.declare_queryable("nedbus/@service/evil/status", zenoh.handlers.Callback(reply, indirect=False))
+    queryable = raw.declare_queryable("nedbus/@service/*/status", zenoh.handlers.Callback(reply, indirect=False))
     assert client.services() == []
     queryable.undeclare()
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert [text.endswith(": an answer that is not JSON") and len(text) < 1000 for text in warned] == [True]
 
 
 def test_junk_does_not_displace_a_waiting_sample(client: Client, raw: Session, bus: nedbus.Bus) -> None:

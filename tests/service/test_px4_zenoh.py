@@ -16,8 +16,20 @@ from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 import nedbus
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4_streams import NotAcceptedError, StreamRegistry, track_sequence
+from nedbus.sources.px4_zenoh import _Inbox
 from nedbus.transport import BRIDGED_ENCODING, NO_HASH, Attachment, Session, TopicKey
-from nedbus_msgs import ANY, LAYOUTS, ROS2_TYPE, DecodeError, dds_type, downgrade, encode_cdr, type_hash, upgrade
+from nedbus_msgs import (
+    ANY,
+    LAYOUTS,
+    ROS2_TYPE,
+    ROS2_TYPES,
+    DecodeError,
+    dds_type,
+    downgrade,
+    encode_cdr,
+    type_hash,
+    upgrade,
+)
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
 
 from .test_ros2 import Peer, flight, peer
@@ -319,6 +331,20 @@ def test_hostile_keys_leave_the_status_readable(serve: Serve, raw: Session, bus:
         raw.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
         raw.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
     wait_for(lambda: status(bus).get("rejected") == 200, what="the status")
+
+
+def test_what_waits_to_be_decoded_is_small(raw: Session) -> None:
+    """What is too long for ROS 2, and large payloads, do not wait; they are counted."""
+    inbox = _Inbox("px4-zenoh:")
+    name = dds_type(ROS2_TYPES[0])
+    inbox.subscribe(raw, name, domain=None)
+    for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):
+        raw.put(f"0/{topic}/{name}/hash", payload)
+    waiting = [inbox.pending.get(timeout=DEADLINE) for _ in range(2)]
+    assert [str(sample.key_expr).split("/")[1] for sample in waiting] == ["a", "last"]
+    assert [(each.where, each.count) for each in inbox.overflow()] == [("size", 2)]
+    assert not list(inbox.overflow())
+    inbox.close()
 
 
 def test_service_connects_to_its_own_router(run_nedbus: Start, tmp_path: Path) -> None:

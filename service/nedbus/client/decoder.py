@@ -40,6 +40,8 @@ WAKE_UP: Final = "nedbus/wake-up"
 Decode = Callable[..., M_co]
 """`nedbus_msgs.decode` or `decode_row`: a payload, and `newer` layouts, to a message."""
 
+_MAX_WARNED: Final = 100  # keys whose invalid messages are logged
+_MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
 _UNKNOWN: Final = Provenance()
 
 
@@ -70,14 +72,14 @@ Arrival = tuple[Stream, bytes, RawSample | Kept, int]
 
 
 class Decoder:
-    """Decode what arrives, and count what is invalid; its reason is logged once for each key."""
+    """Decode what arrives, and count what is invalid; its reason is logged once for each of the first 100 keys."""
 
     def __init__(self, layouts: LayoutLookup, *, prefix: str) -> None:
         self.invalid = 0
         self._layouts = layouts
         self._prefix = prefix
         self._streams: dict[str, Stream] = {}
-        self._warned: set[str] = set()
+        self._warned: set[int] = set()  # hashes of keys, which may be long
         self._counting = threading.Lock()  # whoever receives and whoever reads both reject
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
@@ -144,15 +146,17 @@ class Decoder:
             self.invalid += count
 
     def reject(self, key: str, error: Exception) -> None:
-        """Count an invalid sample, and log why, once for each key."""
+        """Count an invalid sample, and log why, once for each of the first 100 keys: a peer may have any number."""
         self.count_invalid(1)
         with self._counting:
-            if key in self._warned or len(self._warned) >= MAX_KEYS:
+            if len(self._warned) >= _MAX_WARNED or hash(key) in self._warned:
                 return
-            self._warned.add(key)
+            self._warned.add(hash(key))
+            last = "; further keys are only counted" if len(self._warned) == _MAX_WARNED else ""
         stream = self._streams.get(key)
-        extra = about("invalid", stream.address if stream else None, reason=str(error))
-        _log.warning("%r: %s", key, error, extra=extra)
+        reason = str(error)[:_MAX_TEXT]
+        extra = about("invalid", stream.address if stream else None, reason=reason)
+        _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
     def _inspect(self, payload: bytes, kind: zenoh.SampleKind) -> None:
         if len(payload) == PAYLOAD_SIZE:

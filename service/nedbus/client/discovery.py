@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from nedbus.log_event import about
@@ -14,20 +14,20 @@ from nedbus_msgs import ANY, schema_key, status_key
 _log = logging.getLogger(__name__)
 
 _MAX_FIELDS: Final = 256  # of a layout
+_MAX_TEXT: Final = 300  # characters of a key that are logged
 _MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
     """Return the status of every nedbus service, as it reports it."""
     answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
-    return [status for raw in answers if isinstance(status := _parse_json(raw), dict)]
+    return [status for status in _parse(answers) if isinstance(status, dict)]
 
 
 def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
     """Ask publishers for the field names of all layouts, by number; of different answers for one the first counts."""
     found: dict[int, Sequence[str]] = {}
-    for raw in query(session, schema_key(prefix=prefix), timeout=0.5, newest=False):
-        content = _parse_json(raw)
+    for content in _parse(query(session, schema_key(prefix=prefix), timeout=0.5, newest=False)):
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts if isinstance(layouts, list) else ():
             number = layout.get("wire") if isinstance(layout, dict) else None
@@ -37,14 +37,19 @@ def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
     return found
 
 
-def _parse_json(raw: RawSample) -> object:
-    if len(raw.payload) > _MAX_ANSWER:
-        return None
-    try:
-        return json.loads(raw.payload.to_bytes())
-    except (ValueError, RecursionError):
-        _log.warning("%r: an answer that is not JSON", str(raw.key_expr), extra=about("invalid", reason="no JSON"))
-        return None
+def _parse(answers: Iterable[RawSample]) -> Iterator[object]:
+    """Yield the content of answers; the first that is not JSON is logged, as a peer may send any number."""
+    logged = False
+    for raw in answers:
+        if len(raw.payload) > _MAX_ANSWER:
+            continue
+        try:
+            yield json.loads(raw.payload.to_bytes())
+        except (ValueError, RecursionError):
+            if not logged:
+                key = str(raw.key_expr)[:_MAX_TEXT]
+                _log.warning("%r: an answer that is not JSON", key, extra=about("invalid", reason="no JSON"))
+            logged = True
 
 
 def _field_names(layout: object) -> Sequence[str] | None:

@@ -75,4 +75,4 @@ class VehicleDirectory:
             try:
                 self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
             except AddressError:
-                _log.debug("%.200r: a liveliness token that is not one of nedbus", key)
+                _log.debug("%r: a liveliness token that is not one of nedbus", key[:200])

@@ -13,6 +13,7 @@ from nedbus_msgs import Address, AddressError, DecodeError, decode
 
 _RING: Final = 16_384  # samples that may arrive until they are looked at
 _MAX_KEYS: Final = 2000
+_LONGEST: Final = 1024  # characters of a key that is remembered
 _MAX_PUBLISHERS: Final = 8  # that are told apart, for each key
 
 
@@ -60,7 +61,7 @@ class Traffic:
         key = str(sample.key_expr)
         stream = self.streams.get(key)
         if stream is None:
-            if len(self.streams) >= _MAX_KEYS:
+            if len(self.streams) >= _MAX_KEYS or len(key) > _LONGEST:
                 return
             stream = self.streams[key] = Stream(_address_of(key, self._prefix))
         stream.count += 1

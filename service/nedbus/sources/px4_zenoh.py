@@ -6,6 +6,7 @@ import logging
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from typing import Final
@@ -16,6 +17,7 @@ from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
+    LONGEST_TOKEN,
     Attachment,
     PublisherToken,
     Session,
@@ -40,6 +42,9 @@ _JOIN: Final = 3.0  # s
 _TICK: Final = 0.25  # s
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 _MAX_PAYLOAD: Final = 1024  # bytes
+_LARGEST_PENDING: Final = 4096  # bytes of a payload that waits
+_TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
+_TOO_LARGE: Final = "size", f"a payload of more than {_LARGEST_PENDING} bytes, or a key that is too long"
 
 
 class Px4ZenohSource:
@@ -105,7 +110,8 @@ class _Inbox:
         self._subscribers: list[zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = []
         self._tokens: list[zenoh.Handler[zenoh.Sample]] = []
         self._threads: list[threading.Thread] = []
-        self._dropped = self._reported = 0
+        self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
+        self._reported = Counter[tuple[str, str]]()
 
     def subscribe(self, session: Session, dds_type: str, *, domain: int | None) -> None:
         """Receive the messages of a type, and before them the tokens of those who publish them."""
@@ -137,10 +143,10 @@ class _Inbox:
 
     def overflow(self) -> Iterator[Rejection]:
         """Yield how many messages were dropped since the last call."""
-        dropped = self._dropped
-        if dropped > self._reported:
-            yield Rejection("queue", "messages arrive faster than they are decoded", count=dropped - self._reported)
-            self._reported = dropped
+        new = self._dropped - self._reported
+        for (where, reason), count in new.items():
+            yield Rejection(where, reason, count=count)
+        self._reported += new
 
     def close(self) -> None:
         """Receive no more."""
@@ -153,11 +159,15 @@ class _Inbox:
     def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
         with suppress(zenoh.ZError):  # undeclared
             while True:
-                sample = handler.recv()
-                if self.pending.qsize() < _MAX_PENDING:
-                    self.pending.put(sample)
-                else:
-                    self._dropped += 1
+                self._put(handler.recv())
+
+    def _put(self, sample: zenoh.Sample) -> None:
+        if self.pending.qsize() >= _MAX_PENDING:
+            self._dropped[_TOO_FAST] += 1
+        elif len(sample.payload) > _LARGEST_PENDING or len(str(sample.key_expr)) > LONGEST_TOKEN:
+            self._dropped[_TOO_LARGE] += 1
+        else:
+            self.pending.put(sample)
 
 
 class _Decoder:

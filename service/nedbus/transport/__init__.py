@@ -23,6 +23,7 @@ from .queries import (
 from .refusals import log_refusals
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
+    LONGEST_TOKEN,
     NO_HASH,
     Attachment,
     PublisherToken,
@@ -72,6 +73,7 @@ __all__ = [
     "DAYS",
     "DEFAULT_ENDPOINT",
     "LEASE",
+    "LONGEST_TOKEN",
     "MAX_ANSWERS",
     "NO_HASH",
     "RENEW_WITHIN",

@@ -32,6 +32,9 @@ _DOMAINS: Final = 10**9
 _LENGTH: Final = 512  # characters of a key; PX4 and ROS 2 have half as many
 _PX4_NODE = re.compile(r"px4_([0-9a-f]{32})")
 
+LONGEST_TOKEN: Final = 2 * _LENGTH
+"""Characters of a liveliness token; a longer one is none of ROS 2's."""
+
 
 @dataclass(frozen=True, slots=True)
 class TopicKey:
@@ -98,7 +101,7 @@ class PublisherToken:
     def parse(cls, text: str) -> Self:
         """Parse the token of a publisher; raise DecodeError for anything else."""
         parts = text.split("/")
-        if len(parts) != 13 or parts[0] != "@ros2_lv" or parts[5] != "MP" or len(text) > 2 * _LENGTH:
+        if len(parts) != 13 or parts[0] != "@ros2_lv" or parts[5] != "MP" or len(text) > LONGEST_TOKEN:
             raise DecodeError("a liveliness token that is not that of a publisher")
         _, domain, session, _, _, _, _, _, node, topic, dds_type, type_hash, _ = parts
         name = topic.replace("%", "/").strip("/")
