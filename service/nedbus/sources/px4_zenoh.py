@@ -36,7 +36,7 @@ from .source import Rejection, SourceContext, SourceMessage
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
-_CHANNEL: Final = 4096  # samples that arrive until a thread of ours takes them
+_CHANNEL: Final = 16_384  # samples that arrive until a thread of ours takes them
 _MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
 _JOIN: Final = 3.0  # s
 _TICK: Final = 0.25  # s
