@@ -71,6 +71,39 @@ def test_shown_options_exist() -> None:
     assert set(rows) == set(SOURCE_KINDS["ulog"].options.model_fields)
 
 
+BARE_EXTRA = re.compile(r"(?<![\w./])nedbus\[[^\]\n]*\](?! @ )")
+INSTALL = re.compile(r"\b(?:pip3?|pipx|uv)\b.*\b(?:install|download|run|add)\b(.*)")
+BARE_NAME = re.compile(r"""(?<![^\s"'`])nedbus(?=[\s"'`=<>~!]|$)(?! @ )""")
+
+
+def bare_names(text: str) -> list[str]:
+    """Return what a text shows to pip by our name alone, without a path or an address."""
+    commands = [(match[0], match[1]) for match in INSTALL.finditer(text)]
+    return BARE_EXTRA.findall(text) + [whole for whole, arguments in commands if BARE_NAME.search(arguments)]
+
+
+def test_nothing_is_installed_by_our_name() -> None:
+    """On PyPI the name is not ours: whatever is installed is named with a path or an address."""
+    for refused in (
+        'pip install "nedbus[web]"',
+        "pip install -U nedbus",
+        "pip install nedbus==1",
+        "extra `nedbus[all]`",
+    ):
+        assert bare_names(refused), refused
+    for allowed in (
+        'pip install ".[web]"',
+        "pip install ./nedbus-1.whl",
+        "pip install 'nedbus[web] @ git+ssh://host/x'",
+    ):
+        assert not bare_names(allowed), allowed
+    folders = ("docs", "service", "schemas", "examples", "packaging", "config")
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*") if file.is_file()]
+    files += [*ROOT.glob("*.md"), *ROOT.glob("*.yml"), ROOT / "Dockerfile", ROOT / "Makefile"]
+    texts = {file: file.read_text() for file in files if file.suffix not in (".png", ".pyc")}
+    assert {str(file): names for file, text in texts.items() if (names := bare_names(text))} == {}
+
+
 def test_links_lead_somewhere() -> None:
     """Every link to a file of this project has a file at its end."""
     for page in (ROOT / "README.md", *ROOT.glob("docs/*.md"), ROOT / "CONTRIBUTING.md"):

@@ -36,7 +36,7 @@ def arguments_of(command: str, **others: str) -> list[str]:
 def test_all_commands_are_known() -> None:
     """No command on the page that no test runs, but the installation."""
     others = set(COMMANDS) - {*SERVES, *ROS2}
-    assert others == {"nedbus echo vehicle_local_position", 'pip install "nedbus[mavlink]"'}
+    assert others == {"nedbus echo vehicle_local_position", 'pip install ".[mavlink]"'}
     assert len(SERVES) == 5
     assert len(ROS2) == 6
 

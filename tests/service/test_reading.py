@@ -155,7 +155,7 @@ def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.Mo
     for name in ("reader", "chunks"):
         monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
-    with pytest.raises(ConfigError, match=r"mcap: not installed: pip install 'nedbus\[mcap\]'"):
+    with pytest.raises(ConfigError, match=r"^mcap: not installed: .*pip install .*\[mcap\]'$"):
         nedbus.read(flight)
 
 

@@ -1,7 +1,7 @@
 """Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
 
 The common name of a certificate is what the access control of `config/router-secure.json5` matches.
-Needs the package `cryptography`: `pip install "nedbus[pki]"`.
+Needs the package `cryptography`, the extra `pki`.
 """
 
 from __future__ import annotations
