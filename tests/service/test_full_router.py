@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import ssl
 import threading
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from nedbus.doctor.endpoint import check_endpoint
 from nedbus.transport import make_authority, make_certificate, open_router
 from nedbus.transport.full_router import full_router
 from tests.conftest import DEADLINE, free_endpoint
+from tests.service.test_pki_fleet import without_identifiers
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -44,11 +46,23 @@ def test_who_is_turned_away_is_told(tmp_path: Path) -> None:
         router.close()
 
 
-def test_with_certificates(tmp_path: Path) -> None:
-    """The same over mutual TLS, and in the words of the doctor."""
+def strict_context(**given: str) -> ssl.SSLContext:
+    """Return what `ssl.create_default_context` returns from Python 3.13 on."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.verify_flags |= ssl.VERIFY_X509_STRICT
+    context.load_verify_locations(given["cafile"])
+    return context
+
+
+@pytest.mark.parametrize("old", [False, True], ids=["whole", "without identifiers"])
+def test_with_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, old: bool) -> None:
+    """The same over mutual TLS, on any Python, with old certificates too, and in the words of the doctor."""
+    monkeypatch.setattr(ssl, "create_default_context", strict_context)
     make_authority(tmp_path)
     make_certificate(tmp_path, "router", hosts=["127.0.0.1"])
     make_certificate(tmp_path, "reader")
+    for name in ("ca", "router", "reader") if old else ():
+        without_identifiers(tmp_path / f"{name}.crt", tmp_path / "ca.key")
     files = [str(tmp_path / name) for name in ("ca.crt", "reader.crt", "reader.key")]
     endpoint = free_endpoint().replace("tcp/", "tls/")
     router = open_router(config_file=write_config(tmp_path, "router-secure.json5", endpoint))

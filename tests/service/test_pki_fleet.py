@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import ssl
 import stat
 import subprocess
 import sys
@@ -15,6 +16,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 import nedbus
 from nedbus.daemon import check_service
@@ -342,6 +346,69 @@ def test_authority_is_renewed_under_what_it_signed(start: Start, file: Path, pki
     assert list_certificates(pki)[0].until > first.until + timedelta(days=3000)
     start_zenohd(start, "-c", str(file))
     join("reader")
+
+
+def mistrust(ca: Path, server: nedbus.Tls, client: nedbus.Tls, *, strict: bool) -> str:
+    """Return why one of two does not trust the other in a handshake with mutual TLS, "" if both do."""
+    sides = []
+    pipes = ssl.MemoryBIO(), ssl.MemoryBIO()
+    for own, is_server in ((server, True), (client, False)):
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if is_server else ssl.PROTOCOL_TLS_CLIENT)
+        context.verify_mode = ssl.CERT_REQUIRED
+        if strict:  # as create_default_context does from Python 3.13 on
+            context.verify_flags |= ssl.VERIFY_X509_STRICT
+        context.load_verify_locations(ca)
+        assert own.certificate is not None
+        context.load_cert_chain(own.certificate, own.key)
+        host = None if is_server else "127.0.0.1"
+        incoming, outgoing = pipes if is_server else pipes[::-1]
+        sides.append(context.wrap_bio(incoming, outgoing, server_side=is_server, server_hostname=host))
+    for _ in range(5):
+        for side in sides:
+            try:
+                side.do_handshake()
+            except ssl.SSLWantReadError:
+                continue
+            except ssl.SSLCertVerificationError as exc:
+                return exc.verify_message
+    return ""
+
+
+def without_identifiers(path: Path, authority: Path) -> None:
+    """Sign a certificate again as nedbus did before: without the identifiers of its key and its authority's."""
+    old = x509.load_pem_x509_certificate(path.read_bytes())
+    builder = x509.CertificateBuilder(
+        old.issuer, old.subject, old.public_key(), old.serial_number, old.not_valid_before_utc, old.not_valid_after_utc
+    )
+    for each in old.extensions:
+        if not isinstance(each.value, x509.SubjectKeyIdentifier | x509.AuthorityKeyIdentifier):
+            builder = builder.add_extension(each.value, critical=each.critical)
+    key = serialization.load_pem_private_key(authority.read_bytes(), password=None)
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    path.write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+
+
+def test_certificates_are_whole(pki: Path) -> None:
+    """Python's TLS takes them as it is from 3.13 on (VERIFY_X509_STRICT), renewed ones too."""
+    router, reader = tls_of(pki, "router"), tls_of(pki, "reader")
+    assert mistrust(pki / "ca.crt", router, reader, strict=True) == ""
+    for entry in list_certificates(pki):
+        renew_certificate(entry, replace_key=entry.name == "reader")
+        assert mistrust(pki / "ca.crt", router, reader, strict=True) == "", f"after {entry.name} was renewed"
+
+
+def test_certificates_without_identifiers_go_on_working(pki: Path) -> None:
+    """Those of earlier versions are as good as before, with renewed ones too, and whole when all are renewed."""
+    for name in ("ca", "router", "reader"):
+        without_identifiers(pki / f"{name}.crt", pki / "ca.key")
+    router, reader = tls_of(pki, "router"), tls_of(pki, "reader")
+    assert mistrust(pki / "ca.crt", router, reader, strict=False) == ""
+    assert "Identifier" in mistrust(pki / "ca.crt", router, reader, strict=True)
+    entries = {entry.name: entry for entry in list_certificates(pki)}
+    for name in ("reader", "ca", "router"):
+        renew_certificate(entries[name])
+        assert mistrust(pki / "ca.crt", router, reader, strict=False) == "", f"after {name} was renewed"
+    assert mistrust(pki / "ca.crt", router, reader, strict=True) == ""
 
 
 def test_shipped_file_is_what_rules_writes(tmp_path: Path) -> None:

@@ -82,6 +82,7 @@ class Authority:
     ) -> x509.Certificate:
         """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
         builder = _builder(_name(name), self.certificate.subject, key, days, end=self.certificate.not_valid_after_utc)
+        builder = builder.add_extension(self._identifier(), critical=False)
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         builder = builder.add_extension(_usage(sign_certificates=False), critical=True)
         # A router is a client of other routers too.
@@ -91,11 +92,21 @@ class Authority:
             builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
         return builder.sign(self.key, hashes.SHA256())
 
+    def _identifier(self) -> x509.AuthorityKeyIdentifier:
+        """Return the identifier of the CA's key; a CA without one is given this one when it is renewed."""
+        try:
+            own = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
+        except x509.ExtensionNotFound:
+            return x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
+        return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(own)
+
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int = CA_DAYS) -> x509.Certificate:
     """Return the certificate of a CA for its key; what that key signed before stays valid under it."""
     name = _name("nedbus CA")
     builder = _builder(name, name, key.public_key(), days)
+    identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key())
+    builder = builder.add_extension(identifier, critical=False)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(sign_certificates=True), critical=True)
     return builder.sign(key, hashes.SHA256())
@@ -159,6 +170,8 @@ def _builder(
         # A vehicle's clock may be behind when it boots.
         .not_valid_before(min(now, until) - dt.timedelta(days=1))
         .not_valid_after(until if end is None else min(until, end))
+        # Python asks for both key identifiers from 3.13 on, Zenoh does not.
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
     )
 
 
