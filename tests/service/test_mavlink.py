@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.errors import ConfigError
 from nedbus.sources import parse_source
-from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, OutOfOrderError, Vehicle
+from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, OutOfOrderError, Vehicle, request_rates
 from nedbus_msgs import upgrade
 from tests.conftest import DEADLINE, LOGS, Process, Start, free_port, wait_for
 from tests.replays import open_replay
@@ -157,6 +157,7 @@ def test_vehicles_on_one_port(fly: Fly, bus: nedbus.Bus, every: nedbus.Subscript
 
     wait_for(lambda: all(requested(vehicle).keys() == expected for vehicle in fleet.values()), what="all requests")
     assert all(requested(vehicle)[32] == 20_000 for vehicle in fleet.values())
+    assert all(requested(vehicle)[230] == 500_000 for vehicle in fleet.values())  # the link is full without it
     seen = {every.receive(DEADLINE).vehicle for _ in range(200)}
     assert seen == {"3", "250"}
     assert sorted(bus.vehicles()) == ["250", "3"]
@@ -276,7 +277,7 @@ def test_denied_origin_is_told_once_and_not_before_there_can_be_one(service: Pro
 )
 def test_constant_position_mode_is_no_sign_of_rest(flags: int, expected: bool) -> None:
     """Its bit counts where no horizontal velocity is valid: it was the opposite of that until PX4's 48f1687d3a."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     vehicle.handle(dialect.MAVLink_estimator_status_message(0, flags, 0, 0, 0, 0, 0, 0, 1.0, 1.0), 100.0)
     fields = vehicle.handle(position(1), 100.0)
     assert fields is not None
@@ -362,9 +363,23 @@ def position(ms: int) -> SimpleNamespace:
     return SimpleNamespace(get_type=lambda: "LOCAL_POSITION_NED", time_boot_ms=ms, **values)
 
 
+@pytest.mark.parametrize(
+    ("rate", "baud", "status"),
+    [(30.0, 57600, 13.04), (20.0, 57600, 20.0), (45.0, 57600, 2.0), (50.0, 115200, 50.0), (0.5, 57600, 2.0)],
+)
+def test_flags_are_requested_as_often_as_the_link_carries(rate: float, baud: int, status: float) -> None:
+    """ESTIMATOR_STATUS comes with each position where there is room for it, else with what room there is."""
+    rates = request_rates(rate, baud)
+    assert rates.keys() == STREAMS.keys()
+    assert (rates[32], rates[331]) == (rate, 10.0)
+    assert rates[230] == pytest.approx(status, abs=0.01)
+    if status > 2:
+        assert sum(STREAMS[number] * hertz for number, hertz in rates.items()) <= 0.9 * baud / 10 + 0.01
+
+
 def test_requests_are_repeated_five_times() -> None:
     """Each stream is requested up to five times, 1 s apart, then the next; the origin until it is known."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     requested: list[int] = []
     for tick in range(200):
         now = 100.0 + tick / 2
@@ -377,7 +392,7 @@ def test_requests_are_repeated_five_times() -> None:
 
 def test_answer_ends_a_request() -> None:
     """After any answer the next stream is requested; once all are and the origin is known, nothing is requested."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     requested: list[tuple[int, float]] = []
     for tick in range(20):
         now = 100.0 + tick
@@ -397,7 +412,7 @@ def test_answer_ends_a_request() -> None:
 
 def test_reordered_and_duplicate_messages_are_not_lost() -> None:
     """Datagrams that arrive out of order, or twice, do not count as lost."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     for sequence in (10, 12, 11, 13, 13, 14, 100, 200, 0):
         vehicle.track_sequence(1, sequence, 100.0)
     assert vehicle.lost == 85 + 99 + 55
@@ -405,7 +420,7 @@ def test_reordered_and_duplicate_messages_are_not_lost() -> None:
 
 def test_positions_that_stop_are_requested_again() -> None:
     """The streams of a vehicle that sends messages, but no positions, are requested again."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     requested: list[int] = []
     for tick in range(400):
         now = 100.0 + tick / 10
@@ -421,7 +436,7 @@ def test_positions_that_stop_are_requested_again() -> None:
 
 def test_expired_values_are_not_provided() -> None:
     """A heading that is not repeated is not provided after 2 s; an origin stays until a reboot."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 9000), 100.0)
     vehicle.handle(dialect.MAVLink_gps_global_origin_message(473977418, 85455939, 488000), 100.0)
     first = vehicle.handle(position(1000), 101.0)
@@ -442,7 +457,7 @@ def test_expired_values_are_not_provided() -> None:
 
 def test_yaw_of_the_attitude_replaces_the_heading() -> None:
     """Without a global position PX4 sends no GLOBAL_POSITION_INT; the heading is then the yaw of its attitude."""
-    vehicle = Vehicle(30.0)
+    vehicle = Vehicle(30.0, 57600)
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
     fields = vehicle.handle(position(1), 100.0)

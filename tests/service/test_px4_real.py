@@ -6,6 +6,7 @@ They are played as fast as the service takes them, so that no test depends on th
 
 from __future__ import annotations
 
+import bisect
 import gzip
 import json
 import socket
@@ -19,10 +20,12 @@ from typing import Any, Final, Self, cast
 
 import pytest
 import zenoh
+from pymavlink.dialects.v20 import common as dialect
 
 import nedbus
+from nedbus.sources.mavlink_vehicle import Vehicle, request_rates
 from nedbus.transport import Attachment, Session
-from nedbus_msgs import ANY, Address, decode_cdr, encode_cdr, split_ros2_topic, upgrade
+from nedbus_msgs import ANY, Address, VehicleLocalPosition, decode_cdr, encode_cdr, split_ros2_topic, upgrade
 from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, wait_for
 from tests.replays import open_replay
 from tests.zenohd import start_zenohd
@@ -38,6 +41,7 @@ ALIKE: Final = PX4 / "two_alike_zenoh.jsonl.gz"
 MAVLINK: Final = PX4 / "gps_loss_mavlink.bin.gz"
 WINDOW: Final = 100  # messages that are on their way at once
 VLP = "vehicle_local_position"
+FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
 
 pytestmark = [
     pytest.mark.logs,
@@ -303,6 +307,45 @@ def is_position(datagram: bytes) -> bool:
     return False
 
 
+def count_late_flags(name: str, rate: float) -> int:
+    """Return how many positions of a flight have a flag that the log has not, if a status comes at this rate.
+
+    The positions are those that a real PX4 sent, the flags of a status those of its log at that time.
+    """
+    logged = {}
+    for message in open_replay(f"ulog:{PX4 / name}.ulg").messages:
+        if message.address.topic == VLP:
+            estimate = upgrade(message.fields)
+            logged[estimate.timestamp] = estimate
+    times = sorted(logged)
+
+    def truth(microseconds: float) -> VehicleLocalPosition:
+        return logged[times[bisect.bisect(times, microseconds) - 1]]
+
+    vehicle, parser = Vehicle(30.0, 57600), dialect.MAVLink(None)
+    late = turn = 0
+    for _, datagram in read_datagrams(PX4 / f"{name}_mavlink.bin.gz"):
+        for position in parser.parse_buffer(datagram) or []:
+            if position.get_type() != "LOCAL_POSITION_NED":
+                continue
+            now = position.time_boot_ms / 1000
+            if int(now * rate) > turn:
+                turn = int(now * rate)
+                then = truth(1e6 * turn / rate)
+                bits = 2 * then.v_xy_valid | 4 * then.v_z_valid | 24 * then.xy_valid | 32 * then.z_valid
+                vehicle.handle(dialect.MAVLink_estimator_status_message(0, bits, *[0.0] * 6, 1.0, 1.0), now)
+            fields = vehicle.handle(position, now) or {}
+            late += any(fields.get(flag, False) != getattr(truth(1000 * position.time_boot_ms), flag) for flag in FLAGS)
+    return late
+
+
+@pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
+def test_flags_are_hardly_late_at_the_rate_that_is_requested(name: str) -> None:
+    """Over a link of 57,600 baud a third, at most, of the positions have late flags that had with two a second."""
+    often, seldom = (count_late_flags(name, rate) for rate in (request_rates(30.0, 57600)[230], 2.0))
+    assert 0 < 3 * often <= seldom
+
+
 def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
     """Position and velocity equal the log's to the bit, and so do the flags, but for what is younger than their source.
 
@@ -314,7 +357,6 @@ def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
     Recorded from a real PX4, which nobody had asked for anything: gps_loss_mavlink.bin.gz, gps_loss.ulg.
     """
     names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")
-    flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
     logged = {}
     for message in open_replay(f"ulog:{LOG}").messages:
         if message.address.topic == VLP:
@@ -342,13 +384,13 @@ def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
                 continue  # the very last one, after the log was closed
             compared += 1
             assert [fields[name] for name in names] == [row[name] for name in names]
-            for flag in flags:
+            for flag in FLAGS:
                 differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += fields[flag] != row[flag]
         wait_until_counted(bus, 1276)
         now = status(bus)
     assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (1276, 0, 0, 0)
     assert compared == 1275
     vertical, horizontal = {1: 11}, {3: 11, 28: 8, 30: 4}
-    for flag in flags:
+    for flag in FLAGS:
         found = {second: count for (name, second), count in differing.items() if name == flag and count}
         assert found == (horizontal if "xy" in flag else vertical)

@@ -102,7 +102,7 @@ class _LinkSession:
         now = time.monotonic()
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            vehicle = self._vehicles[system] = Vehicle(self._options.rate)
+            vehicle = self._vehicles[system] = Vehicle(self._options.rate, self._options.baud)
         self._peers[system] = peer
         vehicle.track_sequence(component, sequence, now)
         address = Address(self._vehicle_of(system), DEFAULT_TOPIC)

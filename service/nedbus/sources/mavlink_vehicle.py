@@ -15,7 +15,7 @@ from nedbus_msgs import FLAGS
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
 _VALUE_TIMEOUT: Final = 2.0  # s after which a value is no longer part of the estimate
-_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS less often
+_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second if nobody requests it
 _SILENCE: Final = 3.0  # s after which all state is reset
 _ACK_TIMEOUT: Final = 1.0  # s until a request is repeated
 _MAX_TRIES: Final = 5
@@ -28,8 +28,14 @@ _POS_HORIZ_REL, _POS_HORIZ_ABS, _POS_VERT_ABS = 8, 16, 32
 _CONST_POS_MODE: Final = 128
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
-STREAMS: Final = {32: None, 230: 2.0, 33: 10.0, 141: 10.0, 331: 10.0}
-"""The messages that an estimate is made of, and the rates to request [Hz]; None: positions, at the option's rate."""
+_POSITION, _STATUS = 32, 230
+STREAMS: Final = {_POSITION: 40, _STATUS: 54, 33: 40, 141: 44, 331: 244}
+"""The messages that an estimate is made of, in the order of requests, and their bytes on a link: a PX4's, MAVLink 2."""
+
+_RATE: Final = 10.0  # Hz, of what is neither position nor status
+_MIN_STATUS_RATE: Final = 2.0  # Hz, on a link that is full without it
+_USABLE: Final = 0.9  # of a link; the rest is for heartbeats and answers
+_BITS: Final = 10  # of a byte on a serial line, with start and stop
 
 
 @dataclass(slots=True, eq=False)
@@ -47,11 +53,19 @@ class OutOfOrderError(Exception):
     """Raised for a position that arrives after a newer one."""
 
 
+def request_rates(rate: float, baud: int) -> dict[int, float]:
+    """Return the rates to request [Hz]: ESTIMATOR_STATUS as often as positions, at `rate`, if the link carries that."""
+    rates = dict.fromkeys(STREAMS, _RATE) | {_POSITION: rate, _STATUS: 0.0}
+    free = _USABLE * baud / _BITS - sum(size * rates[number] for number, size in STREAMS.items())
+    rates[_STATUS] = max(_MIN_STATUS_RATE, min(rate, free / STREAMS[_STATUS]))
+    return rates
+
+
 class Vehicle:
     """The state of one vehicle: pass messages to `handle`, and send what `requests` yields."""
 
-    def __init__(self, rate: float) -> None:
-        self._rates = {number: rate if hertz is None else hertz for number, hertz in STREAMS.items()}
+    def __init__(self, rate: float, baud: int) -> None:
+        self._rates = request_rates(rate, baud)
         self._sequences: dict[int, int] = {}  # by component
         self._last_ms: int | None = None
         self._wraps = 0

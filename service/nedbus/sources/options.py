@@ -96,7 +96,9 @@ class MavlinkOptions(Options):
     rate: Annotated[float, Field(ge=0.1, le=200)] = Field(
         30.0, description="positions a second to request from the vehicle, 0.1 to 200"
     )
-    baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(57600, description="of a serial port, 300 to 12000000")
+    baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(
+        57600, description="of a serial port, or of the radio on the way, 300 to 12000000"
+    )
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
     )
