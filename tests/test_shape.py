@@ -84,7 +84,7 @@ ONLY: dict[str, set[str]] = {
         "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check", "nedbus/cli/doctor", "nedbus/cli/web",
     },
 }  # fmt: skip
-MAX_LINES = 250
+MAX_LINES = 400
 
 FILES = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
 from nedbus import Counts
+from nedbus.client import receive_queue as module
 from nedbus.client.publisher_sequence import Hole
 from nedbus.client.questions import Question
 from nedbus.client.receive_queue import ReceiveQueue
@@ -146,7 +149,7 @@ def test_message_that_was_on_its_way_is_not_doubled(recovering: Recovering) -> N
     recovering.fill(1, 2)
     recovering.put(2, 3)
     assert recovering.numbers == [0, 1, 2, 3]
-    assert recovering.queue.counts == Counts(received=4)
+    assert recovering.queue.counts == Counts(received=4, discarded=2)
 
 
 def test_publisher_that_is_new_begins_with_its_newest_message(recovering: Recovering) -> None:
@@ -202,7 +205,7 @@ def test_heartbeat_never_doubles_what_comes_by_itself(  # noqa: PLR0917 - a tabl
     numbers = recovering.numbers
     assert numbers == sorted(set(numbers))
     assert set(read) <= set(numbers)
-    assert recovering.queue.counts == Counts(received=len(numbers))
+    assert dataclasses.replace(recovering.queue.counts, discarded=0) == Counts(received=len(numbers))
 
 
 def test_heartbeats_on_another_key_decide_nothing(recovering: Recovering) -> None:
@@ -289,12 +292,46 @@ def test_announced_messages_that_a_heartbeat_told_of_are_no_loss(recovering: Rec
 
 
 def test_message_that_comes_too_late_is_left_out(recovering: Recovering) -> None:
-    """It was given up before, and counted: the order that a reader sees is never broken."""
+    """It was given up before, and counted: the order that a reader sees is never broken, and it is counted as well."""
     recovering.put(0, 3)
     recovering.fill()
     recovering.put(1, 4)
     assert recovering.numbers == [0, 3, 4]
-    assert recovering.queue.counts == Counts(received=3, lost=2)
+    assert recovering.queue.counts == Counts(received=3, lost=2, discarded=1)
+
+
+def test_messages_under_the_id_of_another_publisher_are_counted(recovering: Recovering) -> None:
+    """The numbers of somebody who uses its id push the honest ones out of the sequence: a count tells of it."""
+    recovering.put(0, 1000)
+    recovering.fill()
+    recovering.put(*range(1, 1000))
+    assert recovering.numbers == [0, 1000]
+    assert recovering.queue.counts == Counts(received=2, lost=999, discarded=999)
+
+
+def test_what_is_released_pushes_out_nothing(recovering: Recovering, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What waited behind gaps of many false publishers takes the places that are free, and no others."""
+    monkeypatch.setattr(module, "CAPACITY", 20)
+    recovering.put(*range(15), publisher="honest")
+    for number in range(10):
+        recovering.put(0, 5, 6, 7, publisher=f"false {number}", key=OTHER_KEY)
+    while recovering.holes:
+        recovering.fill()
+    taken = [sample for sample in drain(recovering.queue) if sample.vehicle == "1"]
+    assert [sample.message.timestamp for sample in taken] == list(range(6, 16))
+
+
+def test_share_of_one_key_in_what_waits_is_bounded(recovering: Recovering) -> None:
+    """Whoever leaves gaps on one key has them given up, and not those of others."""
+    recovering.put(0, 2, 3, key=OTHER_KEY, publisher="honest")
+    for number in range(10):
+        recovering.put(0, 5, 6, 7, publisher=f"false {number}")
+    given_up = recovering.queue.excess(1000, 12)
+    assert {hole.stream for hole in given_up} == {KEY}
+    assert len(given_up) == 6
+    assert len(recovering.queue.excess(5, 12)) == 9
+    assert len(recovering.queue.excess(-1, -1)) == 11
+    assert not recovering.queue.excess(1000, 1000)
 
 
 def test_hole_is_filled_once(recovering: Recovering) -> None:

@@ -13,7 +13,7 @@ from nedbus.daemon.worker import Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
-from nedbus_msgs import Address, VehicleLocalPosition
+from nedbus_msgs import Address, VehicleLocalPosition, decode, encode_fields
 
 ONE, TWO = Address("1", "vehicle_local_position"), Address("2", "vehicle_local_position")
 Script = list[SourceMessage | Rejection | float | None]
@@ -52,7 +52,7 @@ class FakePublisher:
     published: list[tuple[float, VehicleLocalPosition]] = field(default_factory=list)
 
     def publish(self, fields: Mapping[str, object]) -> None:
-        self.published.append((self.clock.seconds, VehicleLocalPosition.model_validate(fields)))
+        self.published.append((self.clock.seconds, decode(encode_fields(fields))))
 
 
 class FakeRegistry:

@@ -100,7 +100,9 @@ def echo(
 
 def _write_counts(subscription: Subscription) -> None:
     counts = subscription.counts
-    if counts.lost or counts.dropped or counts.invalid:
+    if counts.lost or counts.dropped or counts.invalid or counts.discarded:
+        discarded = f", {counts.discarded} discarded" if counts.discarded else ""
         write_stderr(
             f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
+            f"{discarded}"
         )

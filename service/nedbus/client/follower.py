@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -11,7 +11,7 @@ from nedbus.transport import entity_name
 
 from .decoder import MAX_KEYS, Arrival, Decoder
 from .publisher_sequence import LARGEST_GAP, Hole
-from .sequence_tracker import HELD, SequenceTracker
+from .sequence_tracker import HELD, LATE, SequenceTracker
 
 if TYPE_CHECKING:
     from zenoh.ext import Miss
@@ -24,12 +24,12 @@ class Follower:
     """Note in arrivals what was lost before them, and hold those that come after a hole until it is filled.
 
     `unreported` are losses before a sample that was invalid or dropped, by the key of the stream. `held` counts the
-    arrivals that wait. Not thread-safe, but for `announce`.
+    arrivals that wait, `discarded` those that came twice or too late. Not thread-safe, but for `announce`.
     """
 
     def __init__(self, decoder: Decoder) -> None:
         self.tracker = SequenceTracker()
-        self.held = 0
+        self.held = self.discarded = 0
         self.unreported: dict[str, int] = {}
         self._keep = decoder.keep
         self._announcements: deque[Miss] = deque()
@@ -42,10 +42,22 @@ class Follower:
         """Whether there are holes."""
         return bool(self._waiting)
 
-    @property
-    def holes(self) -> list[Hole]:
-        """What somebody is to ask for, those for which most arrivals wait first."""
-        return sorted(self._waiting, key=lambda hole: -len(self._waiting[hole]))
+    def excess(self, total: int, of_key: int) -> list[Hole]:
+        """Return the holes to give up so that no more than `total` arrivals wait, and `of_key` of one key.
+
+        Those for which most arrivals wait come first.
+        """
+        held, by_key, found = self.held, Counter[str](), list[Hole]()
+        if held <= min(total, of_key):
+            return found
+        for hole, waiting in self._waiting.items():
+            by_key[hole.stream] += len(waiting)
+        for hole in sorted(self._waiting, key=lambda hole: -len(self._waiting[hole])):
+            if held > total or by_key[hole.stream] > of_key:
+                found.append(hole)
+                held -= len(self._waiting[hole])
+                by_key[hole.stream] -= len(self._waiting[hole])
+        return found
 
     def recover(self, on_hole: Callable[[Hole], object] | None) -> None:
         """Call `on_hole` with each hole from now on; it must not wait, and `fill` must follow. None: dig no more."""
@@ -150,6 +162,8 @@ class Follower:
             self.held += 1
         elif lost > 0:
             self.report_later(arrival[0].key, lost)
+        else:
+            self.discarded += lost == LATE
 
     def _announce_holes(self) -> None:
         dug, self.tracker.dug = self.tracker.dug, []

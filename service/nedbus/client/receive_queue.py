@@ -68,7 +68,8 @@ class ReceiveQueue:
         with self._lock:
             self._follower.apply_announcements()
             tracker = self._follower.tracker
-            return Counts(self._received, tracker.lost, self._dropped + tracker.dropped, self._decoder.invalid)
+            dropped = self._dropped + tracker.dropped
+            return Counts(self._received, tracker.lost, dropped, self._decoder.invalid, self._follower.discarded)
 
     @property
     def waiting(self) -> int:
@@ -81,7 +82,7 @@ class ReceiveQueue:
 
     @property
     def held(self) -> int:
-        """How many messages wait for those before them."""
+        """The number of messages that wait for those before them."""
         return self._follower.held
 
     @property
@@ -89,11 +90,10 @@ class ReceiveQueue:
         """Whether something is missing that may still come."""
         return self._follower.incomplete
 
-    @property
-    def holes(self) -> list[Hole]:
-        """What is missing, and may still come."""
+    def excess(self, total: int, of_key: int) -> list[Hole]:
+        """Return what is to be given up so that no more messages wait for those before them; see Follower."""
         with self._lock:
-            return self._follower.holes
+            return self._follower.excess(total, of_key)
 
     def beat(self, stream: str, publisher: str, number: int, *, begins: bool) -> None:
         """Note that a publisher has sent a message that should have arrived by now; see Follower."""
@@ -102,11 +102,19 @@ class ReceiveQueue:
             self._follower.beat(stream, publisher, number, begins=begins, unsettled=unsettled)
 
     def fill(self, hole: Hole, found: Sequence[RawSample]) -> None:
-        """Queue what was found of a hole, and what waited for it; what is still missing is lost."""
-        arrivals = self._decoder.admit(found)
+        """Queue what was found of a hole, and what waited for it; what is still missing is lost.
+
+        It takes the place of nothing that is queued: where there is no room for all, the oldest of it are dropped.
+        """
+        admitted = self._decoder.admit(found)
         with self._lock:
-            dropping = self._queue(self._follower.fill(hole, arrivals))
-        self._after_put(dropping=dropping, drained=False)
+            arrivals = self._follower.fill(hole, admitted)
+            beyond = min(len(arrivals), max(0, len(self._every) + len(arrivals) - CAPACITY))
+            self._arrived += beyond
+            for arrival in arrivals[:beyond]:
+                self._drop(arrival)
+            self._queue(arrivals[beyond:])
+        self._after_put(dropping=beyond > 0, drained=False)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue all that has arrived, in its order, and reject what is not worth queueing.
@@ -202,11 +210,16 @@ class ReceiveQueue:
     def _queue(self, arrivals: list[Arrival]) -> bool:
         """Queue all, and return whether older ones had to be dropped."""
         self._arrived += len(arrivals)
-        if not self.newest_only:
-            return self._append(arrivals)
-        for arrival in arrivals:
-            self._supersede(arrival)
-        return False
+        if self.newest_only:
+            for arrival in arrivals:
+                self._supersede(arrival)
+            return False
+        every = self._every
+        every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
+        drops = len(every) - CAPACITY
+        for _ in range(drops):
+            self._drop(every.popleft())
+        return drops > 0
 
     def _after_put(self, *, dropping: bool, drained: bool) -> None:
         if dropping and not self.newest_only and not self._warned:
@@ -216,16 +229,10 @@ class ReceiveQueue:
         if self._questions:
             self._answer(drained=drained)
 
-    def _append(self, arrivals: list[Arrival]) -> bool:
-        """Queue all, and return whether older ones had to be dropped."""
-        every = self._every
-        every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
-        drops = len(every) - CAPACITY
-        for _ in range(drops):
-            stream, _, _, lost = every.popleft()
-            self._dropped += 1
-            self._follower.report_later(stream.key, lost)
-        return drops > 0
+    def _drop(self, arrival: Arrival) -> None:
+        stream, _, _, lost = arrival
+        self._dropped += 1
+        self._follower.report_later(stream.key, lost)
 
     def _supersede(self, arrival: Arrival) -> None:
         key = arrival[0].key

@@ -33,7 +33,8 @@ _OPEN: Final = 64  # questions at a time,
 _OPEN_BEGINNINGS: Final = 16  # of these for what a publisher sent before it was heard,
 _OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
 _BEHIND: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
-_HELD: Final = 2 * CAPACITY  # messages that wait for others, some 90 MB
+_HELD: Final = 2 * CAPACITY  # messages that wait for others, some 90 MB,
+_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key: whoever may publish there pushes out nobody else
 _TIMEOUT: Final = 3.0  # s until a question is given up
 _PATIENCE: Final = 20.0  # s of questions after which what is still missing is lost: so long publishers keep it
 _POLL: Final = 0.005  # s between two looks for answers
@@ -119,14 +120,13 @@ class Recovery:
                     next_look = now + _LOOK
                     self._look()
                 self._ask(now)
-                if self._queue.held > _HELD:
-                    self._give_up(until=_HELD)
+                self._give_up(_HELD, _HELD_OF_KEY)
         except BaseException:
             _log.exception("%s: recovery ends after an unexpected error", self._name, extra=about("error"))
             raise
         finally:
             self._queue.recover(None)  # nothing is held from now on
-            self._give_up()
+            self._give_up(-1, -1)
             self._asked.clear()  # nobody takes answers any more, and a full channel would hold up the session
 
     def _take_holes(self) -> None:
@@ -197,11 +197,9 @@ class Recovery:
             self._queue.fill(search.hole, [])
         self._on_fill(search.hole.stream)
 
-    def _give_up(self, *, until: int = -1) -> None:
-        """Fill holes with what was found so far, until no more than so many messages wait: too much, or the end."""
-        for hole in self._queue.holes:
-            if self._queue.held <= until:
-                return
+    def _give_up(self, total: int, of_key: int) -> None:
+        """Fill holes with what was found so far, until no more messages wait in all, and on one key."""
+        for hole in self._queue.excess(total, of_key):
             self._fill(self._searching.get(hole) or Search(hole, 0.0))
 
     def _look(self) -> None:

@@ -104,9 +104,11 @@ class Counts:
     `lost`: lost in transit, and not recovered.
     `dropped`: arrived, but not read in time: superseded in mode "latest", beyond 65,536 that wait in mode "every".
     `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
+    `discarded`: came twice, or too late, as somebody sends under the id of another publisher, perhaps; mode "every".
     """
 
     received: int = 0
     lost: int = 0
     dropped: int = 0
     invalid: int = 0
+    discarded: int = 0

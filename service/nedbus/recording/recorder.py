@@ -38,8 +38,8 @@ class Recorder:
     def status(self) -> str:
         """What was recorded so far, in one line."""
         counts = self._subscription.counts
-        absent = (counts.lost, "lost"), (counts.dropped, "dropped"), (counts.invalid, "invalid")
-        trouble = ", ".join(f"{count} {name}" for count, name in absent if count)
+        names = ("lost", "dropped", "invalid", "discarded")
+        trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))
         return f"{self._writer.messages} messages" + (f", {trouble}" if trouble else "")
 
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
