@@ -57,7 +57,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "invalid": Event("what arrived, a message or an answer, cannot be read"),
     "newer-layout": Event("messages have a layout that is newer than this reader"),
     "dropped": Event("a reader is slower than the data: messages are dropped"),
-    "incomplete": Event("not all vehicles are known"),
+    "incomplete": Event("not all vehicles are known, or not all answers kept"),
     "slow-reader": Event("a lossless publisher waits for a reader, or gives it up"),
     # a link
     "link-broken": Event("the link to a router is broken, or does not come up"),

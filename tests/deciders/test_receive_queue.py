@@ -132,6 +132,14 @@ def test_only_layouts_that_are_needed_are_remembered() -> None:
     assert list(lookup.newer) == list(range(1500, 1516))
 
 
+def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """A layout with a name of 100,000 characters is one short line."""
+    LayoutLookup(lambda: {1500: ["timestamp", 100_000 * "x"]}).learn([msgpack.packb([1500, 1, 2])])
+    [line] = caplog.messages
+    assert line.startswith("layout 1500 is newer than this reader; not read: xxx")
+    assert len(line) < 1000
+
+
 def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
     """A peer that never answers holds up nobody; the lookup is closed all the same."""
     answering = threading.Event()

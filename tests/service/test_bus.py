@@ -16,7 +16,7 @@ import threading
 import time
 import tracemalloc
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import cast
@@ -664,6 +664,44 @@ def test_hostile_answers_do_not_reach_a_script(client: Client, raw: Session, cap
     queryable.undeclare()
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert [text.endswith(": an answer that is not JSON") and len(text) < 1000 for text in warned] == [True]
+
+
+@contextlib.contextmanager
+def answering(raw: Session, answers: Mapping[str, bytes]) -> Iterator[None]:
+    """Answer each question for services with all of these, by the name of a service."""
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            for name, payload in answers.items():
+                query.reply(f"nedbus/@service/{name}/status", payload)
+
+    queryable = raw.declare_queryable("nedbus/@service/*/status", zenoh.handlers.Callback(reply, indirect=False))
+    yield
+    queryable.undeclare()
+
+
+def test_status_that_grows_when_it_is_read_fills_no_memory(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """JSON may take up 30 times its length: of 480 kB, what is beyond 4 MiB is left out, and that is logged."""
+    monkeypatch.setattr("nedbus.client.discovery._MAX_CONTENT", 2**22, raising=False)
+    large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
+    with answering(raw, {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}):
+        services = bus.services(timeout=DEADLINE)
+    assert len(services) == 3
+    assert {"host": "honest"} in services
+    assert "18 services are left out: their answers are too large" in caplog.messages
+
+
+def test_answers_that_are_too_many_are_left_out(
+    bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The bytes that are kept of one question are bounded, and the log says how many answers were left out."""
+    monkeypatch.setattr("nedbus.transport.queries._MAX_BYTES", 10_500)
+    status = b'{"a": "' + 950 * b"x" + b'"}'
+    with answering(raw, {f"evil{number:02}": status for number in range(50)}):
+        assert len(bus.services(timeout=DEADLINE)) == 10
+    assert "nedbus/@service/*/status: 40 answers too many are left out" in caplog.messages
 
 
 def test_junk_does_not_displace_a_waiting_sample(client: Client, raw: Session, bus: nedbus.Bus) -> None:

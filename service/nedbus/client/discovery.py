@@ -16,12 +16,30 @@ _log = logging.getLogger(__name__)
 _MAX_FIELDS: Final = 256  # of a layout
 _MAX_TEXT: Final = 300  # characters of a key that are logged
 _MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
+_MAX_CONTENT: Final = 2**28  # bytes that the status of all services may take up, about: JSON is up to 32 times larger
+_MAX_LAYOUTS: Final = 32  # of an answer; there are five
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
-    """Return the status of every nedbus service, as it reports it."""
-    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
+    """Return the status of every nedbus service, as it reports it; what would fill the memory is left out."""
+    answers: list[RawSample] = []
+    size = left_out = 0
+    for raw in query(session, status_key(ANY, prefix=prefix), timeout=timeout):
+        content = _size_of_content(raw)
+        if len(raw.payload) <= _MAX_ANSWER and size + content <= _MAX_CONTENT:
+            answers.append(raw)
+            size += content
+        else:
+            left_out += 1
+    if left_out:
+        _log.warning("%d services are left out: their answers are too large", left_out, extra=about("incomplete"))
     return [status for status in _parse(answers) if isinstance(status, dict)]
+
+
+def _size_of_content(raw: RawSample) -> int:
+    """Return how many bytes an answer takes up at most when it is parsed, about: measured with CPython 3.11."""
+    text = raw.payload.to_bytes()
+    return 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
 
 
 def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
@@ -29,7 +47,7 @@ def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
     found: dict[int, Sequence[str]] = {}
     for content in _parse(query(session, schema_key(prefix=prefix), timeout=0.5, newest=False)):
         layouts = content.get("layouts") if isinstance(content, dict) else None
-        for layout in layouts if isinstance(layouts, list) else ():
+        for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
             number = layout.get("wire") if isinstance(layout, dict) else None
             names = _field_names(layout)
             if isinstance(number, int) and names is not None:

@@ -18,6 +18,7 @@ _log = logging.getLogger(__name__)
 _MAX_LAYOUTS: Final = 16  # newer layouts that are remembered
 _MAX_UNKNOWN: Final = 256  # numbers that are asked for at once
 _PAUSES: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # s between two questions that explained nothing new; then the last one
+_MAX_TEXT: Final = 300  # characters of names that a publisher wrote
 _JOIN: Final = 3.0  # s
 
 FindLayouts = Callable[[], Mapping[int, Sequence[str]]]
@@ -90,7 +91,7 @@ class LayoutLookup:
             for number, names in new.items():
                 if len(self.newer) < _MAX_LAYOUTS:
                     self.newer = {**self.newer, number: names}
-                    unread = ", ".join(name for name in names if name not in FIELD_TYPES) or "nothing"
+                    unread = ", ".join(name for name in names if name not in FIELD_TYPES)[:_MAX_TEXT] or "nothing"
                     extra = about("newer-layout")
                     _log.warning("layout %d is newer than this reader; not read: %s", number, unread, extra=extra)
             self._in_vain = 0 if new else self._in_vain + 1

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Final
 
 from nedbus.transport import (
@@ -138,7 +139,7 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
 
 def _services(session: Session, prefix: str) -> list[Service]:
     answers = query(session, status_key(ANY, prefix=prefix), timeout=_TIMEOUT)
-    return [each for each in map(_service, answers) if each is not None][:_MAX_SERVICES]
+    return list(islice(filter(None, map(_service, answers)), _MAX_SERVICES))
 
 
 def _service(answer: RawSample) -> Service | None:

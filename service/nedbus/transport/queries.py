@@ -7,16 +7,22 @@ the session, and whatever else needs that lock stops the process.
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import lru_cache
+from itertools import islice
 from typing import Final
 
 import zenoh
 
+from nedbus.log_event import about
+
 from .session import RawSample, Session, entity_name, while_open
+
+_log = logging.getLogger(__name__)
 
 Heartbeats = dict[tuple[str, str], int]
 """The number of the newest message, by the key of a stream and the name of its publisher."""
@@ -24,7 +30,7 @@ Heartbeats = dict[tuple[str, str], int]
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
-_MAX_BYTES: Final = 2**25  # of the payloads that are kept of one query
+_MAX_BYTES: Final = 2**26  # of the payloads that are kept of one query
 _CHANNEL: Final = 1024  # answers that wait; while there are more, the session waits for whoever asked
 _TOKENS: Final = 131_072  # tokens that wait; Zenoh must never wait for room while it holds the lock of its session
 _CHANGES: Final = 16_384  # of tokens, that wait until somebody takes them
@@ -92,21 +98,23 @@ def ask(
 def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
     """Return what is answered within `timeout` seconds: the newest answer for each key, or all.
 
-    At most 10,000 answers of 32 MB in all are kept, whoever sends them.
+    At most 10,000 answers of 64 MB in all are kept, whoever sends them; that there are more is logged.
     """
     kept: dict[object, RawSample] = {}
-    size = 0
-    for reply in ask(session, key_expr, timeout=timeout).wait(timeout):
-        sample = reply.ok
-        if sample is None:
-            continue
+    size = left_out = 0
+    replies = ask(session, key_expr, timeout=timeout).wait(timeout)
+    for sample in filter(None, (reply.ok for reply in replies)):
         key: object = str(sample.key_expr) if newest else len(kept)
         other = kept.get(key)
         if other is not None and not _is_newer(sample, other):
             continue
         new_size = size + _size(sample) - (_size(other) if other is not None else 0)
-        if new_size <= _MAX_BYTES and (other is not None or len(kept) < MAX_ANSWERS):
+        fits = new_size <= _MAX_BYTES and (other is not None or len(kept) < MAX_ANSWERS)
+        left_out += not fits
+        if fits:
             kept[key], size = sample, new_size
+    if left_out:
+        _log.warning("%s: %d answers too many are left out", key_expr, left_out, extra=about("incomplete"))
     return list(kept.values())
 
 
@@ -176,10 +184,7 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
     def take() -> Heartbeats:
         newest: Heartbeats = {}
         with suppress(zenoh.ZError):  # ended meanwhile
-            for _ in range(_HEARTBEATS):
-                beat = subscriber.handler.try_recv()
-                if beat is None:
-                    break
+            for beat in islice(iter(subscriber.handler.try_recv, None), _HEARTBEATS):
                 key, payload = str(beat.key_expr), beat.payload.to_bytes()
                 publisher = _publisher_of(key) if len(key) <= _LONGEST else None
                 if publisher is not None and len(payload) == _NUMBER:  # else it is none, whoever sent it
@@ -198,8 +203,7 @@ def _publisher_of(heartbeat: str) -> tuple[str, str] | None:
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
-    keys, _ = ask_alive_keys(session, key_expr, timeout=timeout)
-    return keys
+    return ask_alive_keys(session, key_expr, timeout=timeout)[0]
 
 
 def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
