@@ -26,13 +26,14 @@ FLOORS = [
 ONLY: dict[str, set[str]] = {
     "zenoh": {
         "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries", "nedbus/transport/refusals",
+        "nedbus/transport/write_probe",
         "nedbus/client/channels", "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
         "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
         "nedbus/client/acknowledgement", "nedbus/client/recovery", "nedbus/client/rejections",
         "nedbus/client/query_server", "nedbus/client/qos", "nedbus/client/demand",
         "nedbus/client/thinned_streams", "nedbus/client/thinned_subscriber",
         "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",
-        "nedbus/doctor/traffic", "nedbus/doctor/write_probe",
+        "nedbus/doctor/traffic",
     },
     "msgpack": {"nedbus_msgs/wire"},
     "xxhash": {"nedbus/transport/rmw_zenoh"},

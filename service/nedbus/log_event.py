@@ -62,7 +62,9 @@ EVENTS: Final[Mapping[str, Event]] = {
     # a link
     "link-broken": Event("the link to a router is broken, or does not come up"),
     "link-back": Event("the link to a router is up, or up again"),
-    "refused": Event("a router refuses a client, for its certificate as a rule"),
+    "client-refused": Event("a router refuses a client, for its certificate as a rule"),
+    "refused": Event("access rules of the router keep from everybody what is published of a vehicle"),
+    "accepted": Event("the router takes what is published of a vehicle that it refused"),
     # nedbus ros2
     "bridged": Event("a stream is published in ROS 2"),
     "conflict": Event("a stream is not published in ROS 2: its topic is that of another one, or of another node"),

@@ -501,7 +501,7 @@ def test_status_tells_everything(run_nedbus: Start, raw: Session, endpoint: str)
         return bool(found and found[0]["sources"]) and source_of(found[0])["published"] != 0
 
     wait_for(ask, what="a status with messages")
-    assert {"service", "host", "version", "started", "now", "role", "endpoints", "sources"} == set(found[0])
+    assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(found[0])
     assert (found[0]["role"], found[0]["endpoints"]) == ("client", [endpoint])
     source = source_of(found[0])
     assert (source["source"], source["state"], source["rejected"], source["total"]) == ("sim:", "running", 0, None)

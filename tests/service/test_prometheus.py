@@ -15,6 +15,7 @@ import pytest
 import zenoh
 
 import nedbus
+from nedbus.transport import make_authority, make_certificate, write_access_rules
 from nedbus_msgs import encode
 from nedbus_msgs.arrays import to_array
 from tests.conftest import Process, Start, free_endpoint, free_port, message, wait_for
@@ -106,8 +107,8 @@ def test_every_alert_fires_and_clears(
     rules = shorten(ALERTS.read_text())
     silent, lossy = free_port(), free_port()
     second, missing = free_endpoint(), tmp_path / "flight.ulg"
-    addresses = [f"127.0.0.1:{free_port()}" for _ in range(7)]
-    service, exporter, lonely, lonely_exporter, ended, full, full_exporter = addresses
+    addresses = [f"127.0.0.1:{free_port()}" for _ in range(8)]
+    service, exporter, lonely, lonely_exporter, ended, full, full_exporter, refused = addresses
     values = tmp_path / "values.json"
     values.write_text(json.dumps([ROW]))
 
@@ -132,15 +133,17 @@ def test_every_alert_fires_and_clears(
     run_nedbus("export", "--wait", "-c", second, "--http", lonely_exporter)
     to_end = export_ended()
     small = start_small_router(run_nedbus, tmp_path, full, full_exporter)
+    mend_rules = refuse_vehicle(run_nedbus, tmp_path, refused)
     vehicle = fly(lossy, "--drop", "0.3")
     run_nedbus("serve", "-c", endpoint, "--http", service, *configured)
     prometheus = Prometheus(start, tmp_path, rules, {"nedbus": addresses})
-    wait_for(lambda: len(prometheus.query("up == 1")) == 7, what="all seven to be scraped", seconds=PATIENCE)
+    wait_for(lambda: len(prometheus.query("up == 1")) == 8, what="all eight to be scraped", seconds=PATIENCE)
     traffic = Traffic(bus, silent)
 
     expected: dict[str, list[dict[str, str]]] = {
         "NedbusDown": [{"instance": ended}],
         "NedbusNoRouter": [{"instance": lonely}, {"instance": lonely_exporter}],
+        "NedbusVehicleRefused": [{"vehicle": "2", "instance": refused}],
         "NedbusRouterFull": [{"instance": full, "role": "router"}, {"instance": full_exporter}],
         "NedbusSourceDown": [{"source": sources["missing"], "state": "retrying"}],
         "NedbusSourceSilent": [{"source": sources["silent"]}],
@@ -169,6 +172,7 @@ def test_every_alert_fires_and_clears(
 
         traffic.bad = False
         crowd.close()
+        mend_rules()
         route()
         export_ended()
         vehicle.kill()
@@ -191,6 +195,27 @@ def start_small_router(run_nedbus: Start, folder: Path, service: str, exporter: 
     )
     run_nedbus("export", "--wait", "-c", where, "--http", exporter)
     return where
+
+
+def refuse_vehicle(run_nedbus: Start, folder: Path, pages: str) -> Callable[[], None]:
+    """Start a service whose router does not know its vehicle; return what restarts the router with rules for it."""
+    pki, file, endpoint = folder / "pki", folder / "secure.json5", free_endpoint().replace("tcp/", "tls/")
+    make_authority(pki)
+    make_certificate(pki, "router", hosts=["127.0.0.1"])
+    make_certificate(pki, "vehicle-2")
+    shipped = (PACKAGING.parent / "config" / "router-secure.json5").read_text()
+    file.write_text(shipped.replace("/etc/nedbus/pki", str(pki)).replace("tls/0.0.0.0:7447", endpoint))
+    router = run_nedbus("router", str(file))
+    files = {"ca": "ca.crt", "certificate": "vehicle-2.crt", "key": "vehicle-2.key"}
+    shown = [f"--tls-{option}={pki / name}" for option, name in files.items()]
+    run_nedbus("serve", "-c", endpoint, *shown, "-s", "sim:?vehicle=2&speed=0.3", "--http", pages)
+
+    def mend() -> None:
+        write_access_rules(file, ["1", "2"])
+        router.kill()
+        run_nedbus("router", str(file))
+
+    return mend
 
 
 def is_quiet(prometheus: Prometheus, name: str) -> bool:
@@ -292,5 +317,8 @@ def test_dashboard_and_rules_use_what_exists(run_nedbus: Start, start: Start, en
             wait_for(found, what=query)
     exposed = {each["__name__"] for each, _ in prometheus.query('{__name__!=""}')}
     used = set(re.findall(r"\b(?:nedbus|process)_\w+", " ".join([*queries, ALERTS.read_text()])))
-    assert used - exposed == {"nedbus_messages_rejected_total"}
+    assert used - exposed == {
+        "nedbus_messages_rejected_total",
+        "nedbus_vehicle_refused",
+    }  # none without a fault, or TLS
     assert len(used) > 20

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
+import signal
 import stat
 import threading
-from collections.abc import Callable, Iterator
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -14,12 +18,21 @@ import zenoh
 
 import nedbus
 from nedbus.client.acknowledgement import WINDOW
-from nedbus.transport import make_authority, make_certificate, open_router
+from nedbus.daemon.write_permission import WritePermission
+from nedbus.transport import (
+    Session,
+    make_authority,
+    make_certificate,
+    open_client,
+    open_router,
+    write_access_rules,
+)
 from nedbus_msgs import Address, encode
 from nedbus_msgs.arrays import to_array
-from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+from tests.conftest import DEADLINE, Process, Start, free_endpoint, free_port, message, wait_for
 from tests.service.test_max_rate import Clock, clock, publish, take, wait_for_demand
 from tests.service.test_px4_zenoh import Px4
+from tests.zenohd import start_zenohd
 
 __all__ = ["clock"]
 
@@ -44,12 +57,19 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def secure(pki: Path, tmp_path: Path) -> Iterator[str]:
-    """Run a router on the shipped configuration, with these certificates on a free port."""
+def configured(pki: Path, tmp_path: Path) -> tuple[Path, str]:
+    """Copy the shipped configuration, with these certificates and a free port; return the file and its endpoint."""
     endpoint = free_endpoint().replace("tcp/", "tls/")
     text = (CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(pki))
     file = tmp_path / "router-secure.json5"
     file.write_text(text.replace("tls/0.0.0.0:7447", endpoint))
+    return file, endpoint
+
+
+@pytest.fixture
+def secure(configured: tuple[Path, str]) -> Iterator[str]:
+    """Run a router on the shipped configuration."""
+    file, endpoint = configured
     session = open_router(config_file=file)
     yield endpoint
     session.close()
@@ -362,3 +382,116 @@ def test_thinned_stream_flows_as_the_stream_does(join: Join, clock: Clock, caplo
         assert take(subscription, 50) == list(range(2, 1002, 20))
         assert subscription.counts.lost == 0
         assert "nobody" not in caplog.text
+
+
+def flags_of(pki: Path, name: str) -> list[str]:
+    """Return the options of a command that shows a certificate."""
+    files = {"ca": "ca.crt", "certificate": f"{name}.crt", "key": f"{name}.key"}
+    return [f"--tls-{option}={pki / file}" for option, file in files.items()]
+
+
+def ask(where: str) -> tuple[int, str]:
+    """Return the status and the text of a page, 0 where none is served."""
+    try:
+        with urllib.request.urlopen(f"http://{where}", timeout=DEADLINE) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as exc:
+        return exc.code, exc.read().decode()
+    except OSError:
+        return 0, ""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("certificate", "kind"),
+    [("vehicle-1", "nedbus"), ("vehicle-2", "zenohd")],
+    ids=["certificate of another vehicle", "certificate without a rule"],
+)
+def test_refused_service_says_so_until_the_rules_are_mended(
+    configured: tuple[Path, str], pki: Path, run_nedbus: Start, start: Start, *, certificate: str, kind: str
+) -> None:
+    """Log, health, metrics and `nedbus info` say that nothing of vehicle 2 passes the router, until something does."""
+    file, endpoint = configured
+
+    def start_router() -> Process:
+        return run_nedbus("router", str(file)) if kind == "nedbus" else start_zenohd(start, "-c", str(file))
+
+    router, pages = start_router(), f"127.0.0.1:{free_port()}"
+    service = run_nedbus("serve", "-c", endpoint, *flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages)
+    wait_for(
+        lambda: "the router refuses vehicle 2: nothing of it reaches anybody" in service.err,
+        what="the refusal",
+        seconds=120,
+    )
+    refused = (503, "the router refuses vehicle 2\n")
+    assert (ask(f"{pages}/healthz"), ask(f"{pages}/readyz")) == (refused, refused)
+    assert 'nedbus_vehicle_refused{vehicle="2"} 1.0' in ask(f"{pages}/metrics")[1]
+    assert json.loads(ask(f"{pages}/status")[1])["refused"] == ["2"]
+    if certificate == "vehicle-1":  # else not even its status passes
+        info = run_nedbus("info", "--wait", "-c", endpoint, *flags_of(pki, "reader"))
+        assert info.wait() == 0, info.err
+        assert "refused by the router: vehicle 2" in info.out
+        assert re.search(rf"2/{VLP} .*refused by the router", info.out)
+        health = run_nedbus("health", "--wait", "-c", endpoint, *flags_of(pki, "reader"))
+        assert health.wait() == 1
+        assert "the router refuses vehicle 2" in health.err
+
+    write_access_rules(file, ["1", "2"])
+    own = '{ rules: ["vehicle-2-in"], subjects: ["vehicle-2"] }'
+    assert own in file.read_text()
+    file.write_text(file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}')))
+    router.kill()
+    start_router()
+    wait_for(lambda: "the router takes vehicle 2 now: all is well again" in service.err, what="its end", seconds=120)
+    assert (ask(f"{pages}/healthz"), ask(f"{pages}/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+    assert 'nedbus_vehicle_refused{vehicle="2"} 0.0' in ask(f"{pages}/metrics")[1]
+    health = run_nedbus("health", "--wait", "-c", endpoint, "--vehicle", "2", *flags_of(pki, "reader"))
+    assert health.wait() == 0, health.err
+
+
+def look(permission: WritePermission, times: int = 3) -> Mapping[str, bool]:
+    """Look several times at which vehicles the router refuses, and return what is known then."""
+    for _ in range(times):
+        permission.check()
+    return permission.refused
+
+
+def permission_of(session: Session, endpoint: str, tls: nedbus.Tls) -> WritePermission:
+    return WritePermission(session, [endpoint], tls=tls, prefix="nedbus", vehicles=lambda: {"1", "2"})
+
+
+def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path) -> None:
+    """What the service of an embedded router publishes passes the router that it joins, or not, by its certificate."""
+    tls = nedbus.Tls(pki / "ca.crt", pki / "vehicle-1.crt", pki / "vehicle-1.key")
+    with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls) as session:
+        permission = permission_of(session, secure, tls)
+        wait_for(lambda: look(permission, 1) == {"1": False}, what="the vehicle that is allowed")
+        assert look(permission) == {"1": False, "2": True}
+
+
+def test_only_access_rules_are_a_refusal(
+    configured: tuple[Path, str], pki: Path, run_nedbus: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A router with older rules, without any, that is away, or that is frozen, refuses nobody."""
+    monkeypatch.setattr("nedbus.daemon.write_permission._OPEN", 0.5)
+    file, endpoint = configured
+    shipped = file.read_text()
+    tls = nedbus.Tls(pki / "ca.crt", pki / "vehicle-1.crt", pki / "vehicle-1.key")
+
+    def start_router(text: str) -> Process:
+        file.write_text(text)
+        return run_nedbus("router", str(file))
+
+    older = start_router(shipped.replace("@doctor", "@probe"))
+    with open_client([endpoint], timeout=DEADLINE, tls=tls) as session:
+        permission = permission_of(session, endpoint, tls)
+        assert look(permission) == {}
+        older.kill()
+        assert look(permission) == {}
+        rules = "access_control: {\n    enabled: "
+        assert f"{rules}true" in shipped
+        plain = start_router(shipped.replace(f"{rules}true", f"{rules}false"))
+        wait_for(lambda: look(permission, 1) == {"1": False, "2": False}, what="a router that takes everything")
+        plain.signal(signal.SIGSTOP)
+        assert look(permission) == {"1": False, "2": False}
+        plain.signal(signal.SIGCONT)

@@ -15,7 +15,7 @@ from nedbus_msgs import ANY, check_vehicle
 
 from .format import to_text
 from .options import JsonOption, on_bus, write
-from .status import sources_of, streams_of
+from .status import refused_of, sources_of, streams_of
 
 _DENIED: Final = (
     ", though its service reports that it is: does the router let that service write this vehicle, and this client"
@@ -85,11 +85,14 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
         ages = {vehicle: min(known)} if answers and known else {}
     report = _Report(None, len(found), len(sources), ages)
     at = " or ".join(bus.routers)
+    refused = sorted({to_text(name, 64) for service in found for name in refused_of(service)})
     failed = [source for source in sources if source.get("state") in {"retrying", "failed"}]
     if expected is not None and len(found) < expected:
         report.reason = f"{len(found)} of {expected} services answer at {at}"
     elif not found and not anywhere:
         report.reason = f"no service of {host} answers at {at}: --services 1 accepts those of other hosts"
+    elif refused and vehicle is None:
+        report.reason = f"the router refuses vehicle {', '.join(refused)[:300]}: do its access rules name it?"
     elif failed and vehicle is None:
         source = failed[0]
         report.reason = " ".join(

@@ -27,7 +27,7 @@ from .options import (
     write,
     write_stderr,
 )
-from .status import sources_of, streams_of
+from .status import refused_of, sources_of, streams_of
 from .table import terminal_width, to_table
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
@@ -117,7 +117,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
         if gone := [str(address) for source in sources_of(service) for address in _gone(source)]:
             write(_fold_list("gone: ", to_text(", ".join(gone), _MAX_VEHICLES), width))
-        streams = [_stream_row(source, *each) for source in sources_of(service) for each in streams_of(source)]
+        if refused := refused_of(service):
+            write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
+        streams = [_stream_row(source, refused, *each) for source in sources_of(service) for each in streams_of(source)]
         _write_rows("\n" + to_table(_STREAM_HEAD, streams[:_MAX_ROWS], width=width, optional=_STREAM_OPTIONAL), streams)
     if len(services) > _MAX_ROWS:
         write(f"{len(services) - _MAX_ROWS} services more")
@@ -165,14 +167,15 @@ def _fold_list(head: str, text: str, width: int | None) -> str:
     return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
-def _stream_row(source: dict[str, object], address: str, health: Health) -> list[str]:
+def _stream_row(source: dict[str, object], refused: Sequence[str], address: str, health: Health) -> list[str]:
     addresses = source.get("addresses")
     alive = address in addresses if isinstance(addresses, list) else None
+    is_refused = address.partition("/")[0] in refused
     return [
         to_text(address),
         "-" if health.rate is None else f"{health.rate:.1f}",
         f"{health.nominal:g}",
         "-" if health.age is None else to_age(health.age),
         str(health.messages),
-        describe_stream(health, stream_state(health, alive=alive)),
+        "refused by the router" if is_refused else describe_stream(health, stream_state(health, alive=alive)),
     ]

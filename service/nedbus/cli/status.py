@@ -24,6 +24,11 @@ def sources_of(service: dict[str, object]) -> list[dict[str, object]]:
     return [source for source in _list(service, "sources") if isinstance(source, dict)]
 
 
+def refused_of(service: dict[str, object]) -> list[str]:
+    """Return the vehicles of a service that its router refuses, as it says itself."""
+    return [vehicle for vehicle in _list(service, "refused") if isinstance(vehicle, str)]
+
+
 def streams_of(source: dict[str, object]) -> list[tuple[str, Health]]:
     """Return address and health of each stream in the status of a source; what cannot be parsed is left out."""
     streams = []

@@ -8,6 +8,7 @@ import re
 import socket
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Final
 
@@ -23,6 +24,7 @@ from .plan import Planned, is_finite, plan_sources
 from .status import Role, ServiceStatus, SourceMeasures, SourceStatus
 from .worker import Worker
 from .workers import Workers
+from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +50,7 @@ class Daemon:
         self._planning = threading.Lock()  # `run` starts what is planned, `reload` changes it
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
+        self._permission: WritePermission | None = None
         # In containers every service may be process 1 of the same host name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, when it is open
@@ -72,6 +75,7 @@ class Daemon:
             now=time.time(),
             role=self.role,
             endpoints=self.endpoints,
+            refused=tuple(sorted(vehicle for vehicle, refused in self.refused.items() if refused)),
             sources=self.sources,
         )
 
@@ -79,6 +83,11 @@ class Daemon:
     def sources(self) -> tuple[SourceStatus, ...]:
         """The status of each source now."""
         return tuple(worker.status for worker in self._list_workers())
+
+    @property
+    def refused(self) -> Mapping[str, bool]:
+        """Whether the router refuses a vehicle that is published, of those of which that is known."""
+        return {} if self._permission is None else self._permission.refused
 
     @property
     def measures(self) -> list[SourceMeasures]:
@@ -153,6 +162,7 @@ class Daemon:
                 )
                 self._workers.apply(self._plan)
             self.ready.set()
+            self._permission = watch_permission(session, settings, registry)
             self._wait(registry, Uplinks(session, settings.connect, tls=settings.tls) if router else None)
         finally:
             self._stop.set()
@@ -160,6 +170,8 @@ class Daemon:
                 self._workers.end(_GRACE)
             queries.close()
             session.close()
+            if self._permission is not None:
+                self._permission.close()
         return not any(source.state == "failed" for source in self.sources)
 
     def _list_workers(self) -> list[Worker]:

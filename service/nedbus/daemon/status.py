@@ -69,6 +69,7 @@ class ServiceStatus:
     """The status of a service.
 
     Times are seconds since the epoch; `host` is the name of its host, or of its container.
+    `refused`: vehicles that its router's access rules keep from everybody.
     """
 
     service: str
@@ -78,4 +79,5 @@ class ServiceStatus:
     now: float
     role: Role
     endpoints: tuple[str, ...]
+    refused: tuple[str, ...]
     sources: tuple[SourceStatus, ...]

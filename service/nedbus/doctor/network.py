@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from nedbus.transport import RouterState, Tls, open_client
+from nedbus.transport import RouterState, Tls, open_client, probe_writes
 
 from .clocks import check_clocks
 from .finding import Finding, limit_findings
@@ -13,7 +13,6 @@ from .other_keys import check_other_keys
 from .permissions import check_permissions
 from .services import check_services
 from .vehicles import check_vehicles
-from .write_probe import probe_write
 
 _OPEN = 1.5  # s
 _NEARLY_FULL = 0.8  # of the sessions that a router accepts
@@ -27,7 +26,7 @@ def check_network(
         verdict = None
         if vehicle is not None:
             with open_client(routers[:1], timeout=_OPEN, tls=tls) as writer:
-                verdict = probe_write(session, writer, vehicle, prefix=prefix)
+                verdict = probe_writes(session, writer, [vehicle], prefix=prefix)[vehicle]
         seen = observe(session, prefix=prefix, listen=listen)
     groups = (
         _count(seen),

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from nedbus.transport import Verdict
+
 from .finding import Finding, State, list_names
 from .observation import Observation
 from .services import reported
-from .write_probe import Verdict
 
 _RULES = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
 _DENIED: Final[dict[State, State]] = {"ok": "ok", "unknown": "warning"}

@@ -27,12 +27,13 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return what keeps a service from being ready: no router, or a source that should speak and does not."""
+    """Return what keeps a service from being ready: no router, one that refuses it, or a source that is silent."""
     if not daemon.ready.is_set():
         return [f"the service starts: {' or '.join(daemon.endpoints)}"]
     reasons = []
     if daemon.role == "client" and not daemon.sessions:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
+    reasons += _refusals(daemon)
     for source in daemon.sources:
         silent = source.state == "waiting" and not source.addresses  # a replay that waits for a reader has some
         if silent or source.state in {"starting", "retrying", "failed"}:
@@ -43,9 +44,15 @@ def why_not_ready(daemon: Daemon) -> list[str]:
 
 def _health(daemon: Daemon) -> Page:
     stuck = daemon.busy
-    if stuck < _STUCK:
-        return Page.text("ok")
-    return Page.text(f"a source has been at one message for {stuck:.0f} s", status=503)
+    reasons = _refusals(daemon)
+    if stuck >= _STUCK:
+        reasons.append(f"a source has been at one message for {stuck:.0f} s")
+    return Page.text("\n".join(reasons), status=503) if reasons else Page.text("ok")
+
+
+def _refusals(daemon: Daemon) -> list[str]:
+    refused = sorted(vehicle for vehicle, is_refused in daemon.refused.items() if is_refused)
+    return [f"the router refuses vehicle {', '.join(refused)}"] if refused else []
 
 
 def _ready(daemon: Daemon) -> Page:

@@ -41,6 +41,14 @@ class ServiceCollector(Collector):
         if daemon.max_sessions is not None:
             room.add_metric([daemon.role], daemon.max_sessions)
         yield room
+        refused = GaugeMetricFamily(
+            "nedbus_vehicle_refused",
+            "1 for a vehicle that the access rules of the router keep from everybody, 0 for one that they let through",
+            labels=["vehicle"],
+        )
+        for vehicle, is_refused in daemon.refused.items():
+            refused.add_metric([vehicle], is_refused)
+        yield refused
         streams = [stream for name, source in sources for stream in _streams(name, source)]
         yield from stream_families(streams, messages=_PUBLISHED)
         yield from _source_families(sources)

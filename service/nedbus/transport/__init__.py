@@ -51,6 +51,7 @@ from .session import (
 )
 from .tls import Tls, check_pem
 from .uplink import UPLINK_POLL, Uplinks
+from .write_probe import Verdict, probe_writes
 
 if TYPE_CHECKING:
     from .pki import CA_DAYS, DAYS, make_authority, make_certificate
@@ -96,6 +97,7 @@ __all__ = [
     "Tls",
     "TopicKey",
     "Uplinks",
+    "Verdict",
     "alive_keys",
     "ask",
     "ask_alive_keys",
@@ -117,6 +119,7 @@ __all__ = [
     "node_token",
     "open_client",
     "open_router",
+    "probe_writes",
     "publisher_token",
     "publishers_key_expr",
     "publishers_of_type_key_expr",

@@ -52,4 +52,4 @@ def _follow(read: int, stdout: int) -> None:
                 continue
             said = found[1]
             reason = next((text for part, text in _REASONS.items() if part in said), said)
-            _log.warning("a client is refused: %s", reason, extra=about("refused", reason=reason))
+            _log.warning("a client is refused: %s", reason, extra=about("client-refused", reason=reason))

@@ -1,0 +1,171 @@
+"""Whether the router lets through what a service publishes: access rules drop the rest, and tell its sender nothing.
+
+Only a service that shows a certificate is checked, as access rules go by it: with a second session for a moment, a few
+seconds after a link is up or a vehicle appears, and then seldom. Rules change when a router starts again.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+from nedbus.client import PublisherRegistry
+from nedbus.errors import ConnectError, NedbusError
+from nedbus.log_event import about
+from nedbus.settings import Settings
+from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, while_open
+
+_log = logging.getLogger(__name__)
+
+_FIRST: Final = (1.0, 5.0)  # s, drawn: the vehicles of a fleet come back together when their router does
+_CONFIRM: Final = 1.0  # s until a refusal is looked at again
+_BELIEVED: Final = 3  # refusals one after the other: a router that is slow, or starts again, is none
+_PAUSES: Final = (30.0, 60.0, 120.0, 300.0, 600.0)  # s until what is refused, or cannot be told, is looked at again
+_POLL: Final = 1.0  # s between two looks at the link
+_OPEN: Final = 5.0  # s for a session
+_ARRIVED: Final = 3.0  # s for a message that is allowed
+_GRACE: Final = 5.0  # s to end
+_MAX_NAMED: Final = 20  # vehicles in a line of the log
+
+
+def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
+    """Start to check what the router lets through, if that may depend on a certificate of ours."""
+    endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
+    if settings.tls is None or settings.tls.certificate is None or not endpoints:
+        return None
+
+    def vehicles() -> set[str]:
+        return {publisher.address.vehicle for publisher in registry.publishers}
+
+    permission = WritePermission(session, endpoints, tls=settings.tls, prefix=settings.prefix, vehicles=vehicles)
+    permission.start()
+    return permission
+
+
+class WritePermission:
+    """Follow which of the vehicles that `vehicles` returns the router refuses, in a thread of its own.
+
+    `session` publishes them, as a client of one of the endpoints or as a router that joins them.
+    """
+
+    def __init__(
+        self, session: Session, endpoints: Sequence[str], *, tls: Tls, prefix: str, vehicles: Callable[[], set[str]]
+    ) -> None:
+        self._session = session
+        self._endpoints = endpoints
+        self._tls = tls
+        self._prefix = prefix
+        self._vehicles = vehicles
+        self._stop = threading.Event()
+        self._denials: Counter[str] = Counter()  # of each vehicle, one after the other
+        self._refused: dict[str, bool] = {}
+        self._tries = 0
+        self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
+
+    @property
+    def refused(self) -> Mapping[str, bool]:
+        """Whether the router refuses a vehicle, of those of which that is known."""
+        return dict(self._refused)
+
+    def start(self) -> None:
+        """Check from now on: when the link is another one, when a vehicle is new, and now and then."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; best after the session, which ends a check that is under way."""
+        self._stop.set()
+        self._thread.join(_GRACE)
+
+    def _run(self) -> None:
+        due, known = 0.0, (set[str](), set[str]())
+        while not self._stop.wait(_POLL):
+            now = time.monotonic()
+            routers, vehicles = _routers_of(self._session), self._vehicles()
+            if routers != known[0]:
+                self._denials.clear()
+                self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - nobody is to be surprised
+            elif vehicles - known[1]:
+                due = min(due, now + _FIRST[0])
+            known = routers, vehicles
+            if routers and vehicles and now >= due:
+                due = now + self.check()
+
+    def check(self) -> float:
+        """Look once, and return after how many seconds to look again."""
+        vehicles = self._vehicles()
+        try:
+            verdicts = self._probe(vehicles)
+        except NedbusError as exc:  # the link or the session has gone, or a file is being replaced
+            _log.debug("whether the router takes what is published cannot be told: %s", exc)
+            verdicts = {}
+        for gone in [*(self._refused.keys() | self._denials.keys()) - vehicles]:
+            self._refused.pop(gone, None)
+            del self._denials[gone]
+        self._note(verdicts)
+        if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
+            return _CONFIRM
+        is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
+        pause = _PAUSES[-1 if is_well else min(self._tries, len(_PAUSES) - 1)]
+        self._tries += 1
+        return pause
+
+    def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
+        """Return what is known of each vehicle; nothing without a router to which both sessions have a link."""
+        routers = _routers_of(self._session)
+        for endpoint in self._endpoints if vehicles else ():
+            try:
+                reader = open_client([endpoint], timeout=_OPEN, tls=self._tls, stop=self._stop)
+            except ConnectError:
+                continue
+            with reader:
+                if not (there := _routers_of(reader)) or not there <= routers:
+                    continue
+                verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=_ARRIVED)
+                # What did not arrive counts only where no link was broken meanwhile.
+                return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
+        return {}
+
+    def _note(self, verdicts: Mapping[str, Verdict]) -> None:
+        """Take the verdicts of one look, and log what is new."""
+        before = {vehicle for vehicle, refused in self._refused.items() if refused}
+        for vehicle, verdict in verdicts.items():
+            if verdict == "allowed":
+                self._denials[vehicle] = 0
+                self._refused[vehicle] = False
+            elif verdict == "denied":
+                self._denials[vehicle] += 1
+                if self._denials[vehicle] >= _BELIEVED:
+                    self._refused[vehicle] = True
+            elif not self._denials[vehicle]:  # else the router was slow: rules do not change under a link
+                self._refused.pop(vehicle, None)
+        now = {vehicle for vehicle, refused in self._refused.items() if refused}
+        if new := now - before:
+            _log.warning(
+                "the router refuses %s: nothing of it reaches anybody; do its access rules name it, with the"
+                " certificate %s? ('nedbus pki rules', docs/security.md); still trying",
+                _name(new),
+                self._tls.certificate,
+                extra=about("refused"),
+            )
+        if mended := {vehicle for vehicle in before - now if self._refused.get(vehicle) is False}:
+            _log.info("the router takes %s now: all is well again", _name(mended), extra=about("accepted"))
+
+
+def _routers_of(session: Session) -> set[str]:
+    """Return the routers to which a session has a link."""
+    try:
+        with while_open():
+            return {str(zid) for zid in session.info.routers_zid()}
+    except NedbusError:
+        return set()
+
+
+def _name(vehicles: set[str]) -> str:
+    names = sorted(vehicles)
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return f"vehicle {', '.join(names[:_MAX_NAMED])}{more}"

@@ -1,0 +1,71 @@
+"""Probe which vehicles may be written: Zenoh drops what is not allowed, without an error at its sender.
+
+One session subscribes to keys under the vehicles that are nobody's topic, another one publishes there.
+The publisher sees whether the router told it of that subscriber. If it did, and nothing arrives, it may not write.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Collection
+from typing import Final, Literal, cast
+
+import zenoh
+
+from nedbus_msgs import ANY
+
+from .session import Session, while_open
+
+Verdict = Literal["allowed", "denied", "unknown"]
+
+_POLL: Final = 0.02  # s
+_AGAIN: Final = 0.2  # s until it is published again: the declarations of a key may still be under way
+_SPARE: Final = 16  # probes that a channel has room for beyond one of each vehicle
+
+
+def probe_writes(
+    reader: Session, writer: Session, vehicles: Collection[str], *, prefix: str, timeout: float = 1.0
+) -> dict[str, Verdict]:
+    """Return which vehicles `writer` may publish; unknown if `reader` may not look.
+
+    `timeout`: seconds until the router has told of the subscriber, and then until a message arrives that is allowed.
+    """
+    probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of a reader does not match its chunk with @
+    keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
+    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(len(keys) + _SPARE)
+    missing = dict(keys)
+
+    def receive() -> bool:
+        while (sample := subscriber.handler.try_recv()) is not None:
+            missing.pop(str(sample.key_expr), None)
+        return not missing
+
+    with while_open():
+        subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", channel)
+        # It ends when nothing refers to it: `undeclare` keeps the interpreter's lock while it waits.
+        announcement = writer.declare_publisher(next(iter(keys)))
+        # Zenoh's stubs call the status a bool; it is an object, always true.
+        announced = _wait(lambda: cast("zenoh.MatchingStatus", announcement.matching_status).matching, timeout)
+        for _ in range(round(timeout / _AGAIN)):
+            for key in missing:
+                # Not behind the data in a queue that is full, where it would be dropped.
+                writer.put(
+                    key,
+                    b"probe",
+                    congestion_control=zenoh.CongestionControl.DROP,
+                    priority=zenoh.Priority.INTERACTIVE_HIGH,
+                    express=True,
+                )
+            if _wait(receive, _AGAIN):
+                break
+    lacking = set(missing.values())
+    refused: Verdict = "denied" if announced else "unknown"
+    return {vehicle: refused if vehicle in lacking else "allowed" for vehicle in keys.values()}
+
+
+def _wait(condition: Callable[[], bool], seconds: float) -> bool:
+    end = time.monotonic() + seconds
+    while not (met := condition()) and time.monotonic() < end:
+        time.sleep(_POLL)
+    return met
