@@ -390,7 +390,7 @@ def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, 
     echo.signal(signal.SIGINT)
     assert echo.wait() == 130
     happened = count_lines(echo.err, time.monotonic() - start)
-    assert happened["invalid"] == 1000
+    assert happened["invalid"] == 100  # keys; further ones are only counted
 
 
 def test_flapping_vehicles_are_bounded(run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
