@@ -16,6 +16,7 @@ from itertools import cycle, islice
 from pathlib import Path
 from typing import Protocol, Self, cast
 
+import hypothesis
 import pytest
 import zenoh
 
@@ -23,6 +24,10 @@ import nedbus
 from nedbus import Mode
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT_TOPIC, Address, VehicleLocalPosition
+
+# A machine that is busy fails no property.
+hypothesis.settings.register_profile("nedbus", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+hypothesis.settings.load_profile("nedbus")
 
 DEADLINE = 30.0  # s that a test waits for a condition before it fails
 _SAID = 10_000  # characters of a process's output that a failure shows

@@ -308,7 +308,7 @@ def follow(tracks: Tracks, streams: Mapping[Address, Stream], counts: Sequence[S
         tracks.update(streams)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     counts=st.lists(st.lists(st.integers(0, 90) | st.integers(0, 700), min_size=3, max_size=3), max_size=30),
     breaks=st.sampled_from([0, 7, 50]),
