@@ -2,7 +2,8 @@
 
 It opens and closes publishers in one thread, while others put, call `vehicles()` and `latest()`, and subscribe, with
 `max_rate` too. Its router is killed and started again; other processes keep the processor busy. A thread ticks every
-50 ms. The bar: no tick comes a second late, and the process ends.
+50 ms, and so does a process that does nothing else: on a shared machine that one may be late by seconds itself.
+The bar: no tick comes a second later than the latest one of that, and the process ends.
 
 Whenever ticks stay away for a second, faulthandler prints the stacks of all threads, on stderr.
 """
@@ -40,11 +41,13 @@ def main() -> None:
     parser.add_argument("--busy", type=int, default=2, help="processes that compute")
     parser.add_argument("--limit", type=float, default=1.0, help="seconds that a tick may be late")
     parser.add_argument("--port", type=int, default=17_447)
-    parser.add_argument("--part", choices=["router", "stress"], help=argparse.SUPPRESS)
+    parser.add_argument("--part", choices=["router", "control", "stress"], help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.part == "router":
         with open_router(listen=(f"tcp/127.0.0.1:{arguments.port}",)):
             signal.pause()
+    elif arguments.part == "control":
+        json.dump(_tick(arguments.seconds, shows=False), sys.stdout)
     elif arguments.part == "stress":
         json.dump(_stress(f"tcp/127.0.0.1:{arguments.port}", arguments.seconds), sys.stdout)
     else:
@@ -54,15 +57,16 @@ def main() -> None:
         finally:
             _kill(*busy)
         sys.stdout.write(json.dumps(found) + "\n")
-        sys.exit(found.get("latest tick", float("inf")) >= arguments.limit)
+        sys.exit(found.get("latest tick", float("inf")) >= arguments.limit + found["latest tick of control"])
 
 
 def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
-    """Run the process beside a router that comes and goes; return its counts, and how late a tick came [s].
+    """Run the process beside a router that comes and goes; return its counts, and how late ticks came [s].
 
-    Of a process that does not end there is nothing to return; the stacks of its threads are printed.
+    Of a process that does not end there is no more than those of the control; the stacks of its threads are printed.
     """
     router = _start("router", port)
+    control = _start("control", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
     stress = _start("stress", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
     deadline, next_restart = time.monotonic() + seconds + GRACE, time.monotonic() + restart
     try:
@@ -78,10 +82,10 @@ def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
         with suppress(subprocess.TimeoutExpired):
             stress.wait(5.0)
         said = stress.communicate()[0] if stress.returncode == 0 else ""
+        late = control.communicate(timeout=GRACE)[0]
     finally:
-        _kill(stress, router)
-    found: dict[str, float] = json.loads(said or "{}")
-    return found
+        _kill(stress, control, router)
+    return {**json.loads(said or "{}"), "latest tick of control": round(json.loads(late), 3)}
 
 
 def _start(part: str, port: int, *arguments: str, stdout: int | None = None) -> subprocess.Popen[str]:
@@ -141,7 +145,7 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             repeat("every", subscribe(mode="every")),
             repeat("thinned", subscribe(max_rate=5.0)),
         ]
-        latest = _tick(seconds)
+        latest = _tick(seconds, shows=True)
         stop.set()
         for thread in threads:
             thread.join(GRACE / 2)
@@ -149,11 +153,12 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
     return {**counts, "latest tick": round(latest, 3)}
 
 
-def _tick(seconds: float) -> float:
-    """Tick for so many seconds, and return how late the latest tick was [s]."""
+def _tick(seconds: float, *, shows: bool) -> float:
+    """Tick for this time, and return how late the latest tick was [s]; `shows`: show all stacks when one is."""
     end, latest, last = time.monotonic() + seconds, 0.0, time.monotonic()
     while last < end:
-        faulthandler.dump_traceback_later(1.0 + TICK, exit=False)
+        if shows:
+            faulthandler.dump_traceback_later(1.0 + TICK, exit=False)
         time.sleep(TICK)
         now = time.monotonic()
         latest, last = max(latest, now - last - TICK), now
