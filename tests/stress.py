@@ -14,6 +14,7 @@ import argparse
 import faulthandler
 import json
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -73,8 +74,9 @@ def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
         while stress.poll() is None and time.monotonic() < deadline:
             with suppress(subprocess.TimeoutExpired):
                 stress.wait(0.1)
-            if time.monotonic() >= next_restart:
-                next_restart += restart
+            if not _listens(port):
+                next_restart = time.monotonic() + restart
+            elif time.monotonic() >= next_restart:
                 _kill(router)
                 router = _start("router", port)
         if stress.poll() is None:
@@ -86,6 +88,13 @@ def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
     finally:
         _kill(stress, control, router)
     return {**json.loads(said or "{}"), "latest tick of control": round(json.loads(late), 3)}
+
+
+def _listens(port: int) -> bool:
+    with suppress(OSError):
+        socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+        return True
+    return False
 
 
 def _start(part: str, port: int, *arguments: str, stdout: int | None = None) -> subprocess.Popen[str]:
