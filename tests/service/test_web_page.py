@@ -29,9 +29,9 @@ from nedbus_msgs.arrays import to_array
 from tests.browser import PATIENCE, Tab, browser, open_tabs
 from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
 
-from .test_secure import pki, secure
+from .test_secure import configured, pki, secure
 
-__all__ = ["browser", "pki", "secure"]  # fixtures
+__all__ = ["browser", "configured", "pki", "secure"]  # fixtures
 
 VLP = "vehicle_local_position"
 HOSTILE = "<img src=x onerror=window.hacked=1><script>window.hacked=1</script>"
