@@ -147,9 +147,6 @@ class World:
     def info(self) -> SimpleNamespace:
         return SimpleNamespace(routers_zid=self.routers.copy)
 
-    def is_closed(self) -> bool:
-        return self.closed
-
     def get(
         self, selector: str, channel: zenoh.handlers.FifoChannel[zenoh.Reply], *, timeout: float, **options: object
     ) -> Query:

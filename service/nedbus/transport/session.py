@@ -156,8 +156,7 @@ def while_open() -> Iterator[None]:
 def translate_error(error: zenoh.ZError) -> NedbusError:
     """Return what `while_open` raises for this error.
 
-    The session itself is not asked: `is_closed` waits for a lock of Zenoh's without giving up the interpreter's, and
-    stops the process for good while a liveliness query holds that lock and calls Python.
+    The session itself is not asked: `is_closed` waits for a lock of Zenoh's without giving up the interpreter's.
     """
     return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 
