@@ -48,6 +48,7 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 _log = logging.getLogger(__name__)
 
 _POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
+_REMEMBERED: Final = 60.0  # s that a vehicle may be gone and still be recovered from; publishers keep 20 s
 _VISIBLE: Final = 5.0  # s after which what was announced is visible to others, or denied
 
 
@@ -91,6 +92,7 @@ class Ros2Bridge:
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
         self._late_filter = LateFilter()
+        self._withdrawn: dict[Address, float] = {}  # since when; what is late of them is still known
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
 
@@ -149,6 +151,10 @@ class Ros2Bridge:
         held_back = self._late_filter.report()
         if held_back:
             _log.warning("%s: ROS 2 would use them as the current estimate", held_back, extra=about("held-back"))
+        for address, since in list(self._withdrawn.items()):
+            if time.monotonic() - since > _REMEMBERED:
+                del self._withdrawn[address]
+                self._late_filter.forget(address)
         addresses = [
             address
             for addresses in self._bus.vehicles().values()
@@ -166,6 +172,7 @@ class Ros2Bridge:
         address, topic, other = decision.address, decision.topic, decision.other
         if decision.action == "publish":
             self._open(address, topic)
+            self._withdrawn.pop(address, None)
             _log.info(
                 "%s -> /%s, %s of layout %s", address, topic, ROS2_TYPE, self._layout, extra=about("bridged", address)
             )
@@ -189,7 +196,8 @@ class Ros2Bridge:
                     extra=about("conflict", address),
                 )
             else:
-                self._late_filter.forget(address)
+                # After a router's restart it is back in a moment, and with it come the messages of the outage.
+                self._withdrawn[address] = time.monotonic()
                 _log.info(
                     "%s is no longer published: /%s is withdrawn", address, topic, extra=about("withdrawn", address)
                 )

@@ -1,5 +1,6 @@
 """The command line, a user of the library."""
 
+import atexit
 import gc
 import os
 import resource
@@ -26,6 +27,7 @@ def main() -> None:
     if allowed != resource.RLIM_INFINITY and allowed < _FILES:  # Zenoh would abort the process
         sys.stderr.write(f"nedbus: only {allowed} open files are allowed: set 'ulimit -n {_FILES}' or more\n")
         sys.exit(1)
+    atexit.register(_give_up_stderr)
     gc.disable()  # to look for garbage while everything is imported takes a sixth of the time, and finds none
     from .app import app
 
@@ -40,3 +42,11 @@ def _fill_closed_streams() -> None:
     os.close(descriptor)
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - until the end
+
+
+def _give_up_stderr() -> None:
+    """Let go what a terminal that is gone did not take: Python would try once more, and exit with 120."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)

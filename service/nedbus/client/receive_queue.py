@@ -150,8 +150,8 @@ class ReceiveQueue:
                 return False
             if timeout is None:
                 break
-        if self.ended:
-            self.wakeups.wake()  # other threads that wait
+        if self.ended or self.waiting > 1:
+            self.wakeups.wake()  # another thread that waits: of all that is put at once only one is woken
         return True
 
     def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:

@@ -92,6 +92,8 @@ class WebServer:
 
         self._loop.add_callback(begin)
         self._loop.start()
+        poll.stop()  # it would stop the loop once more, amid the end of the server
+        again.stop()
         self._server.stop()
         self._loop.close(all_fds=True)
 
