@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
 
-.PHONY: run check quick test compose-test wheel bench clean
+.PHONY: run check quick test behaviour test-all measured compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -21,17 +21,24 @@ check: $(DEV)  ## lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-quick: $(DEV)  ## the tests that start no process: under a minute
-	$(BIN)/pytest -q -m "not process and not compose"
+quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
+	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"
 
-test: check  ## lint, types, and the tests that need no containers in two processes, with branch coverage
+test: check behaviour  ## lint, types, and all tests that prove behaviour: under three minutes
+
+behaviour: $(DEV)
+	$(BIN)/pytest -q -n 4 --dist worksteal -m "not slow and not compose"
+
+test-all: check measured compose-test  ## the same with branch coverage and more examples, the slow tests, and containers
+
+measured: $(DEV)
 	$(BIN)/coverage erase
-	$(BIN)/coverage run -m pytest -q -n 2 --dist loadfile -m "not compose" --junitxml=build/tests.xml
+	$(BIN)/coverage run -m pytest -q -n 4 --dist worksteal -m "not compose" --hypothesis-profile=all --junitxml=build/tests.xml
 	$(BIN)/coverage combine -q
 	$(BIN)/coverage report
 
 compose-test: $(DEV)  ## the tests in containers; they need Docker with compose, and some minutes
-	$(BIN)/pytest -q -m compose --junitxml=build/compose-tests.xml
+	$(BIN)/pytest -q -n 3 --dist loadfile -o timeout_method=signal -o faulthandler_timeout=590 -m compose --junitxml=build/compose-tests.xml
 
 wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and use it
 	rm -rf dist build/wheel-venv

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.conftest import wait_for
+from tests.waits import wait_for
 
 PATIENCE: Final = 60.0  # s: a page takes its time where other programs use the processor
 _NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
@@ -31,7 +31,7 @@ def browser() -> Iterator[Browser]:
     if path is None:
         pytest.skip(f"there is no {' or '.join(_NAMES)} here")
     with sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
         yield started
         started.close()
 
@@ -47,10 +47,7 @@ class Tab:
         page.on("request", lambda request: self.requested.append(request.url))
         page.on("websocket", lambda socket: self.requested.append(socket.url))
         page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        page.on(
-            "console",
-            lambda said: self.complaints.append(said.text) if said.type == "error" else None,
-        )
+        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
 
     def open(self, url: str) -> None:
         """Load the page, and wait for its first picture."""

@@ -12,7 +12,9 @@ from urllib.parse import quote
 
 import pytest
 
-from tests.conftest import Process, Start, free_port, wait_for
+from tests.ports import free_port
+from tests.processes import Process, Start
+from tests.waits import wait_for
 
 PACKAGING: Final = Path(__file__).parents[1] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
@@ -34,10 +36,7 @@ def start_promtool(start: Start, *arguments: str, stdin: Path | str = os.devnull
 
 
 class Prometheus:
-    """A Prometheus that scrapes and evaluates every second, its data in a folder of the test.
-
-    It is killed at the end of the test, as all that `start` starts.
-    """
+    """A Prometheus that scrapes and evaluates every second, its data in a folder of the test; `start` ends it too."""
 
     def __init__(self, start: Start, folder: Path, rules: str, jobs: dict[str, list[str]]) -> None:
         program = find_program("prometheus")
@@ -54,10 +53,10 @@ class Prometheus:
         )  # fmt: skip
         wait_for(self._is_ready, what=f"Prometheus: {self.process.err}")
 
-    def alerts(self, name: str) -> list[dict[str, str]]:
-        """Return the labels of what an alert fires for now."""
-        found = self._get("/api/v1/alerts")["alerts"]
-        return [each["labels"] for each in found if each["labels"]["alertname"] == name and each["state"] == "firing"]
+    def alerts(self, name: str, **labels: str) -> list[dict[str, str]]:
+        """Return the labels of what an alert fires for now, of those with these labels."""
+        firing = [each["labels"] for each in self._get("/api/v1/alerts")["alerts"] if each["state"] == "firing"]
+        return [each for each in firing if {"alertname": name, **labels}.items() <= each.items()]
 
     def annotations(self) -> list[str]:
         """Return the texts of all alerts, pending ones included."""

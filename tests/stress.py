@@ -52,20 +52,17 @@ def main() -> None:
     elif arguments.part == "stress":
         json.dump(_stress(f"tcp/127.0.0.1:{arguments.port}", arguments.seconds), sys.stdout)
     else:
-        busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(arguments.busy)]
-        try:
-            found = measure(arguments.seconds, arguments.restart, arguments.port)
-        finally:
-            _kill(*busy)
+        found = measure(arguments.seconds, arguments.restart, arguments.busy, arguments.port)
         sys.stdout.write(json.dumps(found) + "\n")
         sys.exit(found.get("latest tick", float("inf")) >= arguments.limit + found["latest tick of control"])
 
 
-def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
+def measure(seconds: float, restart: float, computing: int, port: int) -> dict[str, float]:
     """Run the process beside a router that comes and goes; return its counts, and how late ticks came [s].
 
     Of a process that does not end there is no more than those of the control; the stacks of its threads are printed.
     """
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"], text=True) for _ in range(computing)]
     router = _start("router", port)
     control = _start("control", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
     stress = _start("stress", port, "--seconds", str(seconds), stdout=subprocess.PIPE)
@@ -86,7 +83,7 @@ def measure(seconds: float, restart: float, port: int) -> dict[str, float]:
         said = stress.communicate()[0] if stress.returncode == 0 else ""
         late = control.communicate(timeout=GRACE)[0]
     finally:
-        _kill(stress, control, router)
+        _kill(stress, control, router, *busy)
     return {**json.loads(said or "{}"), "latest tick of control": round(json.loads(late), 3)}
 
 
@@ -102,7 +99,7 @@ def _start(part: str, port: int, *arguments: str, stdout: int | None = None) -> 
     return subprocess.Popen([*command, *arguments], stdout=stdout, text=True)
 
 
-def _kill(*processes: subprocess.Popen[str] | subprocess.Popen[bytes]) -> None:
+def _kill(*processes: subprocess.Popen[str]) -> None:
     for process in processes:
         process.kill()
         process.wait()
@@ -113,16 +110,11 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
     stop = threading.Event()
     with nedbus.connect(endpoint, timeout=30.0) as bus:
 
-        def repeat(what: str, action: Callable[[], object]) -> threading.Thread:
-            def run() -> None:
-                while not stop.is_set():
-                    with suppress(NedbusError):
-                        action()
-                        counts[what] += 1
-
-            thread = threading.Thread(target=run, name=what, daemon=True)
-            thread.start()
-            return thread
+        def repeat(what: str, action: Callable[[], object]) -> None:
+            while not stop.is_set():
+                with suppress(NedbusError):
+                    action()
+                    counts[what] += 1
 
         publishers = [bus.publisher("vehicle_local_position", vehicle=f"p{number}") for number in range(VEHICLES)]
         message = nedbus.VehicleLocalPosition(timestamp=1)
@@ -136,24 +128,24 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             with bus.publisher("vehicle_local_position", vehicle=f"c{counts['closed'] % VEHICLES}") as publisher:
                 publisher.publish(message)
 
-        def subscribe(**options: object) -> Callable[[], None]:
-            def take_some() -> None:
-                with bus.subscribe(vehicle="*", **options) as samples:  # type: ignore[arg-type] # made for any option
-                    for _ in range(20):
-                        samples.receive(timeout=0.5)
+        def take_some(mode: nedbus.Mode = "latest", max_rate: float | None = None) -> None:
+            with bus.subscribe(vehicle="*", mode=mode, max_rate=max_rate) as samples:
+                for _ in range(20):
+                    samples.receive(timeout=0.5)
 
-            return take_some
-
-        threads = [
-            repeat("closed", open_and_close),
-            repeat("put", put),
-            repeat("vehicles", lambda: alive_keys(bus._session, alive_key_expr(prefix=bus.prefix), timeout=1.0)),
-            repeat("followed", lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01))),
-            repeat("latest", lambda: bus.latest(timeout=1.0)),
-            repeat("subscribed", subscribe()),
-            repeat("every", subscribe(mode="every")),
-            repeat("thinned", subscribe(max_rate=5.0)),
-        ]
+        actions: dict[str, Callable[[], object]] = {
+            "closed": open_and_close,
+            "put": put,
+            "vehicles": lambda: alive_keys(bus._session, alive_key_expr(prefix=bus.prefix), timeout=1.0),
+            "followed": lambda: (bus.vehicles(timeout=1.0), stop.wait(0.01)),
+            "latest": lambda: bus.latest(timeout=1.0),
+            "subscribed": take_some,
+            "every": lambda: take_some("every"),
+            "thinned": lambda: take_some(max_rate=5.0),
+        }
+        threads = [threading.Thread(target=repeat, args=each, name=each[0], daemon=True) for each in actions.items()]
+        for thread in threads:
+            thread.start()
         latest = _tick(seconds, shows=True)
         stop.set()
         for thread in threads:

@@ -7,12 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 import nedbus
-from nedbus_msgs import ANY
-from tests.conftest import Process, Start, free_endpoint, message, wait_for
+from tests.messages import VALID, VLP, message
+from tests.ports import free_endpoint
+from tests.processes import Process, Start
 from tests.replays import convert_replay
+from tests.waits import wait_for
+
+from .service.test_cli import flying
+
+__all__ = ["flying"]  # a fixture
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTS = {
@@ -25,14 +30,6 @@ PRINTS = {
     "health.py": "1/vehicle_local_position: ",
     "alarm.py": "vehicle 1: good",
 }
-
-
-@pytest.fixture
-def simulated(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> str:
-    """Run a service with a simulated vehicle on the test's router."""
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: len(bus.latest(ANY)) == 5, what="five streams")
-    return endpoint
 
 
 def run_example(start: Start, name: str, endpoint: str, folder: Path) -> Process:
@@ -48,9 +45,9 @@ def test_all_examples_are_tested() -> None:
 
 
 @pytest.mark.parametrize("name", PRINTS)
-def test_example_runs(start: Start, simulated: str, tmp_path: Path, name: str) -> None:
+def test_example_runs(start: Start, flying: str, tmp_path: Path, name: str) -> None:
     """Each example prints its result, and ends without a word at Ctrl-C."""
-    process = run_example(start, name, simulated, tmp_path)
+    process = run_example(start, name, flying, tmp_path)
     wait_for(
         lambda: PRINTS[name] in process.out or process.popen.poll() not in {None, 0}, what=f"{name}: {process.err}"
     )
@@ -71,6 +68,7 @@ def test_publishing_example_publishes(start: Start, endpoint: str, bus: nedbus.B
     assert process.popen.poll() is None
 
 
+@pytest.mark.slow
 def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Path) -> None:
     """examples/alarm.py waits for the service, which is the router too, at its start and when it was killed."""
     endpoint = free_endpoint()
@@ -96,12 +94,10 @@ def test_alarm_survives_a_restart(run_nedbus: Start, start: Start, tmp_path: Pat
 def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bus, tmp_path: Path) -> None:
     """examples/alarm.py names each flag that casts doubt on a position, once."""
     alarm = run_example(start, "alarm.py", endpoint, tmp_path)
-    publisher = bus.publisher("vehicle_local_position", vehicle="1")
-    numbers = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
-    valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
+    publisher = bus.publisher(VLP, vehicle="1")
 
     def is_said(text: str, flags: dict[str, bool]) -> bool:
-        publisher.publish(message(1, **numbers, **valid | flags))
+        publisher.publish(message(1, **VALID | flags))
         return alarm.out.rstrip().endswith(text)
 
     for text, flags in (
@@ -115,6 +111,7 @@ def test_alarm_is_raised_by_the_flag(start: Start, endpoint: str, bus: nedbus.Bu
     assert alarm.out.count("xy_valid is false") == 2
 
 
+@pytest.mark.slow
 def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:
     """examples/resets.py prints the reset at the end of the simulated outage, and plots both tracks and one cross."""
     flight, picture = tmp_path / "flight.mcap", tmp_path / "resets.png"
@@ -122,7 +119,7 @@ def test_resets_are_plotted(start: Start, tmp_path: Path) -> None:
     process = start(str(EXAMPLES / "resets.py"), str(flight), str(picture), MPLBACKEND="agg")
     assert process.wait(60) == 0, process.err
     assert process.out.count("xy reset by") == 1
-    pixels = imread(picture)[..., :3]
+    pixels = pytest.importorskip("matplotlib.image").imread(picture)[..., :3]
     assert pixels.shape == (600, 800, 3)
 
     def drawn(color: tuple[float, float, float]) -> tuple[np.ndarray, ...]:

@@ -9,12 +9,14 @@ import inspect
 import re
 import sys
 import typing
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 import nedbus
-from tests.conftest import Start
+from tests.processes import Start
 
 ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
@@ -22,71 +24,55 @@ FLOORS = [
     "errors", "extras", "whole_file", "log_event", "transport", "settings", "client", "recording", "sources", "daemon",
     "monitoring", "doctor", "bridges", "web", "cli",
 ]  # fmt: skip
-# Packages that only these files import, by their path without .py; nothing else says who may use Zenoh.
-ONLY: dict[str, set[str]] = {
+# Packages that only these files import, by folder; nothing else says who may use Zenoh.
+ONLY_BY_FOLDER = {
     "zenoh": {
-        "nedbus/transport/session", "nedbus/transport/router", "nedbus/transport/queries", "nedbus/transport/refusals",
-        "nedbus/transport/write_probe",
-        "nedbus/client/channels", "nedbus/client/zenoh_subscriber", "nedbus/client/follower", "nedbus/client/decoder",
-        "nedbus/client/sample", "nedbus/client/publisher", "nedbus/client/publisher_registry",
-        "nedbus/client/acknowledgement", "nedbus/client/recovery", "nedbus/client/rejections",
-        "nedbus/client/query_server", "nedbus/client/qos", "nedbus/client/demand",
-        "nedbus/client/thinned_streams", "nedbus/client/thinned_subscriber",
-        "nedbus/sources/px4_zenoh", "nedbus/sources/px4_node", "nedbus/bridges/ros2",
-        "nedbus/doctor/traffic",
+        "nedbus/transport": "session router queries refusals write_probe",
+        "nedbus/client": "channels zenoh_subscriber follower decoder sample publisher publisher_registry "
+        "acknowledgement recovery rejections query_server qos demand thinned_streams thinned_subscriber",
+        "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",
     },
-    "msgpack": {"nedbus_msgs/wire"},
-    "xxhash": {"nedbus/transport/rmw_zenoh"},
+    "msgpack": {"nedbus_msgs": "wire"},
+    "xxhash": {"nedbus/transport": "rmw_zenoh"},
     "numpy": {
-        "nedbus_msgs/arrays", "nedbus/client/batch", "nedbus/sources/ulog",
-        "nedbus/recording/ulog", "nedbus/recording/arrays", "nedbus/recording/plot",
-        "nedbus/web/stream", "nedbus/web/tracks", "nedbus/web/background", "nedbus/web/plots",
+        "nedbus_msgs": "arrays", "nedbus/client": "batch", "nedbus/sources": "ulog",
+        "nedbus/recording": "ulog arrays plot", "nedbus/web": "stream tracks background plots",
     },
-    "bokeh": {
-        "nedbus/web/background", "nedbus/web/map_plot", "nedbus/web/playback", "nedbus/web/plots", "nedbus/web/send",
-        "nedbus/web/serve", "nedbus/web/server", "nedbus/web/style", "nedbus/web/table", "nedbus/web/tracks",
-        "nedbus/web/viewer",
-    },
-    "tornado": {"nedbus/web/server"},
-    "PIL": {"nedbus/web/background"},
+    "bokeh": {"nedbus/web": "background map_plot playback plots send serve server style table tracks viewer"},
+    "tornado": {"nedbus/web": "server"},
+    "PIL": {"nedbus/web": "background"},
     "pydantic": {
-        "nedbus_msgs/position", "nedbus_msgs/px4_types", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
-        "nedbus/settings/model", "nedbus/settings/load", "nedbus/sources/options", "nedbus/sources/spec",
-        "nedbus/recording/conversion", "nedbus/recording/arrays", "nedbus/cli/status",
+        "nedbus_msgs": "position px4_types fast_path wire", "nedbus/settings": "model load",
+        "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
     },
     "pydantic_core": {
-        "nedbus_msgs/px4_types", "nedbus_msgs/position", "nedbus_msgs/fast_path", "nedbus_msgs/wire",
-        "nedbus/client/publisher_registry",
-        "nedbus/settings/load",
+        "nedbus_msgs": "px4_types position fast_path wire", "nedbus/client": "publisher_registry",
+        "nedbus/settings": "load",
     },
-    "pydantic_settings": {"nedbus/settings/model", "nedbus/settings/load"},
-    "typing_extensions": {"nedbus/client/sample"},
-    "pyulog": {"nedbus/recording/ulog"},
-    "mcap": {
-        "nedbus/recording/writer", "nedbus/recording/reader", "nedbus/recording/chunks", "nedbus/recording/records",
-    },
-    "lz4": {"nedbus/recording/records"},
-    "zstandard": {"nedbus/recording/records"},
-    "pandas": {"nedbus/recording/arrays"},
-    "polars": {"nedbus/recording/arrays"},
-    "matplotlib": {"nedbus/recording/plot"},
-    "pymavlink": {"nedbus/sources/mavlink", "nedbus/doctor/mavlink"},
-    "serial": {"nedbus/sources/mavlink_link"},
-    "foxglove": {"nedbus/bridges/foxglove", "nedbus/bridges/foxglove_messages"},
-    "prometheus_client": {
-        "nedbus/monitoring/families", "nedbus/monitoring/exposition", "nedbus/monitoring/service_metrics",
-        "nedbus/monitoring/exporter",
-    },
-    "cryptography": {"nedbus/transport/pki", "nedbus/transport/pki_renewal"},
-    "rich": {"nedbus/cli/progress", "nedbus/cli/files", "nedbus/cli/live_table", "nedbus/cli/logs"},
+    "pydantic_settings": {"nedbus/settings": "model load"},
+    "typing_extensions": {"nedbus/client": "sample"},
+    "pyulog": {"nedbus/recording": "ulog"},
+    "mcap": {"nedbus/recording": "writer reader chunks records"},
+    "lz4": {"nedbus/recording": "records"},
+    "zstandard": {"nedbus/recording": "records"},
+    "pandas": {"nedbus/recording": "arrays"},
+    "polars": {"nedbus/recording": "arrays"},
+    "matplotlib": {"nedbus/recording": "plot"},
+    "pymavlink": {"nedbus/sources": "mavlink", "nedbus/doctor": "mavlink"},
+    "serial": {"nedbus/sources": "mavlink_link"},
+    "foxglove": {"nedbus/bridges": "foxglove foxglove_messages"},
+    "prometheus_client": {"nedbus/monitoring": "families exposition service_metrics exporter"},
+    "cryptography": {"nedbus/transport": "pki pki_renewal"},
+    "rich": {"nedbus/cli": "progress files live_table logs"},
     "typer": {
-        "nedbus/cli/app", "nedbus/cli/bridges", "nedbus/cli/files", "nedbus/cli/pki", "nedbus/cli/options",
-        "nedbus/cli/query", "nedbus/cli/echo", "nedbus/cli/health", "nedbus/cli/serve", "nedbus/cli/run",
-        "nedbus/cli/http", "nedbus/cli/pki_fleet", "nedbus/cli/check", "nedbus/cli/doctor", "nedbus/cli/web",
+        "nedbus/cli": "app bridges files pki options query echo health serve run http pki_fleet check doctor web",
     },
 }  # fmt: skip
+ONLY = {
+    package: {f"{folder}/{name}" for folder, names in folders.items() for name in names.split()}
+    for package, folders in ONLY_BY_FOLDER.items()
+}
 MAX_LINES = 400
-
 FILES = sorted([*ROOT.glob("service/**/*.py"), *ROOT.glob("schemas/**/*.py")])
 
 
@@ -95,46 +81,51 @@ def path_of(file: Path) -> str:
     return "/".join(file.relative_to(ROOT).with_suffix("").parts[1:])
 
 
-def imports_of(path: Path) -> list[str]:
-    """Return the full names of all modules that a file imports, in functions and for types too."""
+@cache
+def parse(path: Path) -> ast.Module:
+    """Return the syntax tree of a file."""
+    return ast.parse(path.read_text())
+
+
+def imports_of(path: Path, nodes: Iterable[ast.AST] | None = None) -> list[tuple[str, list[str]]]:
+    """Return what a file imports: the full name of each module, and the names that are taken from it.
+
+    Without `nodes` also what is imported in functions, or for types.
+    """
     package = path.relative_to(ROOT).parts[1:-1]
-    found: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    found: list[tuple[str, list[str]]] = []
+    for node in ast.walk(parse(path)) if nodes is None else nodes:
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            found += [(alias.name, []) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else ()
-            found.append(".".join([*base, *filter(None, [node.module])]))
+            found.append((".".join([*base, *filter(None, [node.module])]), [alias.name for alias in node.names]))
     return found
 
 
-@pytest.mark.parametrize("path", FILES, ids=path_of)
-def test_imports_point_down(path: Path) -> None:
+def test_imports_point_down() -> None:
     """Each file imports what stands below it only, other packages through their __init__, and what it may use."""
-    package, *rest = path_of(path).split("/")
-    floor = rest[0]
-    for name in imports_of(path):
+    for path, name in [(path_of(file), name) for file in FILES for name, _ in imports_of(file)]:
+        package, floor, *_ = path.split("/")
         top, *inner = name.split(".")
+        where = f"{path} imports {name}"
         if top in ONLY:
-            assert path_of(path) in ONLY[top], name
+            assert path in ONLY[top], where
         elif top == "nedbus_msgs" and package == "nedbus":
-            assert inner in ([], ["arrays"]), f"{name}: import from nedbus_msgs, or nedbus_msgs.arrays for NumPy"
+            assert inner in ([], ["arrays"]), f"{where}: import from nedbus_msgs, or nedbus_msgs.arrays for NumPy"
         elif top == "nedbus":
-            assert package == "nedbus", f"{name}: nedbus_msgs knows nothing of the service"
+            assert package == "nedbus", f"{where}: nedbus_msgs knows nothing of the service"
             if inner and floor in FLOORS:
-                assert inner[0] == floor or len(inner) == 1, f"{name}: import from nedbus.{inner[0]}"
-                assert FLOORS.index(inner[0]) <= FLOORS.index(floor), f"{name} points up"
+                assert inner[0] == floor or len(inner) == 1, f"{where}: import from nedbus.{inner[0]}"
+                assert FLOORS.index(inner[0]) <= FLOORS.index(floor), f"{where}, which points up"
         else:
-            assert top == "nedbus_msgs" or top in sys.stdlib_module_names, f"{name}: who may import this?"
+            assert top == "nedbus_msgs" or top in sys.stdlib_module_names, f"{where}: who may import this?"
 
 
 def test_no_entry_is_left_over() -> None:
     """Every file that ONLY names exists and imports that package; every folder is a floor."""
-    imported = {path_of(path): {name.split(".")[0] for name in imports_of(path)} for path in FILES}
-    unused = {
-        (package, path) for package, paths in ONLY.items() for path in paths if package not in imported.get(path, ())
-    }
-    assert not unused
+    imported = {(name.split(".")[0], path_of(path)) for path in FILES for name, _ in imports_of(path)}
+    assert {(package, path) for package, paths in ONLY.items() for path in paths} <= imported
     folders = {path.name for path in (ROOT / "service" / "nedbus").iterdir() if (path / "__init__.py").is_file()}
     assert folders <= set(FLOORS)
 
@@ -159,28 +150,16 @@ def test_no_import_circle() -> None:
 
 def runtime_imports(path: Path) -> set[str]:
     """Return the modules that are imported when a file is imported."""
-    tree = ast.parse(path.read_text())
-    tree.body = [
-        node for node in tree.body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
-    ]
-    source = ast.unparse(ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], []))
-    package = path.relative_to(ROOT).parts[1:-1]
-    found = set()
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.ImportFrom):
-            base = ".".join([*package[: len(package) - node.level + 1], *filter(None, [node.module])])
-            found.add(base if node.level else node.module or "")
-            found |= {f"{base}.{alias.name}" for alias in node.names if node.level and not node.module}
-    return found
+    imports = imports_of(path, parse(path).body)
+    return {name for name, _ in imports} | {f"{name}.{each}" for name, names in imports for each in names}
 
 
-@pytest.mark.parametrize("path", FILES, ids=path_of)
-def test_file_has_one_duty(path: Path) -> None:
+def test_file_has_one_duty() -> None:
     """No file is long, and the first line of its docstring, one sentence, says what it is for."""
-    text = path.read_text()
-    assert text.count("\n") <= MAX_LINES
-    docstring = ast.get_docstring(ast.parse(text)) or ""
-    assert docstring.splitlines()[0].endswith((".", ":")) or "__main__" in path_of(path) or path.stem == "__init__"
+    assert [path_of(path) for path in FILES if path.read_text().count("\n") > MAX_LINES] == []
+    first = {path_of(path): (ast.get_docstring(parse(path)) or "\n").splitlines()[0] for path in FILES}
+    without = [path for path, line in first.items() if not line.endswith((".", ":"))]
+    assert [path for path in without if not path.endswith(("__main__", "__init__"))] == []
 
 
 @pytest.mark.parametrize("name", ["nedbus", "nedbus_msgs"])
@@ -219,16 +198,14 @@ def annotations_of(public: type | typing.Callable[..., object]) -> typing.Iterat
                 yield from inspect.get_annotations(function).values()
 
 
-@pytest.mark.parametrize("name", sorted(set(nedbus.__all__)))
-def test_public_signatures_mention_public_names_only(name: str) -> None:
+def test_public_signatures_mention_public_names_only() -> None:
     """A script can import from nedbus whatever it gets from nedbus, or gives to it."""
-    for annotation in map(str, annotations_of(getattr(nedbus, name))):
-        expression = annotation.removeprefix("<class '").removesuffix("'>")
-        names = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
-        unknown = {
-            each for each in names if each not in KNOWN and each not in nedbus.__all__ and not each.endswith("_co")
-        }
-        assert not unknown, annotation
+    known = KNOWN | set(nedbus.__all__)
+    for name in nedbus.__all__:
+        for annotation in map(str, annotations_of(getattr(nedbus, name))):
+            expression = annotation.removeprefix("<class '").removesuffix("'>")
+            names = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
+            assert not [each for each in names - known if not each.endswith("_co")], f"{name}: {annotation}"
 
 
 def test_no_python_code_runs_on_threads_of_zenoh() -> None:
@@ -242,29 +219,28 @@ def test_no_python_code_runs_on_threads_of_zenoh() -> None:
         assert "declare_advanced_publisher" not in code or "publisher.undeclare(" not in code, path
 
 
-@pytest.mark.parametrize(
-    ("program", "absent"),
-    [
-        ("import sys; sys.argv = ['nedbus', '--version']; from nedbus.cli import main; main()", "pydantic zenoh typer"),
-        ("import nedbus; nedbus.connect", "numpy pyulog typer rich cryptography"),
-        ("import nedbus.cli.app", "numpy pyulog rich.progress cryptography"),
-    ],
-)
-def test_what_is_not_used_is_not_loaded(start: Start, program: str, absent: str) -> None:
-    """A command is there at once: what it does not need is not imported."""
-    process = start("-c", f"{program}\nimport sys\nassert not set({absent.split()!r}) & set(sys.modules)")
-    assert process.wait() == 0, process.err
+def test_what_is_not_used_is_not_loaded(start: Start) -> None:
+    """A command is there at once: what it does not need is not imported.
 
-
-def test_names_are_completed_before_they_are_loaded(start: Start) -> None:
-    """dir() of a fresh import has all public names, and loads nothing, so that a plain REPL completes them."""
+    dir() of a fresh import has all public names, and loads nothing, so that a plain REPL completes them.
+    """
     program = """
-import sys, nedbus, rlcompleter
+import sys
+def absent(names):
+    assert not set(names.split()) & set(sys.modules), names
+sys.argv = ["nedbus", "--version"]
+from nedbus.cli import main
+main()
+absent("pydantic zenoh typer")
+import nedbus, rlcompleter
 assert [name for name in dir(nedbus) if name[:2] != "__"] == sorted(nedbus.__all__) and "__version__" in dir(nedbus)
-assert "zenoh" not in sys.modules
+absent("zenoh")
 assert rlcompleter.Completer(globals()).complete("nedbus.connect_", 0).startswith("nedbus.connect_async")
+absent("numpy pyulog typer rich cryptography")
+import nedbus.cli.app
+absent("numpy pyulog rich.progress cryptography")
 """
-    process = start("-c", program)
+    process = start("-c", program, fresh=True)
     assert process.wait() == 0, process.err
 
 

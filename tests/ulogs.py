@@ -8,6 +8,8 @@ from pathlib import Path
 
 from nedbus_msgs import FIELD_TYPES, LAYOUTS, VehicleLocalPosition, downgrade
 
+LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
+"""Real flight logs, which tests marked `logs` read where they are."""
 _NAMES = {"uint64": "uint64_t", "uint8": "uint8_t", "bool": "bool", "float32": "float", "float64": "double"}
 _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": "d"}
 

@@ -6,18 +6,22 @@ import hashlib
 import os
 import tarfile
 import tempfile
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import Process, Start
+from tests.processes import Process, Start
 
 ROOT = Path(__file__).parents[1]
 ARCHIVE = ROOT.parent / "shared" / "bin" / "zenohd-1.10.2.tar.xz"
 # Whatever `start` starts is Python: this one becomes another program.
 BECOME = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"
+EITHER = ("nedbus", pytest.param("zenohd", marks=(pytest.mark.slow, pytest.mark.process)))
+"""Parameters of a fixture that runs a router: ours, and the real one where the tests may take their time."""
 
 
+@cache
 def zenohd_path() -> Path:
     """Return the program, whose plugins are in ../lib beside it; skip the test where there is none."""
     if not ARCHIVE.is_file():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import nedbus
 from nedbus.transport import make_authority, make_certificate
-from tests.conftest import DEADLINE
+from tests.waits import DEADLINE
 
 from .stack import ROOT, Stack
 

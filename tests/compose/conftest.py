@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import fcntl
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+import nedbus
+
 from .recorder import Recorder
 from .stack import ENVIRONMENT, ROOT, STAND_IN, Stack, docker, require_docker
 
 StartStack = Callable[..., Stack]
+Record = Callable[[nedbus.Subscription], Recorder]
 
 
 @pytest.fixture(scope="session")
 def images(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Build the image, and the router that stands in for the official one if that was asked for."""
     require_docker()
-    Stack("build", tmp_path_factory.mktemp("build")).compose("build")
-    if ENVIRONMENT.get("NEDBUS_ROUTER_IMAGE") == STAND_IN:
-        docker("build", "--quiet", "--tag", STAND_IN, str(ROOT / "tests" / "compose" / "router"))
+    with Path(tmp_path_factory.getbasetemp().parent, "images").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # of all workers the first builds, and the others find what it built
+        Stack("build", tmp_path_factory.mktemp("build")).compose("build")
+        if ENVIRONMENT.get("NEDBUS_ROUTER_IMAGE") == STAND_IN:
+            docker("build", "--quiet", "--tag", STAND_IN, str(ROOT / "tests" / "compose" / "router"))
 
 
 @pytest.fixture
@@ -37,9 +43,14 @@ def make_stack(images: None, tmp_path: Path) -> Iterator[StartStack]:
 
 
 @pytest.fixture
-def record() -> Iterator[list[Recorder]]:
-    """Collect recorders that end with the test."""
+def record() -> Iterator[Record]:
+    """Make recorders that end with the test."""
     recorders: list[Recorder] = []
-    yield recorders
+
+    def start(subscription: nedbus.Subscription) -> Recorder:
+        recorders.append(Recorder(subscription))
+        return recorders[-1]
+
+    yield start
     for recorder in recorders:
         recorder.close()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import wait_for
+from tests.waits import wait_for
 
 from .stack import DEADLINE, ENVIRONMENT, ROOT, docker
 
@@ -23,24 +22,13 @@ RIGHTS = (
 )
 
 
-def build_machine() -> None:
-    """Build the image; that of nedbus must be there."""
-    base = ENVIRONMENT.get("NEDBUS_BASE_IMAGE")
-    given = ("--build-arg", f"NEDBUS_BASE_IMAGE={base}") if base else ()
-    docker("build", "--quiet", "--tag", IMAGE, *given, str(ROOT / "tests" / "compose" / "systemd"))
-
-
-def documented_commands() -> list[str]:
-    """Return the commands by which the documentation installs the service."""
-    block = re.search(r"```bash\n(.*?)```", (ROOT / "docs" / "systemd.md").read_text(), re.DOTALL)
-    assert block is not None
-    return block[1].replace("sudo ", "").splitlines()
-
-
 class Machine:
-    """A machine with systemd; `remove` leaves nothing behind."""
+    """A machine with systemd, on top of the image of nedbus, which must be there; `remove` leaves nothing behind."""
 
     def __init__(self) -> None:
+        base = ENVIRONMENT.get("NEDBUS_BASE_IMAGE")
+        given = ("--build-arg", f"NEDBUS_BASE_IMAGE={base}") if base else ()
+        docker("build", "--quiet", "--tag", IMAGE, *given, str(ROOT / "tests" / "compose" / "systemd"))
         self.name = f"nedbus-test-{os.getpid()}-systemd"
         docker("run", "--detach", "--name", self.name, *RIGHTS, IMAGE)
 

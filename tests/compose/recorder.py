@@ -1,15 +1,16 @@
-"""A reader on the host that keeps everything it gets."""
+"""A reader on the host that keeps everything it gets, and what the simulated vehicle publishes, to compare it with."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterable, Iterator
 
 import nedbus
-from nedbus_msgs import Address
-from tests.conftest import DEADLINE, wait_for
-
-from .flight import Flight
+from nedbus.sources import SourceMessage
+from nedbus_msgs import Address, VehicleLocalPosition, upgrade
+from tests.replays import open_replay
+from tests.waits import DEADLINE, wait_for
 
 
 class Recorder:
@@ -46,3 +47,45 @@ class Recorder:
 def indices(samples: list[nedbus.Sample], flight: Flight) -> list[int]:
     """Return the indices of these samples of one address in its flight; every value must be right."""
     return flight.indices((sample.address, sample.message) for sample in samples).popitem()[1]
+
+
+class Flight:
+    """The messages of a simulated source, each with its index in the sequence of its address; the same each time."""
+
+    def __init__(self, source: str = "sim:") -> None:
+        self._messages: Iterator[SourceMessage] = open_replay(source).messages
+        self._known: dict[tuple[Address, int], tuple[int, VehicleLocalPosition]] = {}
+        self._counts: dict[Address, int] = {}
+
+    def indices(self, arrived: Iterable[tuple[Address, VehicleLocalPosition]]) -> dict[Address, list[int]]:
+        """Return, for each address, the indices of its messages in the order of their arrival; all must be right."""
+        indices: dict[Address, list[int]] = {}
+        for address, message in arrived:
+            index, right = self._find(address, message.timestamp)
+            assert message == right, f"{address} at {message.timestamp}"
+            indices.setdefault(address, []).append(index)
+        return indices
+
+    def last(self, address: Address) -> VehicleLocalPosition:
+        """Return the last message of an address; the flight must have an end."""
+        *_, last = (each for each in self._messages if each.address == address)
+        return upgrade(last.fields)
+
+    def _find(self, address: Address, timestamp: int) -> tuple[int, VehicleLocalPosition]:
+        while (address, timestamp) not in self._known:
+            published = next(self._messages)
+            message = upgrade(published.fields)
+            index = self._counts.get(published.address, 0)
+            self._counts[published.address] = index + 1
+            self._known[published.address, message.timestamp] = index, message
+        return self._known[address, timestamp]
+
+
+def is_whole(indices: list[int]) -> bool:
+    """Return whether nothing is missing, doubled or out of order."""
+    return indices == list(range(indices[0], indices[0] + len(indices)))
+
+
+def missing(indices: list[int]) -> int:
+    """Return how many are missing between the first and the last."""
+    return indices[-1] - indices[0] + 1 - len(set(indices))

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import Process, free_endpoint
+from tests.ports import free_endpoint
+from tests.processes import Process
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = dict(os.environ)  # as it was before any test: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE

@@ -11,16 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import DEADLINE, Start, free_endpoint, wait_for
+from tests.messages import VLP
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
 
 from .certificates import FILES, USER, hand_out, join, make_certificates
-from .conftest import StartStack
-from .recorder import Recorder
+from .conftest import Record, StartStack
 from .stack import ROOT, Stack
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 RESTART = "docker compose -f docker-compose.yml -f docker-compose.secure.yml restart router"
 
 
@@ -44,11 +45,6 @@ def restart_router(stack: Stack) -> None:
     stack.compose(*RESTART.split()[-2:])
 
 
-def files_seen(stack: Stack, service: str) -> set[str]:
-    """Return the names of the files that a container sees of the certificates."""
-    return set(stack.compose("exec", "-T", service, "ls", "/etc/nedbus/pki").split())
-
-
 def router_certificate(stack: Stack, pki: Path) -> str:
     """Return the certificate that the router shows, as PEM."""
     host, port = stack.address.split(":")
@@ -57,7 +53,7 @@ def router_certificate(stack: Stack, pki: Path) -> str:
 
 
 def test_bundles_run_beside_the_secure_stack(
-    make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: list[Recorder]
+    make_stack: StartStack, run_nedbus: Start, secure: Stack, pki: Path, tmp_path: Path, *, record: Record
 ) -> None:
     """As their README.txt says: who is in the router's rules is read, who is not is denied until the rules name it."""
     rules = tmp_path / "config" / "router-secure.json5"
@@ -85,19 +81,19 @@ def test_bundles_run_beside_the_secure_stack(
     for bundle in bundles.values():
         bundle.up()
     reader = join(secure, pki, "reader")
-    record.append(Recorder(reader.subscribe(VLP, mode="every")))
-    record[0].wait_for_more(100)
+    recorder = record(reader.subscribe(VLP, mode="every"))
+    recorder.wait_for_more(100)
     wait_for(lambda: published(status["stranger"]) > 100, what="what the stranger publishes in vain")
-    record[0].wait_for_more(100)
-    assert {sample.vehicle for sample in record[0].samples} == {"wing"}
+    recorder.wait_for_more(100)
+    assert {sample.vehicle for sample in recorder.samples} == {"wing"}
     assert list(reader.vehicles()) == ["wing"]
     assert "1 vehicles" in bundles["wing"].compose("exec", "-T", "nedbus", "nedbus", "health")
 
     pki_command("rules", str(rules), "--add", "stranger")
     restart_router(secure)
-    wait_for(lambda: {sample.vehicle for sample in list(record[0].samples)} == {"wing", "stranger"}, what="both")
-    record[0].wait_for_more(100)
-    assert record[0].subscription.counts.lost == 0
+    wait_for(lambda: {sample.vehicle for sample in list(recorder.samples)} == {"wing", "stranger"}, what="both")
+    recorder.wait_for_more(100)
+    assert recorder.subscription.counts.lost == 0
 
     pki_command("renew", str(pki), "vehicle-wing")
     (pki / "vehicle-wing.crt").rename(tmp_path / "wing" / "pki" / "vehicle-wing.crt")
@@ -116,13 +112,14 @@ def published(address: str) -> float:
     return sum(map(float, counts))
 
 
-def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: Path, record: list[Recorder]) -> None:
+def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: Path, record: Record) -> None:
     """Copied as documented, containers see them without being made anew; the router shows its own after a restart."""
     secure.up()
-    record.append(Recorder(join(secure, pki, "reader").subscribe(VLP, mode="every")))
-    record[0].wait_for_more(100)
+    recorder = record(join(secure, pki, "reader").subscribe(VLP, mode="every"))
+    recorder.wait_for_more(100)
     for service, name in (("router", "router"), ("service", "vehicle-1")):
-        assert files_seen(secure, service) == {"ca.crt", f"{name}.crt", f"{name}.key"}
+        seen = secure.compose("exec", "-T", service, "ls", "/etc/nedbus/pki").split()
+        assert set(seen) == {"ca.crt", f"{name}.crt", f"{name}.key"}
     before = secure.container("router"), secure.container("service")
     old = router_certificate(secure, pki)
     renewed = run_nedbus("pki", "renew", str(pki), "router", "vehicle-1", "reader", "--days", "900")
@@ -136,8 +133,8 @@ def test_renewed_certificates_are_taken(run_nedbus: Start, secure: Stack, pki: P
     assert router_certificate(secure, pki) == old != new
     restart_router(secure)
     wait_for(lambda: is_shown(secure, pki, new), what="the router's new certificate")
-    record[0].wait_for_more(100)
-    assert record[0].subscription.counts.lost == 0
+    recorder.wait_for_more(100)
+    assert recorder.subscription.counts.lost == 0
     join(secure, pki, "reader").close()
     assert (secure.container("router"), secure.container("service")) == before
 

@@ -9,16 +9,15 @@ import pytest
 
 import nedbus
 from nedbus_msgs import Address
-from tests.conftest import DEADLINE, wait_for
+from tests.messages import VLP
+from tests.waits import DEADLINE, wait_for
 
-from .conftest import StartStack
-from .flight import Flight, is_whole, missing
-from .recorder import Recorder, indices
+from .conftest import Record, StartStack
+from .recorder import Flight, indices, is_whole, missing
 from .stack import docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 BACK = 10.0  # s within which both sides are back once the network is; measured: 0.5 to 2, and 3.4 on a busy machine
 CUT = 10.0  # s that a link is cut
 LEASE = 5.0  # s of silence after which a side is given up
@@ -36,19 +35,13 @@ def sent(sample: nedbus.Sample) -> int:
     return sample.sent
 
 
-def wait_for_router(endpoint: str) -> None:
-    """Wait until a router lets somebody new in."""
-    nedbus.connect(endpoint, timeout=DEADLINE).close()
-
-
-def test_router_is_killed_and_restarted(make_stack: StartStack, record: list[Recorder]) -> None:
+def test_router_is_killed_and_restarted(make_stack: StartStack, record: Record) -> None:
     """Both sides come back by themselves; `every` loses nothing, `latest` goes on with the newest; counts are exact."""
     stack = make_stack("router")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        every = Recorder(bus.subscribe(VLP, mode="every"))
-        latest = Recorder(bus.subscribe(VLP))
-        record += [every, latest]
+        every = record(bus.subscribe(VLP, mode="every"))
+        latest = record(bus.subscribe(VLP))
         every.wait_for_more(100)
         latest.wait_for_more(100)
         stack.compose("kill", "--signal", "KILL", "router")
@@ -58,7 +51,7 @@ def test_router_is_killed_and_restarted(make_stack: StartStack, record: list[Rec
         assert len(every.samples) == silent
         restart = time.time_ns()
         stack.compose("start", "router")
-        wait_for_router(stack.endpoint)
+        nedbus.connect(stack.endpoint, timeout=DEADLINE).close()  # it lets somebody new in
         back = time.time_ns()
         every.wait_for_more(1000)  # of which the outage has some 400
         latest.wait_for_more(100)
@@ -79,15 +72,14 @@ def test_router_is_killed_and_restarted(make_stack: StartStack, record: list[Rec
         assert counts.lost == sum(sample.lost for sample in latest.samples)
 
 
-def test_link_between_hosts_is_cut(make_stack: StartStack, record: list[Recorder]) -> None:
+def test_link_between_hosts_is_cut(make_stack: StartStack, record: Record) -> None:
     """10 s without the link: nothing is lost at 100 Hz; at 400 Hz the cache is too small, and the number is exact."""
     stack = make_stack("link", "docker-compose.hosts.yml", NEDBUS_SOURCE="sim:,sim:?vehicle=2&speed=4")
     stack.up()
     fast = Address("2", VLP)
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        every = Recorder(bus.subscribe(VLP, mode="every"))
-        latest = Recorder(bus.subscribe(VLP))
-        record += [every, latest]
+        every = record(bus.subscribe(VLP, mode="every"))
+        latest = record(bus.subscribe(VLP))
         wait_for(lambda: every.of(MINE) and every.of(fast) and latest.of(MINE), what="both vehicles")
         every.wait_for_more(500)
         link, router = stack.network("link"), stack.container("vehicle-router")
@@ -117,13 +109,12 @@ def test_link_between_hosts_is_cut(make_stack: StartStack, record: list[Recorder
         assert missing(kept) - latest.subscription.counts.dropped <= told <= missing(kept)
 
 
-def test_frozen_host(make_stack: StartStack, record: list[Recorder]) -> None:
+def test_frozen_host(make_stack: StartStack, record: Record) -> None:
     """A paused service: its data grows old, it disappears within its lease, and comes back by itself."""
     stack = make_stack("frozen")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        reader = Recorder(bus.subscribe(VLP))
-        record.append(reader)
+        reader = record(bus.subscribe(VLP))
         reader.wait_for_more(100)
         stack.compose("pause", "service")
         frozen = time.monotonic()
@@ -175,7 +166,7 @@ bus.close()
 """
 
 
-def test_stuck_reader_disturbs_nobody(make_stack: StartStack, record: list[Recorder]) -> None:
+def test_stuck_reader_disturbs_nobody(make_stack: StartStack, record: Record) -> None:
     """One reader that never reads, for 60 s: another one misses nothing, and the publisher never waits."""
     stack = make_stack("stuck")
     stack.up("router")
@@ -183,8 +174,7 @@ def test_stuck_reader_disturbs_nobody(make_stack: StartStack, record: list[Recor
     stuck = stack.run("subscriber", "-c", STUCK, options=python)
     wait_for(lambda: "stuck" in stuck.out, what=f"the stuck reader {stuck.err}")
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        healthy = Recorder(bus.subscribe(VLP, mode="every"))
-        record.append(healthy)
+        healthy = record(bus.subscribe(VLP, mode="every"))
         publisher = stack.run("subscriber", "-c", PUBLISHER, "60", options=python)
         assert publisher.wait(120.0) == 0, publisher.err
         told = json.loads(publisher.out)

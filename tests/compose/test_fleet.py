@@ -16,16 +16,16 @@ import pytest
 import nedbus
 from nedbus.transport import open_client, query
 from nedbus_msgs import Address
-from tests.conftest import DEADLINE, free_endpoint, wait_for
+from tests.messages import VLP
+from tests.ports import free_endpoint
+from tests.waits import DEADLINE, wait_for
 
 from .conftest import StartStack
-from .flight import Flight, is_whole
-from .recorder import Recorder, indices
+from .recorder import Flight, Recorder, indices, is_whole
 from .stack import Stack, docker
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 NEAR_A, NEAR_B = [Address("1", VLP), Address("2", VLP)], [Address("3", VLP)]
 ALL = [*NEAR_A, *NEAR_B]
 VEHICLES = [f"vehicle-{address.vehicle}" for address in ALL]
@@ -72,18 +72,16 @@ class Fleet:
     def end(self) -> None:
         """Stop the vehicles, and wait until everybody has their last messages."""
         self.stack.compose("stop", *VEHICLES)
-        readers = self.readers.values()
-        wait_for(lambda: all(len({last(each, of) for each in readers}) == 1 for of in ALL), what="the last messages")
+
+        def last(address: Address) -> set[int]:
+            return {reader.of(address)[-1].message.timestamp for reader in self.readers.values()}
+
+        wait_for(lambda: all(len(last(address)) == 1 for address in ALL), what="the last messages")
 
 
 def _have_news(samples: list[nedbus.Sample], start: int, moment: int) -> bool:
     news = Counter(each.address for each in samples[start:] if each.sent is not None and each.sent > moment)
     return all(news[address] >= 100 for address in ALL)
-
-
-def last(reader: Recorder, address: Address) -> int:
-    """Return the timestamp of the last message of an address."""
-    return reader.of(address)[-1].message.timestamp
 
 
 def flown(address: Address) -> Flight:

@@ -11,15 +11,14 @@ import zenoh
 
 import nedbus
 from nedbus_msgs import Address, encode
-from tests.conftest import DEADLINE, message, wait_for
+from tests.messages import VLP, message
+from tests.waits import DEADLINE, wait_for
 
-from .conftest import StartStack
-from .flight import Flight, is_whole
-from .recorder import Recorder, indices
+from .conftest import Record, StartStack
+from .recorder import Flight, indices, is_whole
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 BLOCK = zenoh.CongestionControl.BLOCK
 GARBAGE = [b"GET / HTTP/1.1\r\n\r\n", b"\0" * 4096, b"\xff" * 4096, b"\x16\x03\x01\x02\x00\x01\x00"]
 
@@ -43,15 +42,14 @@ def malformed(count: int) -> Iterator[bytes]:
     return (kinds[number % len(kinds)]() for number in range(count))
 
 
-def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: list[Recorder]) -> None:
+def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: Record) -> None:
     """Garbage on the port, 1,000 malformed payloads, 10 MB, wildcard puts, false tokens: counted, and harmless."""
     stack = make_stack("hostile")
     stack.up()
     host, port = stack.address.split(":")
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        reader = Recorder(bus.subscribe("*", mode="every"))
-        latest = Recorder(bus.subscribe("*"))
-        record += [reader, latest]
+        reader = record(bus.subscribe("*", mode="every"))
+        latest = record(bus.subscribe("*"))
         reader.wait_for_more(100)
         chance = random.Random(1)
         for number in range(100):

@@ -10,14 +10,14 @@ import pytest
 import nedbus
 from nedbus import Mode
 from nedbus_msgs import TOPICS, Address, VehicleLocalPosition
-from tests.conftest import DEADLINE, Process, wait_for
+from tests.messages import VLP
+from tests.waits import DEADLINE, wait_for
 
 from .conftest import StartStack
-from .flight import Flight, is_whole
+from .recorder import Flight, is_whole
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in TOPICS.items()}
 COUNT = 1500  # samples: about 7 s of all streams
 
@@ -34,48 +34,36 @@ def parse(output: str) -> list[tuple[Address, VehicleLocalPosition]]:
     ]
 
 
-def read_on_host(endpoint: str) -> list[tuple[Address, VehicleLocalPosition]]:
-    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe("*", mode="every") as subscription:
-        arrived = [subscription.receive(DEADLINE) for _ in range(COUNT)]
+@pytest.mark.parametrize(
+    ("file", "networks"),
+    [
+        ("docker-compose.yml", {}),
+        ("docker-compose.hosts.yml", {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]}),
+    ],
+)
+def test_host_and_container_read_everything(make_stack: StartStack, file: str, networks: dict[str, list[str]]) -> None:
+    """Every sample of all four topics, with the right values; `compose stop` ends the service with exit code 0.
+
+    Beside the service, and behind a second router, on a network that the service is not on; the host through that one.
+    """
+    stack = make_stack("readers", file)
+    stack.up()
+    echo = stack.run("subscriber", "echo", "*", "--every", "--wait", "--json", "--count", str(COUNT))
+    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus, bus.subscribe("*", mode="every") as subscription:
+        samples = [subscription.receive(DEADLINE) for _ in range(COUNT)]
         assert subscription.counts == nedbus.Counts(received=COUNT)
-    return [(sample.address, sample.message) for sample in arrived]
-
-
-def check(arrived: list[tuple[Address, VehicleLocalPosition]]) -> None:
-    indices = Flight().indices(arrived)
-    assert set(indices) >= STREAMS
-    assert all(map(is_whole, indices.values()))
-
-
-def check_echo(echo: Process) -> None:
     assert echo.wait() == 0, echo.err
-    arrived = parse(echo.out)
-    assert len(arrived) == COUNT
     assert "lost" not in echo.err
-    check(arrived)
-
-
-ECHO = ("echo", "*", "--every", "--wait", "--json", "--count", str(COUNT))
-
-
-def test_host_and_container_read_everything(make_stack: StartStack) -> None:
-    """Every sample of all four topics, with the right values, on the host and in a container beside the service."""
-    stack = make_stack("readers")
-    stack.up()
-    echo = stack.run("subscriber", *ECHO)
-    check(read_on_host(stack.endpoint))
-    check_echo(echo)
-
-
-def test_second_host_reads_everything(make_stack: StartStack) -> None:
-    """The same behind a second router, on a network that the service is not on, and from the host through that one."""
-    stack = make_stack("far", "docker-compose.hosts.yml")
-    stack.up()
-    echo = stack.run("subscriber", *ECHO)
-    check(read_on_host(stack.endpoint))
-    check_echo(echo)
-    for service, networks in {"service": ["vehicle"], "vehicle-router": ["link", "vehicle"]}.items():
-        assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(map(stack.network, networks))
+    in_container = parse(echo.out)
+    assert len(in_container) == COUNT
+    for arrived in ([(sample.address, sample.message) for sample in samples], in_container):
+        indices = Flight().indices(arrived)
+        assert set(indices) >= STREAMS
+        assert all(map(is_whole, indices.values()))
+    for service, names in networks.items():
+        assert sorted(stack.inspect(service)["NetworkSettings"]["Networks"]) == sorted(map(stack.network, names))
+    stack.compose("stop", "service")
+    assert stack.inspect("service")["State"]["ExitCode"] == 0
 
 
 def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
@@ -115,16 +103,6 @@ def test_compose_up_shows_data(make_stack: StartStack) -> None:
     wait_for(lambda: b"static/js/bokeh" in read_page(page), what="the page", seconds=60)
     stack.compose("kill", "router")
     wait_for(lambda: stack.health("service") == "unhealthy", what="its sickness", seconds=120)
-
-
-def test_clean_end(make_stack: StartStack) -> None:
-    """`compose stop` ends the service with exit code 0, at once."""
-    stack = make_stack("end")
-    stack.up()
-    with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        wait_for(bus.latest, what="data")
-    stack.compose("stop", "service")
-    assert stack.inspect("service")["State"]["ExitCode"] == 0
 
 
 def test_flags_are_those_of_zenohd(make_stack: StartStack) -> None:

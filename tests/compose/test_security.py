@@ -10,17 +10,17 @@ import pytest
 import nedbus
 from nedbus.transport import make_authority, make_certificate
 from nedbus_msgs import Address
-from tests.conftest import Process, message, wait_for
+from tests.messages import VLP, message
+from tests.processes import Process
+from tests.waits import wait_for
 
 from .certificates import FILES, USER, hand_out, join, make_certificates
-from .conftest import StartStack
-from .flight import Flight, is_whole
-from .recorder import Recorder, indices
+from .conftest import Record, StartStack
+from .recorder import Flight, Recorder, indices, is_whole
 from .stack import Stack
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-VLP = "vehicle_local_position"
 MINE = Address("1", VLP)
 PEOPLE = ("vehicle-1", "vehicle-2", "reader", "operator")
 
@@ -46,12 +46,12 @@ def secure(make_stack: StartStack, pki: Path) -> Stack:
 
 
 @pytest.fixture
-def reader(secure: Stack, pki: Path, record: list[Recorder]) -> Recorder:
+def reader(secure: Stack, pki: Path, record: Record) -> Recorder:
     """Read everything, as the host's script of the README does."""
     bus = join(secure, pki, "reader")
-    record.append(Recorder(bus.subscribe("*", mode="every")))
-    record[-1].wait_for_more(100)
-    return record[-1]
+    recorder = record(bus.subscribe("*", mode="every"))
+    recorder.wait_for_more(100)
+    return recorder
 
 
 def check_genuine(reader: Recorder) -> None:

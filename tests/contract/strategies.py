@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 
-from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition
+from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, encode
+
+DATA = Path(__file__).parents[1] / "data"
+FLIGHTS = [VehicleLocalPosition(**each["fields"]) for each in json.loads((DATA / "flights.json").read_text()).values()]
+"""A message of each of four real flights: with everything, without an origin, and without some fields."""
+REAL = [encode(message) for message in FLIGHTS]
 
 FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
     "xy_valid": ("x", "y"),
@@ -22,6 +31,29 @@ FLAG_FIELDS: Mapping[str, tuple[str, ...]] = {
 }
 NOT_NEGATIVE = ("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv")
 WITHIN = {"heading": struct.unpack("<f", struct.pack("<f", math.pi))[0], "ref_lat": 90.0, "ref_lon": 180.0}
+BEYOND = {"heading": float(np.nextafter(np.float32(math.pi), np.float32(4)))} | {
+    name: math.nextafter(bound, 360.0) for name, bound in WITHIN.items() if name != "heading"
+}
+BREAKING: list[Mapping[str, object]] = [
+    *(
+        {flag: True, **{other: 1.0 for other in names if other != name}, name: value}
+        for flag, names in FLAG_FIELDS.items()
+        for name in names
+        for value in (math.nan, math.inf)
+    ),
+    *({name: -1e-30} for name in NOT_NEGATIVE),
+    *({name: value} for name, bound in BEYOND.items() for value in (bound, -bound, math.inf)),
+    {"timestamp": 2**63, "timestamp_sample": 2**63 + 1},
+]
+"""For each rule, values that just break it; the last one is at fault."""
+KEEPING: list[Mapping[str, object]] = [
+    *({flag: True, **dict.fromkeys(names, 1.0)} for flag, names in FLAG_FIELDS.items()),
+    *({flag: False, name: math.nan} for flag, names in FLAG_FIELDS.items() for name in names),
+    *({name: value} for name in NOT_NEGATIVE for value in (math.nan, math.inf, -0.0)),
+    *({name: value} for name, bound in WITHIN.items() for value in (bound, -bound)),
+    {"timestamp": 2**64 - 1, "timestamp_sample": 2**64 - 1},
+]
+"""Values that break no rule, though they are extremes."""
 
 float32s = st.floats(width=32)
 TYPES: Mapping[str, st.SearchStrategy[object]] = {
@@ -34,16 +66,15 @@ TYPES: Mapping[str, st.SearchStrategy[object]] = {
 }
 # Values that the field's own type allows, but perhaps not the rules.
 SAME_TYPE = {
-    "uint64": st.integers(0, 2**64 - 1),
-    "uint8": st.integers(0, 255),
-    "bool": st.booleans(),
-    "float32": st.floats(width=32) | st.sampled_from([-1.0, 3.2, math.nan]),
-    "float32[2]": st.tuples(st.floats(width=32), st.floats(width=32)),
+    **TYPES,
+    "float32": float32s | st.sampled_from([-1.0, 3.2, math.nan]),
     "float64": st.floats() | st.sampled_from([90.0, 90.5, -180.0, 181.0]),
 }
 FLAGGED = [name for names in FLAG_FIELDS.values() for name in names]
 RULED = ["timestamp", "timestamp_sample", *FLAG_FIELDS, *FLAGGED, *NOT_NEGATIVE, *WITHIN]
 BROKEN = st.sampled_from(RULED).flatmap(lambda name: st.tuples(st.just(name), SAME_TYPE[FIELD_TYPES[name]]))
+MANY = settings(max_examples=10 * settings().max_examples)
+"""For hostile input, which is quickly made and of which little is found with few examples."""
 
 
 def make_valid(fields: dict[str, object]) -> dict[str, object]:

@@ -2,46 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import math
 import random
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import PAYLOAD_SIZE, DecodeError, Row, VehicleLocalPosition, decode_row, encode, encode_row
-from nedbus_msgs.arrays import DTYPE, decode_array, encode_array, to_array, to_row, valid_mask
+from nedbus_msgs import PAYLOAD_SIZE, DecodeError, Row, VehicleLocalPosition, decode_row, encode_cdr, encode_row
+from nedbus_msgs.arrays import DTYPE, decode_array, decode_cdr_array, encode_array, to_array, to_row, valid_mask
 
-from .strategies import BROKEN, FLAG_FIELDS, NOT_NEGATIVE, WITHIN, messages, pack_full_width
+from .strategies import BREAKING, BROKEN, FLIGHTS, KEEPING, REAL, messages, pack_full_width
 
-FLIGHTS = json.loads((Path(__file__).parents[1] / "data" / "flights.json").read_text())
-REAL = [encode(VehicleLocalPosition(**flight["fields"])) for flight in FLIGHTS.values()]
-FIELDS = VehicleLocalPosition(**FLIGHTS["everything set"]["fields"]).model_dump()
 # On both sides of each length at which arrays are decoded, encoded or validated in another way.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]
-# For each rule, values that break it.
-BREAKING: list[Mapping[str, object]] = [
-    *(
-        {flag: True, name: value}
-        for flag, names in FLAG_FIELDS.items()
-        for name in names
-        for value in (math.nan, math.inf)
-    ),
-    *({name: -1e-30} for name in NOT_NEGATIVE),
-    *({name: sign * bound * 1.0001} for name, bound in WITHIN.items() for sign in (-1, 1)),
-    {"timestamp": 2**63, "timestamp_sample": 2**63 + 1},
-]
-# Values that break no rule, though they are extremes.
-KEEPING: list[Mapping[str, object]] = [
-    *({flag: False, name: math.nan} for flag, names in FLAG_FIELDS.items() for name in names),
-    *({name: value} for name in NOT_NEGATIVE for value in (math.nan, math.inf, -0.0)),
-    *({name: sign * bound} for name, bound in WITHIN.items() for sign in (-1, 1)),
-    {"timestamp": 2**64 - 1, "timestamp_sample": 2**64 - 1},
-]
+Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and what is broken in it
+CASES = st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4)
 
 
 def row_or_none(payload: bytes) -> Row | None:
@@ -51,14 +28,8 @@ def row_or_none(payload: bytes) -> Row | None:
         return None
 
 
-@given(
-    size=st.sampled_from(SIZES),
-    cases=st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4),
-    order=st.randoms(use_true_random=False),
-)
-def test_array_of_any_length_is_its_rows(
-    size: int, cases: list[tuple[VehicleLocalPosition, list[tuple[str, object]]]], order: random.Random
-) -> None:
+@given(st.sampled_from(SIZES), CASES, st.randoms(use_true_random=False))
+def test_array_of_any_length_is_its_rows(size: int, cases: list[Case], order: random.Random) -> None:
     """Valid and invalid messages among each other: each is what it is alone, whatever the length of the array."""
     choices = [*REAL, *(pack_full_width({**message.model_dump(), **dict(broken)}) for message, broken in cases)]
     payloads = order.choices(choices, k=size)
@@ -76,7 +47,7 @@ def test_array_of_any_length_is_its_rows(
 def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, object]], expected: bool) -> None:
     """A message that breaks any one rule is invalid, one that just keeps it is valid, and its neighbours always are."""
     for change in changes:
-        payload = pack_full_width({**FIELDS, **change})
+        payload = pack_full_width({**FLIGHTS[0].model_dump(), **change})
         assert (row_or_none(payload) is not None) == expected, change
         payloads = [REAL[index % len(REAL)] for index in range(size)]
         payloads[size // 2] = payload
@@ -85,12 +56,7 @@ def test_each_rule_holds_at_any_length(size: int, changes: list[Mapping[str, obj
         assert np.count_nonzero(~valid) == (not expected), change
 
 
-@given(
-    size=st.sampled_from(SIZES),
-    offset=st.integers(0, PAYLOAD_SIZE - 1),
-    byte=st.integers(0, 255),
-    flight=st.sampled_from(REAL),
-)
+@given(st.sampled_from(SIZES), st.integers(0, PAYLOAD_SIZE - 1), st.integers(0, 255), st.sampled_from(REAL))
 def test_damage_of_one_payload_stays_in_it(size: int, offset: int, byte: int, flight: bytes) -> None:
     """A payload of which one byte has become another is valid only if it decodes; all others are as they were."""
     damaged = bytearray(flight)
@@ -134,16 +100,20 @@ def test_array_with_strides_is_encoded_and_validated(size: int, step: int) -> No
     assert np.flatnonzero(~valid_mask(part)).tolist() == [size // 2]
 
 
-def test_array_without_messages_is_empty() -> None:
-    """No payloads are no messages."""
-    array, valid = decode_array(b"")
-    assert array.dtype == DTYPE
-    assert array.shape == valid.shape == (0,)
-    assert encode_array(array) == encode_array(to_array([])) == b""
-
-
 @pytest.mark.parametrize("excess", [-1, 1])
 def test_part_of_a_payload_is_an_error(excess: int) -> None:
     """Bytes that are no whole number of payloads are not cut silently."""
     with pytest.raises(ValueError, match="reshape"):
         decode_array(bytes(2 * PAYLOAD_SIZE + excess))
+
+
+def test_cdr_that_is_not_certain_is_not_valid() -> None:
+    """A bool that is neither 0 nor 1, another length or another encapsulation is not valid in an array."""
+    payload = encode_cdr(FLIGHTS[0].model_dump(), layout="1.16")
+    first_bool = 4 + 16
+    assert payload[first_bool] == 1
+    others = [payload[:first_bool] + bytes([byte]) + payload[first_bool + 1 :] for byte in (2, 3, 255)]
+    others += [payload[:-1], payload + bytes(4), b"\x00\x00" + payload[2:]]
+    array, valid = decode_cdr_array([payload, *others, payload])
+    assert valid.tolist() == [True, *[False] * len(others), True]
+    assert array[0] == array[-1] == to_array(FLIGHTS[:1])[0]

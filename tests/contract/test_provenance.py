@@ -26,16 +26,9 @@ def test_all_fields_add_nothing() -> None:
 
 @pytest.mark.parametrize(
     "encoding",
-    [
-        "",
-        "zenoh/bytes",
-        *(
-            ENCODING + rest
-            for rest in ("", ";", ";source=", ";source=Ä", ";a=b;=;;", f";source={'x' * 33}", ";source=a b")
-        ),
-        f"{ENCODING};missing=-1",
-        f"{ENCODING};missing={'f' * 15}",
-    ],
+    ["", "zenoh/bytes", ENCODING]
+    + [f"{ENCODING};{rest}" for rest in ("", "source=", "source=Ä", "a=b;=;;", f"source={'x' * 33}", "source=a b")]
+    + [f"{ENCODING};missing={mask}" for mask in ("-1", "f" * 15)],
 )
 def test_invalid_parts_are_ignored(encoding: str) -> None:
     """An encoding may be another program's: its unknown or invalid parts are ignored."""

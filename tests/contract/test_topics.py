@@ -36,13 +36,11 @@ def addresses(draw: st.DrawFn) -> Address:
 
 
 def test_topics_are_px4s_four() -> None:
-    """The four uORB topics of VehicleLocalPosition; only the estimators' has instances."""
-    assert {name: topic.instances for name, topic in TOPICS.items()} == {
-        "vehicle_local_position": False,
-        "vehicle_local_position_groundtruth": False,
-        "external_ins_local_position": False,
-        "estimator_local_position": True,
-    }
+    """The four uORB topics of VehicleLocalPosition; only the estimators' has instances; EKF2's is the default."""
+    assert DEFAULT_TOPIC == "vehicle_local_position"
+    alone = ("vehicle_local_position", "vehicle_local_position_groundtruth", "external_ins_local_position")
+    instances = {**dict.fromkeys(alone, False), "estimator_local_position": True}
+    assert {name: topic.instances for name, topic in TOPICS.items()} == instances
 
 
 def test_keys_are_as_documented() -> None:
@@ -53,6 +51,8 @@ def test_keys_are_as_documented() -> None:
     assert estimator.key(prefix="fleet/a") == "fleet/a/7/estimator_local_position/2"
     assert estimator.alive_key() == "nedbus/7/@alive/estimator_local_position/2"
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
+    assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
+    assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
     assert schema_key() == "nedbus/@schema/VehicleLocalPosition"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
     assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
@@ -64,6 +64,8 @@ def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
     zenoh.KeyExpr(address.key(prefix=prefix))
     assert Address.from_key(address.key(prefix=prefix), prefix=prefix) == address
     assert address_of_alive_key(address.alive_key(prefix=prefix), prefix=prefix) == address
+    with pytest.raises(AddressError):
+        address_of_alive_key(address.key(prefix=prefix), prefix=prefix)
 
 
 @given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from([
@@ -92,18 +94,8 @@ def test_selection_matches_what_its_key_expression_includes(address: Address, pr
     selection = data.draw(selections(address))
     key_expr = zenoh.KeyExpr(selection.key_expr(prefix=prefix))
     assert selection.matches(address) == key_expr.includes(address.key(prefix=prefix))
-    assert zenoh.KeyExpr(ack_key(str(key_expr))).includes(ack_key(address.key(prefix=prefix))) == key_expr.includes(
-        address.key(prefix=prefix)
-    )
-
-
-def test_selection_matches_by_each_of_its_parts() -> None:
-    """Vehicle, topic and instance must be the address's, or any."""
-    estimator = Address("7", "estimator_local_position", 1)
-    for parts in ((), ("estimator_local_position",), (ANY, "7"), ("estimator_local_position", "7", 1)):
-        assert Selection(*parts).matches(estimator)
-    for parts in ((DEFAULT_TOPIC,), (ANY, "8"), ("estimator_local_position", ANY, 0)):
-        assert not Selection(*parts).matches(estimator)
+    acknowledgements = zenoh.KeyExpr(ack_key(str(key_expr)))
+    assert acknowledgements.includes(ack_key(address.key(prefix=prefix))) == selection.matches(address)
 
 
 @given(addresses(), PREFIXES)
@@ -116,31 +108,13 @@ def test_selection_does_not_include_other_keys(address: Address, prefix: str) ->
     assert not key_expr.intersects(ack_key(address.key(prefix=prefix)))
 
 
-def test_default_topic_is_in_the_table() -> None:
-    """The topic that is used unless another is named is EKF2's."""
-    assert DEFAULT_TOPIC == "vehicle_local_position"
-    assert DEFAULT_TOPIC in TOPICS
-
-
-def test_selection_of_an_instance() -> None:
-    """One EKF instance of all vehicles, or all instances of one vehicle."""
-    assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
-    assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
-
-
 @pytest.mark.parametrize(
     ("vehicle", "topic", "instance", "what"),
     [
-        ("", "vehicle_local_position", None, "vehicle"),
-        ("a/b", "vehicle_local_position", None, "vehicle"),
-        ("@alive", "vehicle_local_position", None, "vehicle"),
-        ("*", "vehicle_local_position", None, "vehicle"),
-        ("x" * 65, "vehicle_local_position", None, "vehicle"),
+        *((vehicle, "vehicle_local_position", None, "vehicle") for vehicle in ("", "a/b", "@alive", "*", "x" * 65)),
         ("7", "vehicle_attitude", None, "topic"),
         ("7", "vehicle_local_position", 0, "instance"),
-        ("7", "estimator_local_position", None, "instance"),
-        ("7", "estimator_local_position", 256, "instance"),
-        ("7", "estimator_local_position", -1, "instance"),
+        *(("7", "estimator_local_position", instance, "instance") for instance in (None, 256, -1)),
     ],
 )
 def test_invalid_address_is_rejected(vehicle: str, topic: str, instance: int | None, what: str) -> None:
@@ -149,13 +123,20 @@ def test_invalid_address_is_rejected(vehicle: str, topic: str, instance: int | N
         Address(vehicle, topic, instance)
 
 
-def test_invalid_selection_is_rejected() -> None:
-    """A typo in a topic must not become a subscription without messages."""
-    for arguments in (("vehicle_local_positon", "*", None), ("vehicle_local_position", "*", 0), ("*", "*", 1)):
-        with pytest.raises(AddressError):
-            Selection(*arguments)
-    with pytest.raises(AddressError):
-        Selection(vehicle="a b")
+@pytest.mark.parametrize(
+    ("topic", "vehicle", "instance", "what"),
+    [
+        ("vehicle_local_positon", "*", None, "topic"),
+        ("vehicle_local_position", "*", 0, "instance"),
+        ("*", "*", 1, "instance"),
+        ("vehicle_local_position", "a b", None, "vehicle"),
+        *(("estimator_local_position", "*", instance, "instance") for instance in (-1, 256, True, "0")),
+    ],
+)
+def test_invalid_selection_is_rejected(topic: str, vehicle: str, instance: int | None, what: str) -> None:
+    """A typo in a topic, or an instance that no address has, must not become a subscription without messages."""
+    with pytest.raises(AddressError, match=what):
+        Selection(topic, vehicle, instance)
 
 
 @pytest.mark.parametrize("prefix", ["", "/", "a/", "a//b", "*", "a/**", "@a", "a b"])
@@ -163,19 +144,6 @@ def test_invalid_prefix_is_rejected(prefix: str) -> None:
     """Prefixes are plain chunks."""
     with pytest.raises(AddressError, match="prefix"):
         check_prefix(prefix)
-
-
-@pytest.mark.parametrize("instance", [-1, 256, True, "0"])
-def test_invalid_instance_is_rejected_in_a_selection(instance: int) -> None:
-    """An instance that no address has cannot be subscribed to."""
-    with pytest.raises(AddressError, match="instance"):
-        Selection("estimator_local_position", instance=instance)
-
-
-def test_alive_key_must_be_one() -> None:
-    """The key of a stream is not a liveliness token."""
-    with pytest.raises(AddressError):
-        address_of_alive_key("nedbus/7/vehicle_local_position")
 
 
 def test_errors_can_be_pickled() -> None:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
+from operator import itemgetter
 from types import SimpleNamespace
 from typing import Final, cast
 
@@ -22,11 +23,11 @@ from .raw_samples import Payload
 
 KEY: Final = "nedbus/1/vehicle_local_position"
 _TICK: Final = 0.01  # s
-_END: Final = 3600.0  # s after which whoever still waits is stuck
+END: Final = 600.0  # s after which whoever still waits is stuck
 
 
 class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
-    """Raised when a wait does not end within an hour."""
+    """Raised when a wait does not end within ten minutes."""
 
 
 @dataclass(eq=False)
@@ -51,16 +52,13 @@ class Reader:
 class Query:
     """A query of the publisher, and the readers that still have to answer it."""
 
-    parameters: dict[str, str]
+    number: int
+    read: bool
     end: float
     waiting: list[Reader]
     replies: deque[SimpleNamespace] = field(default_factory=deque)
     ended: bool = False
     lost: bool = False  # a full queue dropped it
-
-    @property
-    def number(self) -> int:
-        return int(self.parameters["number"])
 
     def try_recv(self) -> SimpleNamespace | None:
         """Return the next answer, as the channel of a query does."""
@@ -82,22 +80,15 @@ class World:
     plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
     routers: list[str] = field(default_factory=lambda: ["r1"])
     closed: bool = False
-    dropping: bool = False
-    """Whether a full queue drops the questions that are asked."""
+    dropping: bool = False  # whether a full queue drops the questions that are asked
 
-    def acknowledgement(
-        self, monkeypatch: pytest.MonkeyPatch, *, shared: SharedWindow | None = None, needs_router: bool = True
-    ) -> Acknowledgement:
+    def acknowledgement(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> Acknowledgement:
         """Return an acknowledgement that lives here."""
-        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.sleep))
-        return Acknowledgement(
-            cast("Session", self),
-            KEY,
-            "p:1",
-            priority=zenoh.Priority.DATA,
-            shared=shared or SharedWindow(),
-            needs_router=needs_router,
-        )
+        monkeypatch.setattr(module, "_POLLS", (0.0005, _TICK))
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
+        given = cast("Session", self), KEY, "p:1"
+        shared = SharedWindow()
+        return Acknowledgement(*given, priority=zenoh.Priority.DATA, shared=shared, needs_router=needs_router)
 
     def publish(self, acknowledgement: Acknowledgement, count: int, *, rate: float = 10_000.0) -> None:
         """Publish so many messages, so many a second where nothing holds it up."""
@@ -110,26 +101,35 @@ class World:
     def plan(self, seconds: float, action: Callable[[], object]) -> None:
         """Let something happen in so many seconds."""
         self.plans.append((self.now + seconds, action))
+        self.plans.sort(key=itemgetter(0))
+
+    def cut(self, reader: Reader, at: float, *, until: float) -> None:
+        """Let the link of a reader break."""
+        self.plan(at, lambda: setattr(reader, "alive", False))
+        self.plan(until, lambda: setattr(reader, "alive", True))
 
     def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
         """Let the link of the publisher break for a second, and that of a reader for longer."""
-        self.plan(at, lambda: setattr(reader, "alive", False))
+        self.cut(reader, at, until=until)
         self.plan(at, self.routers.clear)
         self.plan(at + 1.0, lambda: self.routers.append("r2"))
-        self.plan(until, lambda: setattr(reader, "alive", True))
+
+    def stop(self, reader: Reader, at: float, *, until: float) -> None:
+        """Let the process of a reader be stopped (SIGSTOP)."""
+        self.plan(at, lambda: setattr(reader, "stopped", self.now))
+        self.plan(until, lambda: setattr(reader, "stopped", None))
 
     def advance(self, seconds: float) -> None:
         """Let time go by."""
         self.now += seconds
-        if self.now > _END:
+        if self.now > END:
             raise Stuck
-        for plan in [plan for plan in self.plans if plan[0] <= self.now]:
-            self.plans.remove(plan)
-            plan[1]()
+        while self.plans and self.plans[0][0] <= self.now:
+            self.plans.pop(0)[1]()
         for reader in self.readers:
             if reader.is_running():
                 reader.read = min(self.published, reader.read + reader.rate * seconds)
-        for query in list(self.pending):
+        for query in self.pending.copy():
             self._answer(query)
 
     def is_linked(self, reader: Reader) -> bool:
@@ -157,17 +157,10 @@ class World:
         parsed = dict(each.split("=") for each in parameters.split(";"))
         self.asked.append(parsed)
         linked = [reader for reader in self.readers if self.is_linked(reader) and not reader.closed]
-        query = Query(parsed, self.now + timeout, linked)
+        query = Query(int(parsed["number"]), parsed["read"] == "1", self.now + timeout, linked)
         query.lost = self.dropping and bool(self.routers)
         self.pending.append(query)
         return query
-
-    # What it needs of a clock.
-
-    def sleep(self, seconds: float) -> None:
-        end = self.now + seconds
-        while self.now < end:
-            self.advance(min(_TICK, end - self.now) or _TICK)
 
     def _answer(self, query: Query) -> None:
         for reader in list(query.waiting):
@@ -177,7 +170,7 @@ class World:
                 continue
             elif reader.closed:
                 self._reply(query, reader, CLOSED)
-            elif reader.is_running() and (query.parameters["read"] == "0" or reader.read > query.number):
+            elif reader.is_running() and (not query.read or reader.read > query.number):
                 self._reply(query, reader, b"")
         late = bool(query.waiting) or query.lost
         if late and self.now < query.end:
@@ -189,5 +182,5 @@ class World:
 
     def _reply(self, query: Query, reader: Reader, payload: bytes) -> None:
         query.waiting.remove(reader)
-        answer = SimpleNamespace(ok=SimpleNamespace(payload=Payload(payload)), replier_id=reader.name)
-        query.replies.append(answer)
+        sample = SimpleNamespace(payload=Payload(payload))
+        query.replies.append(SimpleNamespace(ok=sample, replier_id=reader.name))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from functools import partial
 from types import SimpleNamespace
 from typing import cast
 
@@ -17,7 +17,7 @@ from nedbus.client.receive_queue import ReceiveQueue
 from nedbus.client.sequence_tracker import SequenceTracker
 from nedbus.transport import RawSample
 from nedbus_msgs import decode, encode, encoding_of
-from tests.conftest import message
+from tests.messages import message
 
 KEY = "nedbus/1/vehicle_local_position"
 OTHER_KEY = "nedbus/2/vehicle_local_position"
@@ -35,16 +35,8 @@ VALID = Payload(encode(message(1)))
 INVALID = Payload(bytes(len(VALID)))  # of the right size, so that only its reader notices
 
 
-@dataclass(slots=True)
-class Raw:
-    """What is read of a sample of Zenoh."""
-
-    payload: Payload
-    key_expr: str = KEY
-    source_info: object = None
-    kind: zenoh.SampleKind = field(default_factory=lambda: zenoh.SampleKind.PUT)
-    encoding: str = SOURCE
-    timestamp: object = None
+class Raw(SimpleNamespace):
+    """What is read of a sample of Zenoh; unlike its base, weak references to it are possible."""
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
@@ -77,12 +69,13 @@ def raw(
     info = None if number is None else source_info(number, publisher)
     if payload is None:
         payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))
-    return cast("RawSample", Raw(payload, key, info, encoding=encoding, timestamp=stamp))
+    read = {"payload": payload, "key_expr": key, "source_info": info, "encoding": encoding, "timestamp": stamp}
+    return cast("RawSample", Raw(**read, kind=zenoh.SampleKind.PUT))
 
 
 def junk(payload: bytes, key: str = KEY) -> RawSample:
     """Return a sample with this payload, and without a sequence number."""
-    return cast("RawSample", Raw(Payload(payload), key))
+    return raw(None, payload=Payload(payload), key=key)
 
 
 def miss(count: int, publisher: str = "a") -> zenoh.ext.Miss:
@@ -97,10 +90,7 @@ def make_queue(mode: Mode, *, layouts: Mapping[int, Sequence[str]] | None = None
 
 def drain(receive_queue: ReceiveQueue) -> list[nedbus.Sample]:
     """Take all that is queued."""
-    taken = []
-    while (sample := receive_queue.pop(decode)) is not None:
-        taken.append(sample)
-    return taken
+    return list(iter(partial(receive_queue.pop, decode), None))
 
 
 def timestamps(receive_queue: ReceiveQueue) -> list[int]:

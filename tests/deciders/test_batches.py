@@ -28,29 +28,6 @@ def take_batch(receive_queue: ReceiveQueue) -> Batch:
     return batch
 
 
-def test_batch_tells_announced_losses_once() -> None:
-    """Losses come with the next batch, also those that were announced while nothing was queued."""
-    receive_queue = make_queue("every")
-    receive_queue.put([raw(0)])
-    take_batch(receive_queue)
-    receive_queue.announce_loss(miss(3))
-    assert receive_queue.pop_batch() is None
-    receive_queue.put([raw(4), raw(5)])
-    batch = take_batch(receive_queue)
-    assert (len(batch), batch.lost) == (2, 3)
-    assert receive_queue.counts == Counts(received=3, lost=3)
-
-
-def test_batch_tells_gaps_of_all_its_streams() -> None:
-    """`lost` is the sum of what single samples would tell."""
-    receive_queue = make_queue("every")
-    receive_queue.put([raw(0), raw(0, key=OTHER_KEY, publisher="b"), raw(5), raw(3, key=OTHER_KEY, publisher="b")])
-    batch = take_batch(receive_queue)
-    assert (len(batch), batch.lost, len(batch.of(batch.addresses[1]))) == (4, 4 + 2, 2)
-    receive_queue.put([raw(6)])
-    assert take_batch(receive_queue).lost == 0
-
-
 def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
     """In mode latest a batch has one message of each key, and all that was lost before it."""
     receive_queue = make_queue("latest")
@@ -58,19 +35,6 @@ def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
     batch = take_batch(receive_queue)
     assert (batch.sequence.tolist(), batch.lost) == ([4], 2)
     assert receive_queue.counts == Counts(received=1, lost=2, dropped=2)
-
-
-def test_invalid_messages_are_left_out_of_a_batch_and_their_losses_are_not() -> None:
-    """A batch has valid messages only; one without any is none."""
-    receive_queue = make_queue("every")
-    receive_queue.put([raw(0), raw(3, payload=INVALID), raw(4)])
-    batch = take_batch(receive_queue)
-    assert (batch.sequence.tolist(), batch.lost) == ([0, 4], 2)
-    receive_queue.put([raw(7, payload=INVALID)])
-    assert receive_queue.pop_batch() is None
-    receive_queue.put([raw(8)])
-    assert take_batch(receive_queue).lost == 2
-    assert receive_queue.counts == Counts(received=3, lost=4, invalid=2)
 
 
 def test_losses_come_with_the_batch_in_which_the_gap_is() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
+from itertools import pairwise
 
 import hypothesis.strategies as st
 import pytest
@@ -10,6 +12,7 @@ from hypothesis import given
 
 from nedbus import Counts
 from nedbus.client import receive_queue as module
+from nedbus.client.decoder import MAX_KEYS
 from nedbus.client.publisher_sequence import Hole
 from nedbus.client.questions import Question
 from nedbus.client.receive_queue import ReceiveQueue
@@ -62,51 +65,14 @@ def test_what_comes_after_a_hole_waits_for_it(recovering: Recovering) -> None:
     assert (recovering.queue.held, recovering.queue.incomplete) == (0, False)
 
 
-def test_others_do_not_wait(recovering: Recovering) -> None:
-    """A hole holds up its own publisher only."""
-    recovering.put(0, 5)
-    recovering.put(0, 1, publisher="b", key=OTHER_KEY)
-    assert len(drain(recovering.queue)) == 3
-
-
-def test_what_is_given_up_is_lost_before_the_next(recovering: Recovering) -> None:
-    """Its publisher kept a part of it: the rest is lost, and told at its place."""
-    recovering.put(0, 6, 7)
-    recovering.fill(4, 5)
-    assert [(sample.message.timestamp - 1, sample.lost) for sample in drain(recovering.queue)] == [
-        (0, 0), (4, 3), (5, 0), (6, 0), (7, 0),
-    ]  # fmt: skip
-    assert recovering.queue.counts == Counts(received=5, lost=3)
-
-
-def test_nothing_found_is_lost(recovering: Recovering) -> None:
-    """The next message tells it."""
-    recovering.put(0, 3)
-    recovering.fill()
-    assert [sample.lost for sample in drain(recovering.queue)] == [0, 2]
-
-
 def test_holes_that_are_known_are_one_question(recovering: Recovering) -> None:
     """On a link that loses every second message each question would take a round trip, one after the other."""
     recovering.put(0, 2, 4, 5)
     assert recovering.asked == [(1, 4, True)]
+    recovering.put(7, 9)
     recovering.fill(1, 2, 3)
+    assert recovering.asked == [(6, 9, True)]
     assert recovering.numbers == [0, 1, 2, 3, 4, 5]
-    assert recovering.queue.counts == Counts(received=6)
-
-
-def test_hole_after_a_hole(recovering: Recovering) -> None:
-    """What waits may have holes, which are asked for together once the first is filled."""
-    recovering.put(0, 2)
-    recovering.put(4, 6, 7)
-    assert recovering.asked == [(1, 2, True)]
-    recovering.fill(1)
-    assert recovering.asked == [(3, 6, True)]
-    assert recovering.numbers == [0, 1, 2]
-    recovering.fill(3)
-    assert [(sample.message.timestamp - 1, sample.lost) for sample in drain(recovering.queue)] == [
-        (3, 0), (4, 0), (6, 1), (7, 0),
-    ]  # fmt: skip
 
 
 def test_restart_while_a_hole_is_open_is_not_a_gap_of_billions(recovering: Recovering) -> None:
@@ -128,28 +94,6 @@ def test_newest_messages_are_missed_by_heartbeat(recovering: Recovering) -> None
     assert recovering.asked == [(1, 3, True)]
     recovering.fill(1, 2)
     assert recovering.numbers == [0, 1, 2]
-
-
-def test_newest_messages_that_nobody_keeps_are_lost(recovering: Recovering) -> None:
-    """Though no message follows; the next one tells it, whenever it comes."""
-    recovering.put(0)
-    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
-    recovering.fill()
-    assert recovering.queue.counts.lost == 2
-    recovering.put(3)
-    assert [sample.lost for sample in drain(recovering.queue)] == [0, 2]
-    assert recovering.queue.counts.lost == 2
-
-
-def test_message_that_was_on_its_way_is_not_doubled(recovering: Recovering) -> None:
-    """A heartbeat overtook it: it comes by itself, and again as the answer."""
-    recovering.put(0)
-    recovering.queue.beat(KEY, name_of("a"), 2, begins=True)
-    recovering.put(1)
-    recovering.fill(1, 2)
-    recovering.put(2, 3)
-    assert recovering.numbers == [0, 1, 2, 3]
-    assert recovering.queue.counts == Counts(received=4, discarded=2)
 
 
 def test_publisher_that_is_new_begins_with_its_newest_message(recovering: Recovering) -> None:
@@ -175,70 +119,55 @@ def test_publisher_that_is_new_after_a_break_is_asked_for_all(recovering: Recove
     assert recovering.queue.counts == Counts(received=7)
 
 
-@pytest.mark.parametrize(
-    ("before", "beat", "after", "found", "read"),
-    [
-        ((), 7, (7,), (7,), [7]),  # the history's answer comes while the question is open
-        ((), 5, (5, 6), (5,), [5, 6]),
-        ((), 5, (4, 5, 6), (5,), [5, 6]),  # what is older than the beginning
-        ((3,), 5, (4, 5), (4, 5), [3, 4, 5]),
-    ],
-)
-@pytest.mark.parametrize("unsettled", [False, True])
-def test_heartbeat_never_doubles_what_comes_by_itself(  # noqa: PLR0917 - a table
-    recovering: Recovering,
-    before: tuple[int, ...],
-    beat: int,
-    after: tuple[int, ...],
-    found: tuple[int, ...],
-    read: list[int],
-    unsettled: bool,
+@given(st.integers(0, 4), st.integers(0, 9), st.integers(0, 9), st.integers(0, 4), st.booleans())
+def test_heartbeat_never_doubles_what_comes_by_itself(
+    before: int, newest: int, start: int, count: int, unsettled: bool
 ) -> None:
-    """In order and once, whatever is on its way while the newest message is asked for."""
-    recovering.put(*before)
+    """In order and once, whatever is on its way while the newest message is asked for, and nothing is lost.
+
+    Where it overtook the first message of all, what is missing between the two is not asked for, but counted.
+    """
+    recovering, after = Recovering(), range(start, start + count)
+    recovering.put(*range(before))
     recovering.queue.unsettled_until = float("inf") if unsettled else 0.0
-    recovering.queue.beat(KEY, name_of("a"), beat, begins=True)
+    recovering.queue.beat(KEY, name_of("a"), newest, begins=True)
     for number in after:
         recovering.put(number)
     while recovering.holes:
-        recovering.fill(*found)
+        recovering.fill(*range(recovering.holes[0].start, recovering.holes[0].stop))
     numbers = recovering.numbers
-    assert numbers == sorted(set(numbers))
-    assert set(read) <= set(numbers)
-    assert dataclasses.replace(recovering.queue.counts, discarded=0) == Counts(received=len(numbers))
+    assert numbers == sorted({*numbers, *range(before), newest})
+    assert {number for number in after if number > newest} <= set(numbers)
+    lost = 0 if before or unsettled else numbers[-1] - numbers[0] + 1 - len(numbers)
+    assert dataclasses.replace(recovering.queue.counts, discarded=0) == Counts(received=len(numbers), lost=lost)
 
 
 def test_heartbeats_on_another_key_decide_nothing(recovering: Recovering) -> None:
-    """A peer may send them on its own key, with any name: the messages of that one tell where it publishes."""
+    """A peer may send them on its own key, with any name: the messages of that one tell where it publishes.
+
+    Names that only heartbeats tell of have no place of those that publish.
+    """
     recovering.queue.beat(OTHER_KEY, name_of("a"), 900, begins=True)
-    recovering.put(0, 1)
+    recovering.put(0)
+    for number in range(11_000):
+        recovering.queue.beat(OTHER_KEY, f"{number:x}:1", 5, begins=True)
+    recovering.put(1)
     recovering.put(4)
+    assert len(recovering.holes) <= 10_002
     assert recovering.asked[-1] == (2, 4, True)
     recovering.fill(2, 3, hole=-1)
     assert recovering.numbers == [0, 1, 2, 3, 4]
 
 
-def test_heartbeats_make_nobody_forgotten(recovering: Recovering) -> None:
-    """Names can be invented: those that only heartbeats tell of have no place of those that publish."""
-    recovering.put(0)
-    for number in range(11_000):
-        recovering.queue.beat(OTHER_KEY, f"{number:x}:1", 5, begins=True)
-    recovering.put(1)
-    recovering.put(3)
-    assert recovering.numbers == [0, 1]
-    assert recovering.asked[-1] == (2, 3, True)
-    assert len(recovering.holes) <= 10_001
-
-
 def test_publisher_that_is_forgotten_with_a_hole_is_counted(recovering: Recovering) -> None:
     """Memory is bounded: what waited for it is lost, and told."""
-    recovering.queue._follower.tracker._max = 1
     recovering.put(0, 2, 3)
-    recovering.put(0, publisher="b", key=OTHER_KEY)
+    for number in range(MAX_KEYS):
+        recovering.put(0, publisher=str(number), key=OTHER_KEY)
     recovering.put(4)
     recovering.fill(1)
     counts = recovering.queue.counts
-    assert counts.lost + len(drain(recovering.queue)) == 6
+    assert counts.lost + sum(sample.vehicle == "1" for sample in drain(recovering.queue)) == 5
 
 
 def test_nothing_is_held_any_more(recovering: Recovering) -> None:
@@ -253,17 +182,11 @@ def test_nothing_is_held_any_more(recovering: Recovering) -> None:
     assert recovering.queue.counts == Counts(received=3, lost=2)
 
 
-def test_full_channel_is_not_asked_for(recovering: Recovering) -> None:
-    """A reader that is too slow for the data is not sent it twice; of that only what was announced was lost."""
-    recovering.put(0)
-    recovering.queue.announce_loss(miss(3))
-    recovering.put(10, overflowed=True)
-    assert not recovering.holes
-    assert recovering.queue.counts == Counts(lost=3, dropped=6)
-
-
 def test_announced_hole_is_no_loss_yet(recovering: Recovering) -> None:
-    """Zenoh announces each gap at once; whether it is a loss is decided here, and once."""
+    """Zenoh announces each gap at once; whether it is a loss is decided here, and once.
+
+    A reader that is too slow for the data is not sent it twice: of what a full channel dropped nothing is asked for.
+    """
     recovering.put(0)
     recovering.queue.announce_loss(miss(3))
     assert recovering.queue.counts.lost == 0
@@ -271,8 +194,9 @@ def test_announced_hole_is_no_loss_yet(recovering: Recovering) -> None:
     recovering.fill(1, 2)
     assert recovering.queue.counts.lost == 1
     recovering.queue.announce_loss(miss(3))
-    recovering.put(20, overflowed=True)
-    assert recovering.queue.counts == Counts(lost=4, dropped=12)
+    recovering.put(14, overflowed=True)
+    assert not recovering.holes
+    assert recovering.queue.counts == Counts(lost=1 + 3, dropped=6)
 
 
 @pytest.mark.parametrize("when", ["before", "after"])
@@ -292,21 +216,15 @@ def test_announced_messages_that_a_heartbeat_told_of_are_no_loss(recovering: Rec
 
 
 def test_message_that_comes_too_late_is_left_out(recovering: Recovering) -> None:
-    """It was given up before, and counted: the order that a reader sees is never broken, and it is counted as well."""
+    """It was given up before, and counted: the order that a reader sees is never broken, and it is counted as well.
+
+    So are messages under the id of another publisher, which push the honest ones out of the sequence.
+    """
     recovering.put(0, 3)
     recovering.fill()
     recovering.put(1, 4)
     assert recovering.numbers == [0, 3, 4]
     assert recovering.queue.counts == Counts(received=3, lost=2, discarded=1)
-
-
-def test_messages_under_the_id_of_another_publisher_are_counted(recovering: Recovering) -> None:
-    """The numbers of somebody who uses its id push the honest ones out of the sequence: a count tells of it."""
-    recovering.put(0, 1000)
-    recovering.fill()
-    recovering.put(*range(1, 1000))
-    assert recovering.numbers == [0, 1000]
-    assert recovering.queue.counts == Counts(received=2, lost=999, discarded=999)
 
 
 def test_what_is_released_pushes_out_nothing(recovering: Recovering, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,73 +264,69 @@ def test_hole_is_filled_once(recovering: Recovering) -> None:
 
 
 def test_rejected_messages_leave_no_hole(recovering: Recovering) -> None:
-    """They came: they are counted as what they are, and not asked for."""
+    """They came: they are counted as what they are, and not asked for, also behind a hole."""
     recovering.put(0)
     recovering.queue.put([raw(1, payload=Payload(b"junk")), raw(2, timestamp=3), junk(b"junk")])
     assert not recovering.holes
-    assert recovering.numbers == [0, 2]
-    assert recovering.queue.counts == Counts(received=2, invalid=2)
+    recovering.queue.put([raw(4, payload=Payload(b"junk")), raw(5, timestamp=6), raw(6, payload=INVALID)])
+    recovering.fill(3)
+    assert recovering.numbers == [0, 2, 3, 5]
+    assert recovering.queue.counts == Counts(received=4, invalid=4)
 
 
-def test_rejected_messages_that_wait_are_left_out(recovering: Recovering) -> None:
-    """A hole before them changes nothing in what they are."""
-    recovering.put(0)
-    recovering.queue.put([raw(2, payload=Payload(b"junk")), raw(3, timestamp=4), raw(4, payload=INVALID)])
-    recovering.fill(1)
-    assert recovering.numbers == [0, 1, 3]
-    assert recovering.queue.counts == Counts(received=3, invalid=2)
-
-
-def test_nobody_holds_up_another_by_using_its_name(recovering: Recovering) -> None:
-    """A peer may publish on its own key only, but under any name: then that one's messages wait for nothing."""
+def test_nobody_holds_up_another(recovering: Recovering) -> None:
+    """A hole holds up its own publisher only. A peer may use its name, on another key: then it waits for nothing."""
+    recovering.put(0, 5, publisher="b", key=OTHER_KEY)
     recovering.put(0)
     recovering.put(900, key=OTHER_KEY)
     recovering.put(1, 2)
-    assert not recovering.holes
+    assert recovering.asked == [(1, 5, True)]
     assert sum(sample.vehicle == "1" for sample in drain(recovering.queue)) == 3
 
 
 def test_question_waits_for_a_hole(recovering: Recovering) -> None:
-    """A publisher that asks whether its message was read is answered when the reader has it."""
-    answered: list[int] = []
-    recovering.put(0, 2)
-    recovering.queue.ask(Question(name_of("a"), 2, False, lambda: answered.append(2)))
-    assert not answered
-    recovering.fill(1)
-    assert answered == [2]
+    """A publisher that asks whether its message was read is answered when the reader has it.
 
-
-def test_filling_a_hole_tells_nothing_of_publishers_that_are_unknown(recovering: Recovering) -> None:
-    """What they sent may still be in the channel: only who empties it knows that nothing is left there."""
+    Filling a hole tells nothing of a publisher that is unknown: only who empties the channel knows what is left there.
+    """
     answered: list[str] = []
     recovering.put(0, 2)
-    recovering.queue.ask(Question(name_of("b"), 7, False, lambda: answered.append("b")))
-    recovering.fill(1)
+    for publisher, number in (("a", 2), ("b", 7)):
+        recovering.queue.ask(Question(name_of(publisher), number, False, partial(answered.append, publisher)))
     assert not answered
+    recovering.fill(1)
+    assert answered == ["a"]
     recovering.put(3)
-    assert answered == ["b"]
+    assert answered == ["a", "b"]
 
 
 @given(st.data(), st.integers(1, 60))
 def test_every_message_is_read_once_or_counted(data: st.DataObject, total: int) -> None:
-    """Whatever arrives, whatever is found of what does not, whenever: in order, once, and the rest is counted."""
+    """Whatever arrives, whatever is found of what does not, whenever: in order, once; the next one tells the rest."""
     recovering = Recovering()
     recovering.put(0)
     kept = data.draw(st.sets(st.integers(1, total)), label="kept")
     arriving = sorted(data.draw(st.sets(st.integers(1, total)), label="arriving"))
+
+    def fill_first() -> None:
+        first = recovering.holes[0]
+        recovering.fill(*(kept & set(range(first.start, first.stop))))
+
     for number in arriving:
         recovering.put(number)
-        fills = data.draw(st.booleans())
-        if recovering.holes and fills:
-            first = recovering.holes[0]
-            recovering.fill(*(kept & set(range(first.start, first.stop))))
+        if data.draw(st.booleans()) and recovering.holes:
+            fill_first()
         if data.draw(st.booleans()):
             recovering.queue.beat(KEY, name_of("a"), data.draw(st.integers(0, number)), begins=True)
     recovering.queue.beat(KEY, name_of("a"), total, begins=True)
     while recovering.holes:
-        hole = recovering.holes[0]
-        recovering.fill(*(kept & set(range(hole.start, hole.stop))))
+        fill_first()
         recovering.queue.beat(KEY, name_of("a"), total, begins=True)
-    numbers = recovering.numbers
-    assert numbers == sorted({0, *arriving} | kept)
-    assert recovering.queue.counts == Counts(received=len(numbers), lost=total + 1 - len(numbers))
+    absent = total - len({*arriving} | kept)
+    assert recovering.queue.counts.lost == absent
+    recovering.put(total + 1)
+    samples = drain(recovering.queue)
+    numbers = [sample.message.timestamp - 1 for sample in samples]
+    assert numbers == sorted({0, *arriving, total + 1} | kept)
+    assert [sample.lost for sample in samples] == [0, *(after - before - 1 for before, after in pairwise(numbers))]
+    assert recovering.queue.counts == Counts(received=len(numbers), lost=absent)

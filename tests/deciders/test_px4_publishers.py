@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import pytest
 
+from nedbus.sources import px4_publishers as module
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4_publishers import AlivePublishers
 from nedbus.sources.px4_streams import NotAcceptedError, Stream, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
 from nedbus_msgs import ROS2_TYPE, DecodeError, dds_type, type_hash
+from tests.messages import VLP
 
-VLP = "vehicle_local_position"
 GID = bytes.fromhex("aabbcc00000000000000000000000000")  # of every PX4 in SITL
 # From ../shared/data/px4/gps_loss_zenoh.jsonl.gz.
 REAL = (
@@ -135,13 +136,14 @@ def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
         vehicle.reverse()
 
 
-def test_tokens_are_bounded() -> None:
-    """A peer that declares tokens without end is followed up to 10,000, and costs nothing once they are gone."""
+def test_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peer that declares tokens without end is followed up to a limit, and costs nothing once they are gone."""
+    monkeypatch.setattr(module, "_MAX_TOKENS", 10)
     alive = AlivePublishers()
-    tokens = [node(str(number)) for number in range(10_005)]
+    tokens = [node(str(number)) for number in range(15)]
     for token in tokens:
         alive.add(token)
-    assert [alive.is_alive(token) for token in (tokens[0], tokens[-1])] == [True, False]
+    assert [alive.is_alive(token) for token in tokens] == 10 * [True] + 5 * [False]
     for token in tokens[:-6]:
         alive.remove(token, 0.0)
     alive.add(tokens[-1])

@@ -7,17 +7,18 @@ import pytest
 from nedbus.client.readers import RETURN, THAW, Readers
 
 
-def note(
-    readers: Readers,
-    now: float,
-    *answers: str,
-    late: bool = False,
-    stood_still: bool = False,
-) -> bool:
+def note(readers: Readers, now: float, *answers: str, late: bool = False, stood_still: bool = False) -> bool:
     """Note who answered a question, with a minus before one that is closed; return whether anybody is away."""
     by_reader = {each.removeprefix("-"): each.startswith("-") for each in answers}
     readers.note(by_reader, late=late, stood_still=stood_still, now=now)
     return readers.away
+
+
+def known(*names: str) -> Readers:
+    """Return readers of which these have answered."""
+    readers = Readers()
+    note(readers, 0.0, *names)
+    return readers
 
 
 def away_for(readers: Readers, start: float, *answers: str) -> float:
@@ -37,19 +38,19 @@ def test_nobody_is_away_where_all_answer() -> None:
 
 
 def test_reader_that_has_gone_may_return_for_5_seconds() -> None:
-    """Its link was reset, perhaps, or its router has restarted."""
-    readers = Readers()
-    note(readers, 0.0, "a", "b")
-    assert note(readers, 10.0, "b")
-    assert away_for(readers, 10.0, "b") == pytest.approx(RETURN, abs=0.6)
+    """Its link was reset, perhaps, or its router has restarted; and when it was back it may go again."""
+    readers = known("a", "b")
+    for gone in (10.0, 20.0):
+        assert note(readers, gone, "b")
+        assert not note(readers, gone + 2.0, "a", "b")
+    assert away_for(readers, 30.0, "b") == pytest.approx(RETURN, abs=0.6)
     assert not note(readers, 100.0, "b")  # forgotten
 
 
 def test_nobodys_time_runs_while_the_publisher_has_no_router() -> None:
     """The 5 s begin when there is one again; of readers that never answered too."""
-    for known in (["a"], []):
-        readers = Readers()
-        note(readers, 0.0, *known)
+    for before in (["a"], []):
+        readers = known(*before)
         note(readers, 1.0)
         for second in range(1, 60):
             readers.wait_for_link(float(second))
@@ -59,35 +60,17 @@ def test_nobodys_time_runs_while_the_publisher_has_no_router() -> None:
     assert not note(late, 1.0, "a"), "a reader that answers for the first time is the one that was waited for"
 
 
-def test_reader_that_returns_is_not_away_any_more() -> None:
-    """It answers, and may go again."""
-    readers = Readers()
-    note(readers, 0.0, "a")
-    assert note(readers, 10.0)
-    assert not note(readers, 12.0, "a")
-    assert note(readers, 20.0)
-    assert away_for(readers, 20.0) == pytest.approx(RETURN, abs=0.6)
-
-
 def test_reader_that_is_closed_is_not_waited_for() -> None:
-    """It says so, with its last answer."""
-    readers = Readers()
-    note(readers, 0.0, "a", "b")
-    assert not note(readers, 1.0, "-a", "b")
-    assert not note(readers, 2.0, "b")
-
-
-def test_closed_reader_that_was_never_seen_is_not_waited_for() -> None:
-    """Its first answer may be its last."""
-    readers = Readers()
-    assert not note(readers, 0.0, "-a")
-    assert not note(readers, 1.0)
+    """It says so, with its last answer, which may be its first."""
+    for before in (["a", "b"], ["b"]):
+        readers = known(*before)
+        assert not note(readers, 1.0, "-a", "b")
+        assert not note(readers, 2.0, "b")
 
 
 def test_reader_that_stood_still_may_return_for_90_seconds() -> None:
     """The question was open until Zenoh's lease ended: it may have been stopped."""
-    readers = Readers()
-    note(readers, 0.0, "a", "b")
+    readers = known("a", "b")
     assert note(readers, 10.0, "b", stood_still=True)
     assert away_for(readers, 10.0, "b") == pytest.approx(THAW, abs=0.6)
 
@@ -104,29 +87,19 @@ def test_reader_that_stood_still_before_its_first_answer_may_return_for_90_secon
 
 
 def test_late_reader_is_there() -> None:
-    """It was asked, is connected, and has not answered in time: there is nothing to wait for but its answer."""
-    readers = Readers()
-    note(readers, 0.0, "a", "b")
-    assert not note(readers, 10.0, "b", late=True)
-    assert not note(readers, 20.0, late=True)
-    assert not note(readers, 21.0, "a", "b")
-
-
-def test_late_reader_that_answers_leaves_nobody_away() -> None:
-    """Known before or not, beside others or alone."""
+    """It was asked, is connected, known or not, and has not answered in time: only its answer is waited for."""
     for before in ([], ["a"], ["b"], ["a", "b"]):
-        readers = Readers()
-        note(readers, 0.0, *before)
-        note(readers, 10.0, "b", late=True)
-        assert not note(readers, 11.0, "a", "b")
-        assert not note(readers, 12.0, "a", "b")
+        readers = known(*before)
+        assert not note(readers, 10.0, "b", late=True)
+        assert not note(readers, 20.0, late=True)
+        assert not note(readers, 21.0, "a", "b")
+        assert not note(readers, 22.0, "a", "b")
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_late_reader_that_has_gone_may_return_for_90_seconds(known: bool) -> None:
+@pytest.mark.parametrize("before", [["a", "b"], ["b"]])
+def test_late_reader_that_has_gone_may_return_for_90_seconds(before: list[str]) -> None:
     """A question that was late and one that ended with the lease are one and the same standstill."""
-    readers = Readers()
-    note(readers, 0.0, *(["a", "b"] if known else ["b"]))
+    readers = known(*before)
     note(readers, 10.0, "b", late=True)
     assert note(readers, 11.0, "b")
     assert away_for(readers, 11.0, "b") == pytest.approx(THAW, abs=0.6)

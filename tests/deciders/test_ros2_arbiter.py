@@ -9,8 +9,8 @@ import pytest
 from nedbus.bridges.ros2_arbiter import TAKE_OVER_DELAY, Decision, Ros2Arbiter
 from nedbus.errors import AddressError
 from nedbus_msgs import Address
+from tests.messages import VLP
 
-VLP = "vehicle_local_position"
 ONE = Address("1", VLP)
 TOPIC = f"fmu/out/{VLP}"
 
@@ -26,20 +26,13 @@ def actions(
     return [(each.action, each.topic) for each in arbiter.update(addresses, nodes or {}, now=now)]
 
 
-@pytest.mark.parametrize(
-    ("address", "topic"),
-    [
-        (ONE, TOPIC),
-        (Address("7", VLP), f"px4_7/fmu/out/{VLP}"),
-        (Address("wing", VLP), f"wing/fmu/out/{VLP}"),
-        (Address("wing-2", "estimator_local_position", 1), "wing_2/fmu/out/estimator_local_position_1"),
-        (Address("named", VLP), f"fleet/a/fmu/out/{VLP}"),
-        (Address("bare", VLP), TOPIC),
-    ],
-)
-def test_topic_has_a_namespace_by_vehicle(address: Address, topic: str) -> None:
+def test_topic_has_a_namespace_by_vehicle() -> None:
     """The plain vehicle has none, a given one wins, else it is the vehicle's name as ROS 2 allows it."""
-    assert make({"named": "/fleet/a/", "bare": ""}).topic_of(address) == topic
+    arbiter = make({"named": "/fleet/a/", "bare": ""})
+    estimator = Address("wing-2", "estimator_local_position", 1)
+    assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"
+    namespaces = {"1": "", "7": "px4_7/", "wing": "wing/", "named": "fleet/a/", "bare": ""}
+    assert {name: arbiter.topic_of(Address(name, VLP)).removesuffix(TOPIC) for name in namespaces} == namespaces
 
 
 @pytest.mark.parametrize("namespace", ["7up", "a b", "a//b", "a-b", "/1/"])
@@ -50,28 +43,25 @@ def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
 
 
 def test_address_is_published_once_and_withdrawn_when_gone() -> None:
-    """Only changes are decided: nothing while all stays as it is."""
+    """Only changes are decided: nothing while all stays as it is; a sample may come before and after."""
     arbiter = make()
+    assert not arbiter.publishes(ONE)
     assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
+    assert arbiter.publishes(ONE)
     assert arbiter.update([ONE], {}, now=1.0) == []
     assert arbiter.update([], {}, now=2.0) == [Decision("withdraw", ONE, TOPIC)]
+    assert not arbiter.publishes(ONE)
     assert arbiter.update([], {}, now=3.0) == []
 
 
-def test_topic_of_another_node_is_left_to_it() -> None:
-    """It is not published, and the node is named once."""
+@pytest.mark.parametrize("published", [False, True])
+def test_topic_of_another_node_is_left_to_it(published: bool) -> None:
+    """It is not published, or no more: PX4 itself wins over the bridge; the node is named once."""
     arbiter = make()
-    assert arbiter.update([ONE], {ONE: "px4"}, now=0.0) == [Decision("defer", ONE, TOPIC, "px4")]
-    assert arbiter.update([ONE], {ONE: "px4"}, now=1.0) == []
-    assert not arbiter.publishes(ONE)
-
-
-def test_published_topic_is_left_to_a_node_that_comes_later() -> None:
-    """PX4 itself wins over the bridge."""
-    arbiter = make()
-    arbiter.update([ONE], {}, now=0.0)
-    assert arbiter.publishes(ONE)
-    assert actions(arbiter, [ONE], {ONE: "px4"}, now=1.0) == [("defer", TOPIC)]
+    arbiter.update([ONE] if published else [], {}, now=0.0)
+    assert arbiter.publishes(ONE) is published
+    assert arbiter.update([ONE], {ONE: "px4"}, now=1.0) == [Decision("defer", ONE, TOPIC, "px4")]
+    assert arbiter.update([ONE], {ONE: "px4"}, now=2.0) == []
     assert not arbiter.publishes(ONE)
 
 
@@ -105,22 +95,8 @@ def test_two_addresses_of_one_topic_conflict() -> None:
     assert arbiter.update([first, second], {}, now=1.0) == []
     assert (arbiter.publishes(first), arbiter.publishes(second)) == (True, False)
     assert actions(arbiter, [second], now=2.0) == [("withdraw", topic), ("publish", topic)]
+    # An address that comes later does not displace one that is published, whatever their order.
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
-
-
-def test_published_address_keeps_its_topic_in_a_conflict() -> None:
-    """An address that comes later does not displace one that is published, whatever their order."""
-    arbiter = make()
-    arbiter.update([Address("a_b", VLP)], {}, now=0.0)
-    assert actions(arbiter, [Address("a-b", VLP), Address("a_b", VLP)], now=1.0) == [
-        ("conflict", f"a_b/fmu/out/{VLP}"),
-    ]
-
-
-def test_address_is_not_published_before_and_after() -> None:
-    """A sample can come before the first update, and after the address was withdrawn."""
-    arbiter = make()
-    assert not arbiter.publishes(ONE)
-    arbiter.update([ONE], {}, now=0.0)
-    arbiter.update([], {}, now=1.0)
-    assert not arbiter.publishes(ONE)
+    assert actions(arbiter, [first, second], {second: "px4"}, now=4.0) == [("defer", topic)]
+    assert actions(arbiter, [first, second], now=5.0) == [("publish", topic)]
+    assert actions(arbiter, [first, second], now=5.0 + TAKE_OVER_DELAY) == [("conflict", topic)]  # told anew

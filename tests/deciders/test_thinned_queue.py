@@ -1,18 +1,24 @@
-"""The queue of a reader with a maximum rate: what is left out, and that it is neither lost nor dropped."""
+"""A reader with a maximum rate: which messages pass, and that what is left out is neither lost nor dropped."""
 
 from __future__ import annotations
 
 import math
+from itertools import accumulate, combinations_with_replacement, pairwise
 from types import SimpleNamespace
 
+import hypothesis.strategies as st
 import pytest
+from hypothesis import given
 
 from nedbus import Counts, Mode
 from nedbus.client.decoder import Decoder
 from nedbus.client.layout_lookup import LayoutLookup
 from nedbus.client.publisher_sequence import Hole
+from nedbus.client.qos import RATES
+from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.client.thinned_queue import ThinnedQueue
 from nedbus.client.unthinned import PATIENCE, Unthinned
+from nedbus.errors import ConfigError
 from nedbus.transport import RawSample
 
 from .raw_samples import KEY, OTHER_KEY, drain, miss, name_of, raw, timestamps
@@ -124,7 +130,10 @@ def test_message_without_a_timestamp_is_thinned_by_arrival(monkeypatch: pytest.M
 
 
 def test_stream_is_read_whole_when_nobody_thins_it() -> None:
-    """One that is alive for a while and not heard thinned; a publisher that returns is waited for again."""
+    """One that is alive for a while and not heard thinned; a publisher that returns is waited for again.
+
+    Who asks for one stream alone reads it whole when nothing comes, as a plain publisher has no token.
+    """
     unthinned = Unthinned(0.0)
     unthinned.appeared("a", 0.0)
     unthinned.appeared("b", 0.0)
@@ -136,12 +145,79 @@ def test_stream_is_read_whole_when_nobody_thins_it() -> None:
     unthinned.appeared("a", 20.0)
     assert unthinned.needed({"b"}, 20.0) == set()
     assert unthinned.needed({"b"}, 20.0 + PATIENCE) == {"a"}
+    plain = Unthinned(0.0, always="a")
+    assert plain.needed(set(), PATIENCE) == {"a"}
+    plain.gone("a", 5.0)
+    assert plain.needed(set(), 5.0) == set()
+    assert plain.needed(set(), 5.0 + PATIENCE) == {"a"}
 
 
-def test_only_stream_needs_no_token() -> None:
-    """Who asks for one stream alone reads it whole when nothing comes, as a plain publisher has no token."""
-    unthinned = Unthinned(0.0, always="a")
-    assert unthinned.needed(set(), PATIENCE) == {"a"}
-    unthinned.gone("a", 5.0)
-    assert unthinned.needed(set(), 5.0) == set()
-    assert unthinned.needed(set(), 5.0 + PATIENCE) == {"a"}
+def passed(rate: float, times: list[float]) -> list[float]:
+    """Return which of these times pass, in seconds."""
+    gate = RateGate(rate)
+    return [now for now in times if gate.passes(round(1e9 * now))]
+
+
+def steady(rate: float, seconds: float) -> list[float]:
+    """Return the times of a steady stream."""
+    return [number / rate for number in range(round(rate * seconds))]
+
+
+def test_steady_stream_passes_evenly() -> None:
+    """Of 100 Hz to 5 Hz each 20th message passes, whatever its jitter, and without a drift in ten minutes."""
+    times = [number / 100 + 0.002 * math.sin(number) for number in range(60_000)]
+    taken = passed(5, times)
+    assert len(taken) == 3_000
+    assert {round(100 * (after - before)) for before, after in pairwise(taken)} == {20}
+
+
+@pytest.mark.parametrize("rate", [0.3, 1, 3, 7, 30, 33, 70, 99, 100])
+@pytest.mark.parametrize("source", [100.0, 103.7, 250.0])
+def test_mean_is_the_rate(rate: float, source: float) -> None:
+    """Where rates divide badly the mean is the one that was asked for, and not the next lower divisor."""
+    seconds = 10_000 / source
+    assert len(passed(rate, steady(source, seconds))) == pytest.approx(seconds * rate, abs=2)
+
+
+@pytest.mark.parametrize("rate", [2, 5, 10])
+def test_slower_stream_passes_whole(rate: float) -> None:
+    """A stream that is not faster than the rate loses nothing."""
+    times = steady(2, 100.0)
+    assert passed(rate, times) == times
+
+
+@given(st.lists(st.floats(-0.09, 0.09), min_size=50, max_size=50))
+def test_jitter_costs_one_message(jitter: list[float]) -> None:
+    """Of a stream at the very rate that jitters by half a period at most one message is left out."""
+    times = [number / 5 + late for number, late in enumerate(jitter)]
+    assert len(passed(5, times)) >= len(times) - 1
+
+
+@given(st.floats(0.1, 200.0), st.lists(st.floats(0.0, 3.0), min_size=1, max_size=200))
+def test_never_more_than_the_rate_and_two(rate: float, steps: list[float]) -> None:
+    """Whatever comes, in T seconds at most rate x (T + 2.5 ms) + 2 messages pass."""
+    taken = passed(rate, list(accumulate(steps, initial=1000.0)))
+    for first, last in combinations_with_replacement(range(len(taken)), 2):
+        assert last - first + 1 <= rate * (taken[last] - taken[first] + 0.0025) * (1 + 1e-6) + 2
+
+
+def test_clock_that_was_set_back_goes_on() -> None:
+    """After a restart with an earlier clock the stream passes at once."""
+    gate = RateGate(5)
+    times = (10**18, 10**18 + 100_000_000, 5_000_000_000, 5_100_000_000, 5_200_000_000)
+    assert [gate.passes(now) for now in times] == [True, False, True, False, True]
+
+
+def test_step_is_the_greatest_that_is_not_above() -> None:
+    """A wish is served by a step of the ladder; below the least of them by that one."""
+    assert [rate_step(rate) for rate in RATES] == list(RATES)
+    wishes = {0.1: 1, 1.9: 1, 4.99: 2, 7: 5, 30: 20, 99: 50, 1e6: 100}
+    assert {wish: rate_step(wish) for wish in wishes} == wishes
+
+
+@pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, "5", True, None])
+def test_invalid_rate_is_refused(value: object) -> None:
+    """What is no finite number above 0 is a ConfigError, and a ValueError, that names the option."""
+    with pytest.raises(ConfigError, match="max_rate") as error:
+        check_max_rate(value)
+    assert isinstance(error.value, ValueError)

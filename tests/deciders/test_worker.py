@@ -4,32 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
 from nedbus.client import PublisherRegistry
+from nedbus.daemon.status import SourceStatus
 from nedbus.daemon.worker import Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import Address, VehicleLocalPosition, decode, encode_fields
+from tests.messages import VLP
 
-ONE, TWO = Address("1", "vehicle_local_position"), Address("2", "vehicle_local_position")
+ONE, TWO = Address("1", VLP), Address("2", VLP)
 Script = list[SourceMessage | Rejection | float | None]
 
 
+@dataclass
 class StandingClock:
     """A clock that goes on only by waiting, and stops after a while."""
 
-    def __init__(self, *, stop_at: float = 1000.0) -> None:
-        self.seconds = 0.0
-        self.waits: list[float] = []
-        self._stop_at = stop_at
+    stop_at: float = 1000.0
+    seconds: float = 0.0
+    waits: list[float] = field(default_factory=list)
 
     @property
     def stopped(self) -> bool:
-        return self.seconds >= self._stop_at
+        return self.seconds >= self.stop_at
 
     def now(self) -> float:
         return self.seconds
@@ -44,46 +47,35 @@ class StandingClock:
 
 
 @dataclass
-class FakePublisher:
-    """Validates fields as the real one does, and keeps what is published, and when."""
+class FakeRegistry:
+    """One publisher for each address, as the real one has, without a session: what it gets is validated, and kept."""
 
     clock: StandingClock
-    close: Callable[[], object]
-    published: list[tuple[float, VehicleLocalPosition]] = field(default_factory=list)
+    open: dict[Address, SimpleNamespace] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+    published: dict[Address, list[tuple[float, VehicleLocalPosition]]] = field(default_factory=dict)
+    rejected: list[tuple[Address, Mapping[str, object]]] = field(default_factory=list)
+    readers_at: float = 0.0
 
-    def publish(self, fields: Mapping[str, object]) -> None:
-        self.published.append((self.clock.seconds, decode(encode_fields(fields))))
-
-
-class FakeRegistry:
-    """One publisher for each address, as the real one has, without a session."""
-
-    def __init__(self, clock: StandingClock) -> None:
-        self.clock = clock
-        self.open: dict[Address, FakePublisher] = {}
-        self.log: list[str] = []
-        self.published: dict[Address, list[tuple[float, VehicleLocalPosition]]] = {}
-        self.rejected: list[tuple[Address, Mapping[str, object]]] = []
-        self.readers_at = 0.0
-
-    def publisher(self, address: Address, *, lossless: bool, source: str) -> FakePublisher:
+    def publisher(self, address: Address, *, lossless: bool, source: str) -> SimpleNamespace:
         if address in self.open:
             raise AddressInUseError(address)
+
+        def publish(fields: Mapping[str, object]) -> None:
+            self.published.setdefault(address, []).append((self.clock.seconds, decode(encode_fields(fields))))
 
         def close() -> None:
             del self.open[address]
             self.log.append(f"{self.clock.seconds:g} -{address.vehicle}")
 
         self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
-        kept = self.published.setdefault(address, [])
-        self.open[address] = FakePublisher(self.clock, close, kept)
+        self.open[address] = SimpleNamespace(publish=publish, close=close)
         return self.open[address]
-
-    def is_alive(self, address: Address) -> bool:
-        return address in self.open
 
     def is_published(self, address: Address) -> bool:
         return address in self.open
+
+    is_alive = is_published
 
     def is_read(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at
@@ -94,7 +86,7 @@ class FakeRegistry:
 
 @dataclass
 class FakeReplay:
-    """A replay of these messages; each of `failures` is raised by one `open` before it works."""
+    """A replay of these messages, or of what `run` does; each of `failures` is raised by one `open` before it works."""
 
     messages: list[SourceMessage]
     failures: list[BaseException] = field(default_factory=list)
@@ -102,14 +94,13 @@ class FakeReplay:
     loop: bool = False
     wait: bool = False
     finite: bool = True
-    opened: int = 0
+    run: Callable[[], Iterator[SourceMessage]] | None = None
 
     def open(self) -> ReplayRun:
-        self.opened += 1
         if self.failures:
             raise self.failures.pop(0)
         addresses = tuple(dict.fromkeys(each.address for each in self.messages))
-        return ReplayRun(iter(self.messages), addresses, len(self.messages), "a flight")
+        return ReplayRun(self.run() if self.run else iter(self.messages), addresses, len(self.messages), "a flight")
 
 
 @dataclass
@@ -141,42 +132,51 @@ def at(due: float, address: Address = ONE, **fields: object) -> SourceMessage:
     return SourceMessage(due, address, {"timestamp": round(due * 1e6), **fields})
 
 
-def make(source: object, clock: StandingClock, *, retry: bool = True) -> tuple[Worker, FakeRegistry, list[str]]:
-    registry, ends = FakeRegistry(clock), []
-    worker = Worker(
-        "ulog:flight.ulg",
-        cast("Source", source),
-        cast("PublisherRegistry", registry),
-        clock=clock,
-        retry=retry,
-        on_end=lambda: ends.append("end"),
-    )
-    return worker, registry, ends
+class Ran:
+    """A worker, what it published where, and how often it told its end."""
+
+    def __init__(self, source: object, clock: StandingClock, *, retry: bool = True) -> None:
+        self.ends = 0
+        self.registry = FakeRegistry(clock)
+        given = cast("Source", source), cast("PublisherRegistry", self.registry)
+        self.worker = Worker("ulog:flight.ulg", *given, clock=clock, retry=retry, on_end=self._count_end)
+
+    def _count_end(self) -> None:
+        self.ends += 1
+
+    @property
+    def status(self) -> SourceStatus:
+        return self.worker.status
+
+    @property
+    def times(self) -> list[float]:
+        """When messages of vehicle 1 were published."""
+        return [round(seconds, 6) for seconds, _ in self.registry.published.get(ONE, [])]
 
 
-def times(registry: FakeRegistry, address: Address = ONE) -> list[float]:
-    return [round(seconds, 6) for seconds, _ in registry.published.get(address, [])]
+def run(source: object, clock: StandingClock | None = None, *, retry: bool = True) -> Ran:
+    ran = Ran(source, clock or StandingClock(), retry=retry)
+    ran.worker.run()
+    return ran
 
 
 def test_replay_publishes_each_message_when_it_is_due() -> None:
     """At speed 2 after half the time; then the source is done, and says so once."""
-    clock = StandingClock()
-    worker, registry, ends = make(FakeReplay([at(0.0), at(1.0), at(3.0)], speed=2.0), clock)
-    assert worker.status.state == "starting"
-    worker.run()
-    assert times(registry) == [0.0, 0.5, 1.5]
-    status = worker.status
+    ran = Ran(FakeReplay([at(0.0), at(1.0), at(3.0)], speed=2.0), StandingClock())
+    assert ran.status.state == "starting"
+    ran.worker.run()
+    assert ran.times == [0.0, 0.5, 1.5]
+    status = ran.status
     assert (status.state, status.published, status.done, status.total, status.ended) == ("done", 3, 3, 3, True)
-    assert ends == ["end"]
+    assert ran.ends == 1
 
 
 def test_replay_at_full_speed_is_lossless_and_never_waits() -> None:
     """Its publishers wait for readers; it does not wait for the clock."""
     clock = StandingClock()
-    worker, registry, _ = make(FakeReplay([at(0.0), at(100.0)], speed=None), clock)
-    worker.run()
-    assert (times(registry), clock.waits) == ([0.0, 0.0], [])
-    assert registry.log[0] == "0 +1 lossless ulog"
+    ran = run(FakeReplay([at(0.0), at(100.0)], speed=None), clock)
+    assert (ran.times, clock.waits) == ([0.0, 0.0], [])
+    assert ran.registry.log[0] == "0 +1 lossless ulog"
 
 
 def test_replay_that_is_late_goes_on_from_there() -> None:
@@ -188,56 +188,40 @@ def test_replay_that_is_late_goes_on_from_there() -> None:
         clock.seconds += 10.0
         yield from (at(1.0), at(2.0))
 
-    source = FakeReplay([])
-    source.open = lambda: ReplayRun(stall(), (ONE,), 3, "a flight")  # type: ignore[method-assign] # a clock that jumps
-    worker, registry, _ = make(source, clock)
-    worker.run()
-    assert times(registry) == [0.0, 10.0, 11.0]
+    assert run(FakeReplay([at(0.0)], run=stall), clock).times == [0.0, 10.0, 11.0]
 
 
 def test_replay_waits_for_a_reader_once() -> None:
     """wait=1: nothing is published before somebody subscribes; a second run of a loop does not wait again."""
-    clock = StandingClock(stop_at=2.0)
-    worker, registry, _ = make(FakeReplay([at(0.0), at(0.5)], wait=True, loop=True), clock)
-    registry.readers_at = 1.0
-    worker.run()
-    assert times(registry)[:3] == [1.0, 1.5, 1.5]
+    ran = Ran(FakeReplay([at(0.0), at(0.5)], wait=True, loop=True), StandingClock(stop_at=2.0))
+    ran.registry.readers_at = 1.0
+    ran.worker.run()
+    assert ran.times[:3] == [1.0, 1.5, 1.5]
 
 
 def test_loop_does_not_spin() -> None:
     """A run takes a tenth of a second at least, however short the log is."""
-    clock = StandingClock(stop_at=1.0)
-    worker, registry, _ = make(FakeReplay([at(0.0)], loop=True), clock)
-    worker.run()
-    assert times(registry)[:10] == pytest.approx([step / 10 for step in range(10)])
+    ran = run(FakeReplay([at(0.0)], loop=True), StandingClock(stop_at=1.0))
+    assert ran.times[:10] == pytest.approx([step / 10 for step in range(10)])
 
 
 def test_failure_is_retried_with_growing_pauses() -> None:
-    """1, 2, 4, 8, 16, 30, 30 s; the status has the reason until it works, and the addresses are free meanwhile."""
+    """1, 2, 4, 8, 16, 30, 30 s, until it works, and anew when it has worked; the addresses are free meanwhile."""
     clock = StandingClock()
     failures: list[BaseException] = [SourceError("flight.ulg", "no such file")] * 7
-    worker, registry, _ = make(FakeReplay([at(0.0)], failures), clock)
-    worker.run()
+    ran = run(FakeReplay([at(0.0)], failures), clock)
     assert clock.waits == [1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
-    status = worker.status
+    status = ran.status
     assert (status.state, status.retries, status.error, status.published) == ("done", 7, None, 1)
-    assert registry.log == ["91 +1 ulog"]
+    assert ran.registry.log == ["91 +1 ulog"]
 
+    def work() -> Iterator[SourceMessage]:
+        yield at(0.0)
+        yield at(40.0)
+        raise SourceError("flight.ulg", "no such file")
 
-def test_failure_without_retry_is_final() -> None:
-    """--until-done: a source that fails has failed, with its reason."""
-    worker, _, ends = make(FakeReplay([], [SourceError("flight.ulg", "no such file")]), StandingClock(), retry=False)
-    worker.run()
-    status = worker.status
-    assert (status.state, status.error, status.ended) == ("failed", "flight.ulg: no such file", True)
-    assert ends == ["end"]
-
-
-def test_unexpected_error_stops_this_source_only() -> None:
-    """A bug in a source is a failure with its name, not the end of its thread."""
-    worker, _, _ = make(FakeReplay([at(0.0)], [ZeroDivisionError("1/0")]), StandingClock())
-    worker.run()
-    assert (worker.status.state, worker.status.retries) == ("done", 1)
+    run(FakeReplay([at(0.0)], run=work), clock := StandingClock(stop_at=200.0))
+    assert clock.waits == [40.0, 1.0] * 4 + [40.0]
 
 
 class PanicException(BaseException):
@@ -245,15 +229,19 @@ class PanicException(BaseException):
 
 
 @pytest.mark.parametrize("retry", [True, False])
-def test_panic_is_a_failure_of_the_source(retry: bool) -> None:
-    """What is no Exception is told as any other error: it never leaves a source "running" whose thread ended."""
-    clock = StandingClock(stop_at=100.0)
-    worker, _, ends = make(FakeReplay([at(0.0)], [PanicException("clock before 1970")] * 9), clock, retry=retry)
-    worker.run()
-    status = worker.status
-    assert (status.state, status.ended) == (("retrying", False) if retry else ("failed", True))
-    assert status.error == "an unexpected PanicException: clock before 1970"
-    assert ends == ["end"]
+@pytest.mark.parametrize(
+    ("failure", "reason"),
+    [
+        (SourceError("flight.ulg", "no such file"), "flight.ulg: no such file"),
+        (ZeroDivisionError("1/0"), "an unexpected ZeroDivisionError: 1/0"),
+        (PanicException("clock before 1970"), "an unexpected PanicException: clock before 1970"),
+    ],
+)
+def test_any_failure_is_retried_or_final(failure: BaseException, reason: str, retry: bool) -> None:
+    """A bug, and what is no Exception, too: it never leaves a source "running" whose thread ended."""
+    ran = run(FakeReplay([at(0.0)], [failure] * 9), StandingClock(stop_at=100.0), retry=retry)
+    assert (ran.status.state, ran.status.ended) == (("retrying", False) if retry else ("failed", True))
+    assert (ran.status.error, ran.ends) == (reason, 1)
 
 
 def test_error_while_a_failure_is_handled_ends_the_source() -> None:
@@ -262,27 +250,21 @@ def test_error_while_a_failure_is_handled_ends_the_source() -> None:
     def panic() -> None:
         raise PanicException("poisoned")
 
-    class Breaking(FakeReplay):
-        def open(self) -> ReplayRun:
-            return ReplayRun(self.break_(), (ONE,), 2, "a flight")
+    def break_() -> Iterator[SourceMessage]:
+        yield at(0.0)
+        ran.registry.open[ONE].close = panic
+        raise ZeroDivisionError
 
-        def break_(self) -> Iterator[SourceMessage]:
-            yield at(0.0)
-            registry.open[ONE].close = panic
-            raise ZeroDivisionError
-
-    worker, registry, ends = make(Breaking([]), StandingClock())
-    worker.run()
-    status = worker.status
-    assert (status.state, status.error) == ("failed", "an unexpected PanicException: poisoned")
-    assert ends == ["end"]
+    ran = Ran(FakeReplay([at(0.0)], run=break_), StandingClock())
+    ran.worker.run()
+    assert (ran.status.state, ran.status.error) == ("failed", "an unexpected PanicException: poisoned")
+    assert ran.ends == 1
 
 
 def test_closed_session_is_a_failure_unless_the_service_is_stopped() -> None:
     """A session that was closed meanwhile cannot be used again: the source has failed, and says why."""
-    worker, _, _ = make(FakeReplay([at(0.0)], [ClosedError()]), StandingClock())
-    worker.run()
-    assert (worker.status.state, worker.status.error) == ("failed", str(ClosedError()))
+    status = run(FakeReplay([at(0.0)], [ClosedError()])).status
+    assert (status.state, status.error) == ("failed", str(ClosedError()))
     clock = StandingClock()
 
     class Stopping(FakeReplay):
@@ -290,39 +272,35 @@ def test_closed_session_is_a_failure_unless_the_service_is_stopped() -> None:
             clock.wait(1000.0)
             raise ClosedError
 
-    worker, _, _ = make(Stopping([]), clock)
-    worker.run()
-    assert (worker.status.state, worker.status.error) == ("starting", None)
+    status = run(Stopping([]), clock).status
+    assert (status.state, status.error) == ("starting", None)
 
 
 def test_live_source_is_retried_without_retry() -> None:
     """--until-done: a serial port that fails once does not end a live source; only replays have no second try."""
     clock = StandingClock(stop_at=100.0)
-    source = FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")])
-    worker, registry, _ = make(source, clock, retry=False)
-    worker.run()
-    assert (times(registry), worker.status.state, worker.status.retries) == ([1.0], "done", 1)
+    ran = run(FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")]), clock, retry=False)
+    assert (ran.times, ran.status.state, ran.status.retries) == ([1.0], "done", 1)
 
 
 def test_taken_address_leaves_the_others_free() -> None:
     """A source whose second address is taken takes none, not even for a moment: others may need the first."""
-    clock = StandingClock(stop_at=1.0)
-    worker, registry, _ = make(FakeReplay([at(0.0), at(0.0, TWO)]), clock)
-    registry.publisher(TWO, lossless=False, source="other")
-    worker.run()
-    assert registry.log == ["0 +2 other"]
-    assert worker.status.state == "retrying"
-    assert "2/vehicle_local_position is published by this process already" in str(worker.status.error)
+    ran = Ran(FakeReplay([at(0.0), at(0.0, TWO)]), StandingClock(stop_at=1.0))
+    ran.registry.publisher(TWO, lossless=False, source="other")
+    ran.worker.run()
+    assert ran.registry.log == ["0 +2 other"]
+    assert ran.status.state == "retrying"
+    assert "2/vehicle_local_position is published by this process already" in str(ran.status.error)
 
 
 def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     """It is counted, reported with its reason and its fields, and the first five are logged; the others go on."""
-    broken = [at(0.0, z_valid=True) for _ in range(8)]
-    worker, registry, _ = make(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None), StandingClock())
-    worker.run()
-    assert (worker.status.published, worker.status.rejected) == (1, 8)
-    address, report = registry.rejected[0]
-    assert (address, len(registry.rejected)) == (ONE, 8)
+    broken = [at(0.0, z_valid=True), *(at(0.0, eph=-1.0 - number) for number in range(7))]
+    ran = run(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None))
+    assert list(ran.status.rejections.values()) == [1, 7], "by field and rule, and not by value"
+    assert (ran.status.published, ran.status.rejected) == (1, 8)
+    address, report = ran.registry.rejected[0]
+    assert (address, len(ran.registry.rejected)) == (ONE, 8)
     assert "z: must be finite while z_valid is true" in str(report["reason"])
     assert report["fields"] == {"timestamp": 0, "z_valid": True}
     assert sum("rejected" in text for text in caplog.messages) == 5
@@ -332,13 +310,10 @@ def test_live_source_publishes_what_arrives_until_it_is_stale() -> None:
     """A vehicle is published from its first message on, withdrawn after 3 s without one, and comes back."""
     clock = StandingClock(stop_at=100.0)
     source = FakeLive(clock, [at(0.0), 1.0, at(0.0, TWO), 3.5, at(0.0), 1.0])
-    worker, registry, _ = make(source, clock)
-    worker.run()
-    assert registry.log[:4] == ["0 +1 ulog", "1 +2 ulog", "3 -1", "4 -2"]
-    assert registry.log[4] == "4.5 +1 ulog"
+    ran = run(source, clock)
+    assert ran.registry.log[:5] == ["0 +1 ulog", "1 +2 ulog", "3 -1", "4 -2", "4.5 +1 ulog"]
     assert source.closed == 1
-    status = worker.status
-    assert (status.state, status.published) == ("done", 3)
+    assert (ran.status.state, ran.status.published) == ("done", 3)
 
 
 def test_live_states_follow_the_vehicles() -> None:
@@ -350,10 +325,10 @@ def test_live_states_follow_the_vehicles() -> None:
         def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
             for item in super().listen(None):
                 yield item
-                states.append((worker.status.state, worker.status.stale))
+                states.append((ran.status.state, ran.status.stale))
 
-    worker, _, _ = make(Watched(clock, [0.5, at(0.0), 4.0]), clock)
-    worker.run()
+    ran = Ran(Watched(clock, [0.5, at(0.0), 4.0]), clock)
+    ran.worker.run()
     assert states[0] == ("waiting", ())
     assert ("running", ()) in states
     assert states[-1] == ("waiting", ("1/vehicle_local_position",))
@@ -362,13 +337,8 @@ def test_live_states_follow_the_vehicles() -> None:
 def test_live_losses_and_reboots_are_summed() -> None:
     """What a source says was lost before it is counted, and so is each restart of a vehicle."""
     clock = StandingClock(stop_at=100.0)
-    script: Script = [
-        SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4),
-        SourceMessage(0.0, ONE, {"timestamp": 0}, 0, True),
-    ]
-    worker, _, _ = make(FakeLive(clock, script), clock)
-    worker.run()
-    status = worker.status
+    reboot = SourceMessage(0.0, ONE, {"timestamp": 0}, 0, True)
+    status = run(FakeLive(clock, [SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4), reboot]), clock).status
     assert (status.lost, status.reboots, status.streams[0].health.lost) == (4, 1, 4)
 
 
@@ -376,28 +346,23 @@ def test_rejections_are_bounded_and_told_once(caplog: pytest.LogCaptureFixture) 
     """A flood from many senders is counted whole; 50 of them are remembered, each with 300 characters."""
     clock = StandingClock(stop_at=100.0)
     script: Script = [Rejection(f"sender {number % 80}", "x" * 1000, ONE) for number in range(200)]
-    worker, registry, _ = make(FakeLive(clock, script), clock)
-    worker.run()
-    status = worker.status
-    assert (status.rejected, len(status.warnings), len(registry.rejected)) == (200, 50, 200)
-    assert max(map(len, status.warnings)) < 350
+    ran = run(FakeLive(clock, script), clock)
+    assert (ran.status.rejected, len(ran.status.warnings), len(ran.registry.rejected)) == (200, 50, 200)
+    assert max(map(len, ran.status.warnings)) < 350
     assert sum("rejected" in text for text in caplog.messages) == 50
 
 
-def test_addresses_of_a_live_source_are_bounded() -> None:
+def test_addresses_of_a_live_source_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """One peer cannot make a service publish without end; the vehicles that are known go on."""
+    monkeypatch.setattr("nedbus.daemon.output._MAX_ADDRESSES", 10)
     clock = StandingClock(stop_at=100.0)
-    script: Script = [at(0.0, Address(str(number), "vehicle_local_position")) for number in range(1005)]
-    worker, _, _ = make(FakeLive(clock, [*script, *script[:10]]), clock)
-    worker.run()
-    status = worker.status
-    assert (status.published, status.rejected, len(status.addresses)) == (1010, 5, 1000)
-    assert status.warnings == ("vehicles: more than 1000 addresses: 1000/vehicle_local_position is left out",)
+    script: Script = [at(0.0, Address(str(number), VLP)) for number in range(15)]
+    status = run(FakeLive(clock, [*script, *script[:10]]), clock).status
+    assert (status.published, status.rejected, len(status.addresses)) == (20, 5, 10)
+    assert status.warnings == ("vehicles: more than 10 addresses: 10/vehicle_local_position is left out",)
 
 
 def test_stop_ends_a_replay_in_its_pause() -> None:
     """A stopped service publishes nothing more, and the source is neither done nor failed."""
-    clock = StandingClock(stop_at=5.0)
-    worker, registry, ends = make(FakeReplay([at(0.0), at(60.0)]), clock)
-    worker.run()
-    assert (times(registry), worker.status.state, ends) == ([0.0], "running", ["end"])
+    ran = run(FakeReplay([at(0.0), at(60.0)]), StandingClock(stop_at=5.0))
+    assert (ran.times, ran.status.state, ran.ends) == ([0.0], "running", 1)

@@ -12,47 +12,48 @@ from nedbus.errors import ConfigError
 from nedbus.settings import load_settings
 from nedbus.sources import parse_source
 from nedbus.transport import make_authority, make_certificate
-from tests.conftest import Start, free_endpoint
+from tests.command_line import run_command
+from tests.ports import free_endpoint
+from tests.processes import Start
 from tests.ulogs import write_log
 
 ROOT = Path(__file__).parents[2]
 
 
-def check(run_nedbus: Start, *arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:
+def check(*arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:
     """Return the lines of a check that finds something."""
-    checked = run_nedbus(*command, *map(str, arguments))
-    assert checked.wait() == 2
-    assert checked.out == ""
+    checked = run_command(*command, *map(str, arguments))
+    assert (checked.exit_code, checked.out) == (2, "")
     return [line.removeprefix("nedbus: ") for line in checked.err.splitlines()]
 
 
+def passes(*arguments: object) -> bool:
+    """Return whether a check finds nothing."""
+    checked = run_command(*map(str, arguments))
+    return (checked.exit_code, checked.out, checked.err) == (0, "nothing is wrong\n", "")
+
+
 @pytest.mark.parametrize(
-    ("table", "text"),
+    ("sources", "texts"),
     [
-        ('kind = "sim"', "sim:"),
-        ('kind = "sim"\nvehicle = 7\nwait = true\nduration = 2.5', "sim:?vehicle=7&wait=1&duration=2.5"),
-        ('kind = "ulog"\nfile = "a?b 100%.ulg"\nspeed = "max"', "ulog:a%3Fb 100%25.ulg?speed=max"),
+        ('[{ kind = "sim" }]', ["sim:"]),
+        ('[{ kind = "sim", vehicle = 7, wait = true, duration = 2.5 }]', ["sim:?vehicle=7&wait=1&duration=2.5"]),
+        ('[{ kind = "ulog", file = "a?b 100%.ulg", speed = "max" }]', ["ulog:a%3Fb 100%25.ulg?speed=max"]),
         (
-            'kind = "mavlink"\nlink = "udpin:0.0.0.0:14540"\nvehicles = { 1 = "wing", 2 = "tail" }',
-            "mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail",
+            '[{ kind = "mavlink", link = "udpin::1", vehicles = { 1 = "a", 2 = "b" } }]',
+            ["mavlink:udpin::1?vehicles=1:a,2:b"],
         ),
-        ('kind = "px4-zenoh"\n[source.vehicles]\nleft = "a"\nright = "b"', "px4-zenoh:?vehicles=left:a,right:b"),
-        ('kind = "px4-zenoh"\nendpoint = "tcp/10.0.0.2:7447"\ndomain = 5', "px4-zenoh:tcp/10.0.0.2:7447?domain=5"),
+        ('[{ kind = "px4-zenoh", vehicles = { left = "a", right = "b" } }]', ["px4-zenoh:?vehicles=left:a,right:b"]),
+        ('[{ kind = "px4-zenoh", endpoint = "tcp/b:7447", domain = 5 }]', ["px4-zenoh:tcp/b:7447?domain=5"]),
+        ('["sim:", { kind = "sim", vehicle = 2 }]', ["sim:", "sim:?vehicle=2"]),
     ],
 )
-def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, table: str, text: str) -> None:
-    """Both forms give the same options; the text is how status and metrics name the source."""
-    (tmp_path / "nedbus.toml").write_text(f"[[source]]\n{table}\n")
-    (source,) = load_settings().source
-    spec = parse_source(source)
-    assert spec.text == text
-    assert spec == parse_source(text)
-
-
-def test_tables_and_texts_may_be_mixed(tmp_path: Path) -> None:
-    """As a list of TOML, in one order."""
-    (tmp_path / "nedbus.toml").write_text('source = ["sim:", { kind = "sim", vehicle = 2 }]\n')
-    assert [parse_source(source).text for source in load_settings().source] == ["sim:", "sim:?vehicle=2"]
+def test_source_as_a_table_is_the_same_as_its_text(tmp_path: Path, sources: str, texts: list[str]) -> None:
+    """Both forms give the same options, and may be mixed; the text is how status and metrics name the source."""
+    (tmp_path / "nedbus.toml").write_text(f"source = {sources}")
+    specs = [parse_source(source) for source in load_settings().source]
+    assert [spec.text for spec in specs] == texts
+    assert specs == [parse_source(text) for text in texts]
 
 
 @pytest.mark.parametrize(
@@ -62,9 +63,7 @@ def test_tables_and_texts_may_be_mixed(tmp_path: Path) -> None:
         ({"kind": "ulg"}, "there is no kind 'ulg': choose from sim, ulog"),
         ({"kind": 5}, "there is no kind 5"),
         ({"kind": "ulog"}, 'it needs file = "..."'),
-        ({"kind": "ulog", "link": "a.ulg"}, 'it needs file = "..."'),
         ({"kind": "ulog", "file": 7}, 'it needs file = "..."'),
-        ({"kind": "sim", "sed": 1}, "there is no option 'sed'"),
         ({"kind": "sim", "speed": 0}, "speed=0 is invalid: expected a factor from 0.001"),
         ({"kind": "mavlink", "link": "udpin::14540", "vehicles": {"x": "a"}}, "vehicles=x:a is invalid"),
     ],
@@ -75,19 +74,12 @@ def test_wrong_table_is_explained(source: dict[str, object], reason: str) -> Non
         parse_source(source)
 
 
-def test_variable_carries_options_with_commas(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Semicolons or lines separate sources whose options have commas."""
-    texts = ["mavlink:udpin:0.0.0.0:14540?vehicles=1:wing,2:tail", "px4-zenoh:?vehicles=left:a,right:b"]
-    for separator in (";", "\n"):
-        monkeypatch.setenv("NEDBUS_SOURCE", separator.join(texts))
-        assert [parse_source(source).text for source in load_settings().source] == texts
-
-
-def test_all_mistakes_are_said_at_once(run_nedbus: Start, tmp_path: Path) -> None:
+def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
     """No mistake hides another one, of whatever kind: settings, items of a list, sources, their options and links."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
-        f'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\nconnect = ["here", "{closed}"]\n'
+        'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'
+        f'connect = ["here", "tcp/nowhere.invalid:1", "{closed}"]\n'
         'listen = ["tcp/127.0.0.1:99999", "tcp/192.0.2.1:1"]\nuntil_done = "maybe"\ntls_ca = "gone.crt"\n'
         'source = ["foo:", "mavlink:udpin:0.0.0.0:99999?sed=1&baud=0", "ulog:gone.ulg?sed=1"]\n'
     )
@@ -97,7 +89,8 @@ def test_all_mistakes_are_said_at_once(run_nedbus: Start, tmp_path: Path) -> Non
         (3, 1, "vehicle 'a b' is not valid"),
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
-        (5, 1, f"{closed}: nothing answers"),
+        (5, 1, "tcp/nowhere.invalid:1: this host finds no address of nowhere.invalid"),
+        (5, 1, f"{closed}: nothing answers (connection refused)"),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
         (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is no address of this host"),
         (7, 1, "until_done: "),
@@ -110,26 +103,26 @@ def test_all_mistakes_are_said_at_once(run_nedbus: Start, tmp_path: Path) -> Non
         (9, 64, "source 'ulog:gone.ulg': gone.ulg: no such file"),
     ]
     for command in (("check",), ("serve", "--check", "--config")):
-        lines = check(run_nedbus, file, command=command)
+        lines = check(file, command=command)
         for line, column, text in expected:
             start = f"{file}, line {line}, column {column}: {text}"
             assert any(each.startswith(start) for each in lines), (start, lines)
         assert len(lines) == len(expected)
 
 
-def test_file_that_cannot_be_read_hides_nothing(run_nedbus: Start, tmp_path: Path) -> None:
+def test_file_that_cannot_be_read_hides_nothing(tmp_path: Path) -> None:
     """Flags and variables are checked all the same; what the file may have said is not called missing."""
     broken = tmp_path / "broken.toml"
     broken.write_text("source = [\n")
     for file, reason in ((tmp_path / "gone.toml", "there is no such file"), (broken, "Invalid value")):
         flags = ("--listen", "tcp/192.0.2.1:1", "--tls-key", "gone.key")
-        lines = check(run_nedbus, file, *flags, command=("serve", "--check", "--config"))
+        lines = check(file, *flags, command=("serve", "--check", "--config"))
         assert [reason in lines[0], len(lines)] == [True, 3], lines
         assert lines[1].startswith("tls_key: gone.key cannot be read")
         assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is no address of this host")
 
 
-def test_two_sources_of_one_vehicle(run_nedbus: Start, tmp_path: Path) -> None:
+def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
     """Sources that publish the same address keep each other from it: replays, and live ones that name a vehicle."""
     file, log = tmp_path / "nedbus.toml", write_log(tmp_path / "flight.ulg", range(0, 100_000, 10_000))
     named = "mavlink:udpin:127.0.0.1:1?vehicles=1:wing"
@@ -137,7 +130,7 @@ def test_two_sources_of_one_vehicle(run_nedbus: Start, tmp_path: Path) -> None:
         f'source = ["sim:", "ulog:{log}?vehicle=7", "sim:?seed=2", "ulog:{log}?vehicle=7&speed=2", "sim:", "{named}",'
         f' "sim:?vehicle=wing", "sim:?vehicle=8", "px4-zenoh:"]\n'
     )
-    reasons = [line.partition(": ")[2] for line in check(run_nedbus, file)]
+    reasons = [line.partition(": ")[2] for line in check(file)]
     advice = "give one of the two another vehicle"
     sims = [
         f"source 'sim:?seed=2': it publishes 1/vehicle_local_position, as source 'sim:' does: {advice}",
@@ -147,10 +140,10 @@ def test_two_sources_of_one_vehicle(run_nedbus: Start, tmp_path: Path) -> None:
     first = f"as source 'ulog:{log}?vehicle=7' does: {advice}"
     logs = f"source 'ulog:{log}?vehicle=7&speed=2': it publishes 7/vehicle_local_position, {first}"
     assert reasons == [sims[0], logs, *sims[1:]]
-    assert [line.partition(": ")[2] for line in check(run_nedbus, "--offline", file)] == sims
+    assert [line.partition(": ")[2] for line in check("--offline", file)] == sims
 
 
-def test_router_file_that_settings_name(run_nedbus: Start, tmp_path: Path) -> None:
+def test_router_file_that_settings_name(tmp_path: Path) -> None:
     """It is checked with them, but for the endpoints that they replace."""
     file, router = tmp_path / "nedbus.toml", tmp_path / "router.json5"
     router.write_text(
@@ -158,38 +151,24 @@ def test_router_file_that_settings_name(run_nedbus: Start, tmp_path: Path) -> No
         '  listen_private_key: "/no/such.key", listen_certificate: "/no/such.crt" } } } }\n'
     )
     file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\n')
-    lines = check(run_nedbus, file)
-    assert sorted(line.partition(": ")[0] for line in lines) == [
-        f"{file}, line 2, column 12",
-        f"{router}, line 1, column 26",
-        f"{router}, line 3, column 24",
-        f"{router}, line 3, column 60",
-    ]
-    assert len(check(run_nedbus, "--offline", file)) == 1
+    lines = check(file)
+    places = [f"{router}, line {place}" for place in ("1, column 26", "3, column 24", "3, column 60")]
+    assert sorted(line.partition(": ")[0] for line in lines) == [f"{file}, line 2, column 12", *places]
+    assert len(check("--offline", file)) == 1
     file.write_text(f'router_config = "{router}"\nsource = ["foo:"]\nlisten = "{free_endpoint()}"\n')
-    assert len(check(run_nedbus, file)) == 3
+    assert len(check(file)) == 3
 
 
-def test_sources_endpoints_and_files_are_tried(run_nedbus: Start, tmp_path: Path) -> None:
-    """A missing log, an option that there is not, a router that does not answer, an address of another host."""
-    file, closed = tmp_path / "nedbus.toml", free_endpoint()
-    file.write_text(
-        f'listen = "tcp/192.0.2.1:7447"\nconnect = ["tcp/nowhere.invalid:7447", "{closed}"]\n'
-        'tls_ca = "gone.crt"\n\n[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n'
-    )
-    lines = check(run_nedbus, file)
-    for expected in (
-        f"{file}, line 7, column 1: source 'sim:?sed=1': there is no option 'sed'",
-        f"{file}, line 9, column 3: source 'ulog:gone.ulg': gone.ulg: no such file",
-        f"{file}, line 3, column 1: gone.crt cannot be read",
-        f"{file}, line 2, column 1: tcp/nowhere.invalid:7447: this host finds no address of nowhere.invalid",
-        f"{file}, line 2, column 1: {closed}: nothing answers (connection refused)",
-        f"{file}, line 1, column 1: tcp/192.0.2.1:7447: 192.0.2.1 is no address of this host",
-    ):
-        assert any(line.startswith(expected) for line in lines), expected
-    assert len(lines) == 6
-    offline = check(run_nedbus, file, command=("check", "--offline"))
-    assert [line.partition(": ")[0] for line in offline] == [f"{file}, line 7, column 1"]
+def test_tables_have_their_places(tmp_path: Path) -> None:
+    """An option that there is not, at its own line; a missing log, at its table, but not offline."""
+    file = tmp_path / "nedbus.toml"
+    file.write_text('[[source]]\nkind = "sim"\nsed = 1\n\n[[source]]\nkind = "ulog"\nfile = "gone.ulg"\n')
+    wrong = f"{file}, line 3, column 1: source 'sim:?sed=1': there is no option 'sed'"
+    lines = check(file)
+    assert lines[0].startswith(wrong)
+    assert lines[1] == f"{file}, line 5, column 3: source 'ulog:gone.ulg': gone.ulg: no such file or directory"
+    [line] = check("--offline", file)
+    assert line.startswith(wrong)
 
 
 @pytest.mark.parametrize(
@@ -212,32 +191,23 @@ def test_endpoint_that_is_none(tmp_path: Path, endpoint: str, reasons: list[str]
     assert [reason in each for reason, each in zip(reasons, mistakes, strict=True)] == [True, True], mistakes
 
 
-def test_router_files(run_nedbus: Start, tmp_path: Path) -> None:
-    """A file for zenohd is read as zenohd reads it; what is shipped has no mistake in its text."""
+def test_router_files(tmp_path: Path, endpoint: str) -> None:
+    """A file for zenohd is read as zenohd reads it; what is shipped, or runs, has no mistake in its text."""
     broken, unknown = tmp_path / "broken.json5", tmp_path / "unknown.json5"
     broken.write_text('{\n  mode: "router",\n  listen: [\n}\n')
     unknown.write_text('{ mode: "router",\n  lisen: {} }\n')
-    lines = check(run_nedbus, broken, unknown)
-    assert len(lines) == 2
-    assert lines[0].startswith(f"{broken}, line 4, column 1: ")
-    assert lines[1].startswith(f"{unknown}, line ")
+    of_broken, of_unknown = check(broken, unknown)
+    assert of_broken.startswith(f"{broken}, line 4, column 1: ")
+    assert of_unknown.startswith(f"{unknown}, line ")
     missing = tmp_path / "router.json5"
     missing.write_text('{\n  transport: { link: { tls: {\n    listen_certificate: "/no/such.crt" } } } }\n')
-    (line,) = check(run_nedbus, missing)
+    (line,) = check(missing)
     assert line.startswith(f"{missing}, line 3, column 26: listen_certificate: /no/such.crt cannot be read")
-    shipped = run_nedbus("check", "--offline", *map(str, sorted((ROOT / "config").glob("*.json5"))))
-    assert shipped.wait() == 0, shipped.err
-    assert shipped.out == "nothing is wrong\n"
+    assert passes("check", "--offline", *sorted((ROOT / "config").glob("*.json5")))
+    assert passes("serve", "--check", "--connect", endpoint, "-s", "sim:")
 
 
-def test_what_runs_passes(run_nedbus: Start, endpoint: str) -> None:
-    """The flags of a service that works are right, also while it runs."""
-    checked = run_nedbus("serve", "--check", "--connect", endpoint, "-s", "sim:")
-    assert checked.wait() == 0, checked.err
-    assert checked.out == "nothing is wrong\n"
-
-
-def test_certificates_that_expire_are_named(run_nedbus: Start, tmp_path: Path) -> None:
+def test_certificates_that_expire_are_named(tmp_path: Path) -> None:
     """Expired, and within 30 days: of a client, and of a router's file; what is valid for longer is not mentioned."""
     make_authority(tmp_path / "pki")
     for name, days in (("soon", 20), ("late", 200)):
@@ -250,15 +220,14 @@ def test_certificates_that_expire_are_named(run_nedbus: Start, tmp_path: Path) -
     files = {"listen_certificate": "soon.crt", "listen_private_key": "soon.key", "root_ca_certificate": "ca.crt"}
     tls = ",\n".join(f'"{name}": "{tmp_path}/pki/{file}"' for name, file in files.items())
     router.write_text(f"{{ transport: {{ link: {{ tls: {{\n{tls} }} }} }} }}\n")
-    lines = check(run_nedbus, settings, router)
+    lines = check(settings, router)
     expires = f"{tmp_path}/pki/soon.crt expires in "
     assert [line.partition(" days")[0][:-2].strip() for line in lines] == [
         f"{settings}, line 3, column 1: {expires}".strip(),
         f"{router}, line 2, column 24: listen_certificate: {expires}".strip(),
     ]
     settings.write_text(settings.read_text().replace("soon", "late"))
-    fine = run_nedbus("check", str(settings))
-    assert fine.wait() == 0, fine.err
+    assert passes("check", settings)
 
 
 def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path: Path) -> None:
@@ -268,6 +237,5 @@ def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path
     settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')
     program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
     checked = start("-c", program, "check", str(settings))
-    assert checked.wait() == 0, checked.err
-    assert checked.out == "nothing is wrong\n"
+    assert (checked.wait(), checked.out) == (0, "nothing is wrong\n"), checked.err
     assert f"{tmp_path}/pki/ca.crt is not checked for when it expires: cryptography: not installed" in checked.err

@@ -2,31 +2,61 @@
 
 from __future__ import annotations
 
+import csv
 import json
-import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 import nedbus
-from nedbus_msgs import ANY, DEFAULT_TOPIC, LAYOUTS, json_schema
-from tests.conftest import DEADLINE, Start, free_endpoint, message, wait_for
+from nedbus.cli import follow
+from nedbus.cli.app import app
+from nedbus.cli.pki import pki
+from nedbus.client import Subscription, connect_with
+from nedbus.settings import Settings
+from nedbus.transport import open_router
+from nedbus_msgs import ANY, LAYOUTS, json_schema
+from tests.command_line import fork_command, run_command
+from tests.messages import VLP, message
+from tests.ports import free_endpoint
+from tests.processes import Process, Start, Zygote, unmeasured
+from tests.waits import DEADLINE, wait_for
 
-VLP = DEFAULT_TOPIC
+COMMANDS = [str(each.name) for each in app.registered_commands]
+COMMANDS += [f"pki {each.name or getattr(each.callback, '__name__', None)}" for each in pki.registered_commands]
 
 
-@pytest.fixture
-def flying(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> str:
-    """Run a service with a simulated vehicle on the test's router."""
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: len(bus.latest(ANY)) == 5, what="five streams")
-    return endpoint
+@pytest.fixture(scope="module")
+def flying(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Run a router with a service and its simulated vehicle, for all tests that only look at it."""
+    endpoint = free_endpoint()
+    router = open_router(listen=(endpoint,))
+    command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, "-s", "sim:")
+    environment = {name: value for name, value in unmeasured().items() if not name.startswith("NEDBUS_")}
+    service = Process(command, tmp_path_factory.mktemp("flying"), environment, zygote)
+    with nedbus.connect(endpoint) as bus:
+        wait_for(lambda: len(bus.latest(ANY)) == 5, what="five streams")
+    yield endpoint
+    service.kill()
+    router.close()
 
 
-def test_list_shows_what_is_published(run_nedbus: Start, flying: str) -> None:
+@pytest.mark.parametrize("fresh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "fresh"])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_command_starts(run_nedbus: Start, command: str, *, fresh: bool) -> None:
+    """Each command is one of a process of its own, and imports all that it needs; most other tests run it in theirs."""
+    shown = run_nedbus(*command.split(), "--help", fresh=fresh)
+    assert shown.wait() == 0, shown.err
+    assert f" nedbus {command} [OPTIONS]" in shown.out
+
+
+@pytest.mark.process
+def test_list_shows_what_is_published(flying: str) -> None:
     """A row for each vehicle and topic: its age, and whether to trust it."""
-    listed = run_nedbus("list", "-c", flying)
-    assert listed.wait() == 0, listed.err
+    listed = run_command("list", "-c", flying)
+    assert listed.exit_code == 0, listed.err
     head, *lines = listed.out.splitlines()
     assert head.split() == ["VEHICLE/TOPIC", "AGE", "STATE"]
     assert [line.split()[0] for line in lines] == [
@@ -37,115 +67,122 @@ def test_list_shows_what_is_published(run_nedbus: Start, flying: str) -> None:
         "1/vehicle_local_position_groundtruth",
     ]
     assert all(line.endswith("ok") for line in lines)
-    machine = run_nedbus("list", "-c", flying, "--json")
-    assert machine.wait() == 0
-    rows = [json.loads(line) for line in machine.out.splitlines()]
+    rows = [json.loads(line) for line in run_command("list", "-c", flying, "--json").out.splitlines()]
     assert [row["instance"] for row in rows] == [0, 1, None, None, None]
     assert all(row["vehicle"] == "1" and row["age"] >= 0 for row in rows)
 
 
-def test_list_of_one_vehicle(run_nedbus: Start, flying: str, bus: nedbus.Bus) -> None:
+def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
     """--vehicle lists one vehicle, also one of which nobody answers, and says when it is not there."""
-    bus.publisher(VLP, vehicle="2").publish(message(1))
+    for vehicle, topic in (("1", VLP), ("1", f"{VLP}_groundtruth"), ("2", VLP)):
+        bus.publisher(topic, vehicle=vehicle).publish(message(1))
     bus.publisher(VLP, vehicle="silent")
-    for vehicle, count in (("1", 5), ("2", 1), ("silent", 1), ("3", 0)):
-        listed = run_nedbus("list", "-c", flying, "--vehicle", vehicle, "--json")
-        assert listed.wait() == 0, listed.err
+    for vehicle, count in (("1", 2), ("2", 1), ("silent", 1), ("3", 0)):
+        listed = run_command("list", "-c", endpoint, "--vehicle", vehicle, "--json")
+        assert listed.exit_code == 0, listed.err
         assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
 
 
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:
-    """Rate, jitter, latency and loss of each stream; the rate of the estimate is near 100 Hz."""
-    hz = run_nedbus("hz", "-c", flying, "--duration", "3")
-    assert hz.wait() == 0, hz.err
-    lines = hz.out.splitlines()
-    assert lines[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"]
-    machine = run_nedbus("hz", "-c", flying, "-d", "2.5", "--json", "-t", VLP)
-    assert machine.wait() == 0
-    rows = [json.loads(line) for line in machine.out.splitlines()]
+    """Rate, jitter, latency and loss of each stream, as a table, JSON or CSV; that of the estimate is near 100 Hz."""
+    table, csv_form = (run_nedbus("hz", "-c", flying, "-t", VLP, *form, measured=False) for form in ([], ["--csv"]))
+    json_form = run_command("hz", "-c", flying, "-d", "2.1", "--json", "-t", VLP)
+    assert json_form.exit_code == 0, json_form.err
+    rows = [json.loads(line) for line in json_form.out.splitlines()]
     assert {row["topic"] for row in rows} == {VLP}
     assert all(
         set(row) >= {"rate", "jitter", "latency", "latency_max", "lost", "flags", "gaps", "reboots"} for row in rows
     )
     assert any(row["rate"] is not None and 20 < row["rate"] < 500 for row in rows)
     assert rows[-1]["lost"] == 0
+    for form in (table, csv_form):
+        wait_for(lambda form=form: form.out.count("1/" if form is table else ",1,") >= 2, what="two seconds")  # type: ignore[misc]
+        form.kill()
+    assert table.out.splitlines()[0].split() == ["VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE"]
+    rows = list(csv.DictReader(csv_form.out.splitlines()))
+    assert {(row["vehicle"], row["topic"]) for row in rows} == {("1", VLP)}
+    assert {row["state"] for row in rows} <= {"ok", "slow"}  # slow on a machine that is busy
+    assert float(rows[-1]["rate"]) > 1
+    assert float(rows[0]["time"]) < float(rows[-1]["time"])
 
 
-def test_get_shows_the_last_message(run_nedbus: Start, flying: str) -> None:
+@pytest.mark.process
+def test_get_shows_the_last_message(flying: str) -> None:
     """All fields of the last message, of vehicle_local_position unless a topic is given; exit 1 when there is none."""
-    got = run_nedbus("get", "-c", flying, "estimator_local_position", "--instance", "1")
-    assert got.wait() == 0, got.err
-    assert got.out.startswith("1/estimator_local_position/1, ")
-    assert "  hagl_max_xy: inf" in got.out
-    machine = run_nedbus("get", "-c", flying, "--json", "*")
-    assert machine.wait() == 0
-    assert len(machine.out.splitlines()) == 5
-    default = run_nedbus("get", "-c", flying, "--json")
-    assert default.wait() == 0
-    assert [json.loads(line)["topic"] for line in default.out.splitlines()] == [VLP]
-    chosen = run_nedbus("get", "-c", flying, "--field", "x,eph")
-    assert chosen.wait() == 0, chosen.err
-    assert [line.split(":")[0] for line in chosen.out.splitlines()[1:]] == ["  x", "  eph", "---"]
-    machine = run_nedbus("get", "-c", flying, "--json", "--field", "x")
-    assert machine.wait() == 0, machine.err
-    assert json.loads(machine.out)["message"].keys() == {"x"}
-    nobody = run_nedbus("get", "-c", flying, "--vehicle", "99")
-    assert nobody.wait() == 1
-    assert f"nothing is published on nedbus/99/{VLP}" in nobody.err
+
+    def get(*arguments: str) -> str:
+        got = run_command("get", "-c", flying, *arguments)
+        assert got.exit_code == 0, got.err
+        return got.out
+
+    estimate = get("estimator_local_position", "--instance", "1")
+    assert estimate.startswith("1/estimator_local_position/1, ")
+    assert "  hagl_max_xy: inf" in estimate
+    assert len(get("--json", "*").splitlines()) == 5
+    assert [json.loads(line)["topic"] for line in get("--json").splitlines()] == [VLP]
+    assert [line.split(":")[0] for line in get("--field", "x,eph").splitlines()[1:]] == ["  x", "  eph", "---"]
+    assert json.loads(get("--json", "--field", "x"))["message"].keys() == {"x"}
+    nothing = run_command("get", "-c", flying, "--vehicle", "99")
+    assert nothing.exit_code == 1
+    assert f"nothing is published on nedbus/99/{VLP}" in nothing.err
 
 
-def test_info_shows_the_services(run_nedbus: Start, flying: str) -> None:
+@pytest.mark.process
+def test_info_shows_the_services(flying: str) -> None:
     """The services, what their sources do, and what was rejected."""
-    info = run_nedbus("info", "-c", flying)
-    assert info.wait() == 0, info.err
-    assert f"router    {flying}" in info.out
-    assert "vehicles  1" in info.out
-    assert "SOURCE" in info.out
-    assert "running" in info.out
-    machine = run_nedbus("info", "-c", flying, "--json")
-    assert machine.wait() == 0
+    info = run_command("info", "-c", flying)
+    assert info.exit_code == 0, info.err
+    assert all(text in info.out for text in (f"router    {flying}", "vehicles  1", "SOURCE", "running"))
+    machine = run_command("info", "-c", flying, "--json")
     assert json.loads(machine.out)["sources"][0]["source"] == "sim:"
 
 
-def test_schema_needs_no_network(run_nedbus: Start) -> None:
+def test_schema_needs_no_network() -> None:
     """The JSON Schema, and the layouts, as JSON."""
-    schema = run_nedbus("schema")
-    assert schema.wait() == 0
-    assert json.loads(schema.out) == json_schema()
-    layouts = run_nedbus("schema", "--layouts")
-    assert layouts.wait() == 0
-    assert [layout["name"] for layout in json.loads(layouts.out)] == list(LAYOUTS)
+    assert json.loads(run_command("schema").out) == json_schema()
+    assert [layout["name"] for layout in json.loads(run_command("schema", "--layouts").out)] == list(LAYOUTS)
 
 
-def test_no_data_yet_is_reported(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_no_data_yet_is_reported(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a router but no vehicle: list says so, echo says so and waits."""
-    listed = run_nedbus("list", "-c", endpoint)
-    assert listed.wait() == 0
-    assert (listed.out, "no vehicle is published" in listed.err) == ("", True)
-    echo = run_nedbus("echo", "-c", endpoint, "-n", "1")
-    wait_for(lambda: "yet, waiting" in echo.err, what="echo to report that nothing is there")
-    bus.publisher(VLP, vehicle="7").publish(message(5, x=1.0))
-    assert echo.wait() == 0
+    listed = run_command("list", "-c", endpoint)
+    assert (listed.exit_code, listed.out, "no vehicle is published" in listed.err) == (0, "", True)
+    notice = follow.write_notice
+
+    def publish_after_notice(subscription: Subscription) -> None:
+        notice(subscription)
+        bus.publisher(VLP, vehicle="7").publish(message(5, x=1.0))
+
+    monkeypatch.setattr(follow, "write_notice", publish_after_notice)
+    monkeypatch.setattr(follow, "_NOTICE", 0.1)
+    echo = run_command("echo", "-c", endpoint, "-n", "1")
+    assert echo.exit_code == 0
+    assert echo.err.count("yet, waiting") == 1
     assert echo.out.startswith("7/vehicle_local_position ")
 
 
 @pytest.mark.parametrize(("command", "key_expr"), [("echo", f"nedbus/*/{VLP}"), ("hz", "nedbus/*/**")])
-def test_duration_without_data_fails(run_nedbus: Start, endpoint: str, command: str, key_expr: str) -> None:
+def test_duration_without_data_fails(endpoint: str, command: str, key_expr: str) -> None:
     """A script that follows for a while learns from the exit code that nothing came."""
-    watch = run_nedbus(command, "-c", endpoint, "--duration", "0.3")
-    assert watch.wait() == 1
-    assert f"nothing arrived on {key_expr} within 0.3 s" in watch.err
+    watch = run_command(command, "-c", endpoint, "--duration", "0.1")
+    assert watch.exit_code == 1
+    assert f"nothing arrived on {key_expr} within 0.1 s" in watch.err
 
 
 @pytest.mark.parametrize("command", ["list", "echo", "hz", "get", "info"])
-def test_no_router_is_one_clear_line(run_nedbus: Start, command: str) -> None:
+def test_no_router_is_one_clear_line(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit 1, one line: where, for how long, what to do; a traceback only with --debug."""
+
+    def connect_soon(settings: Settings, *, timeout: float) -> nedbus.Bus:
+        return connect_with(settings, timeout=timeout / 10)
+
+    monkeypatch.setattr("nedbus.cli.options.connect_with", connect_soon)
     where = free_endpoint()
-    process = run_nedbus(command, "-c", where)
-    assert process.wait() == 1
-    assert process.err.startswith(f"nedbus: nothing answers at {where}")
-    assert len(process.err.splitlines()) == 1
+    ended = run_command(command, "-c", where)
+    assert ended.exit_code == 1
+    assert ended.err.startswith(f"nedbus: nothing answers at {where} (tried for 0.1 s): start 'nedbus serve'")
+    assert len(ended.err.splitlines()) == 1
 
 
 def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
@@ -163,48 +200,41 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
     [
         (["echo", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["echo", "vehicle_local_positon"], "topic 'vehicle_local_positon' is not valid: expected one of"),
+        (["echo", "--field", "xy_vallid"], "--field: there is no field 'xy_vallid': did you mean xy_valid"),
+        (["echo", "--field", "qqq"], "--field: there is no field 'qqq': 'nedbus schema' lists them"),
+        (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
+        (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),
         (["get", "--field", "xx"], "--field: there is no field 'xx'"),
         (["list", "--vehicle", "a/b"], "vehicle 'a/b' is not valid: expected 1 to 64 of"),
         (["get", "-t", VLP, "-i", "0"], "instance 0 is not valid: expected none"),
         (["list", "--connect", "nonsense"], "connect: 'nonsense' is not an endpoint"),
+        (["echo", "--wait", "--connect", "tcp/127.0.0.1:1", "--max-rate", "nan"], "max_rate: nan is invalid"),
     ],
 )
-def test_invalid_name_is_a_usage_error(run_nedbus: Start, endpoint: str, arguments: list[str], text: str) -> None:
-    """Exit 2, one line with what is expected."""
-    process = run_nedbus(*arguments, NEDBUS_CONNECT=endpoint)
-    assert process.wait() == 2
-    assert text in process.err
-    assert len(process.err.splitlines()) == 1
-
-
-def test_unknown_flag_is_a_usage_error(run_nedbus: Start) -> None:
-    """Exit 2."""
-    assert run_nedbus("list", "--no-such-flag").wait() == 2
-
-
-def test_debug_shows_a_traceback(run_nedbus: Start) -> None:
-    """Only --debug shows where an error came from."""
-    process = run_nedbus("--debug", "list", "-c", free_endpoint())
-    assert process.wait() == 1
-    assert "Traceback" in process.err
+def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], text: str) -> None:
+    """Exit 2, one line with what is expected, or what to write instead."""
+    ended = run_command(*arguments, NEDBUS_CONNECT=endpoint)
+    assert ended.exit_code == 2
+    assert text in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert run_command(*arguments, "--no-such-flag").exit_code == 2
 
 
 def test_version_and_help(run_nedbus: Start) -> None:
-    """--version is the package's; help names every command."""
+    """--version is the package's, before anything is imported and after; help names every command."""
     version = run_nedbus("--version")
     assert version.wait() == 0
-    assert version.out == f"nedbus {nedbus.__version__}\n"
-    overview = run_nedbus("--help")
-    assert overview.wait() == 0
-    for command in ("serve", "router", "list", "echo", "hz", "get", "info", "schema"):
-        assert f" {command} " in overview.out
+    assert version.out == run_command("--version").out == f"nedbus {nedbus.__version__}\n"
+    overview = run_command("--help")
+    assert overview.exit_code == 0
+    assert all(f" {command.split()[0]} " in overview.out for command in COMMANDS)
 
 
 @pytest.mark.process
-def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus) -> None:
+def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus, zygote: Zygote) -> None:
     """An output that cannot be written is an error, not a traceback."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    wait_for(bus.latest, what="the message")
-    command = f"{sys.executable} -m nedbus get -c {endpoint} > /dev/full"
-    ended = subprocess.run(["bash", "-c", command], capture_output=True, timeout=DEADLINE, check=False, text=True)
-    assert (ended.returncode, ended.stderr) == (1, "nedbus: cannot write: no space left on device\n")
+    with Path("/dev/full").open("wb") as full, Path("err").open("wb") as err:
+        ended = fork_command(zygote, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
+    assert ended.wait(DEADLINE) == 1
+    assert Path("err").read_text() == "nedbus: cannot write: no space left on device\n"

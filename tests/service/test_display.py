@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import os
-import pty
 import re
 import signal
-import subprocess
-import sys
-import threading
-from functools import partial
 from pathlib import Path
 
 import pytest
 
 from nedbus.cli.progress import what_to_type
 from nedbus.transport import DEFAULT_ENDPOINT
-from tests.conftest import DEADLINE, Start, free_endpoint, free_port, wait_for
+from tests.command_line import run_command
+from tests.ports import free_endpoint, free_port
+from tests.processes import Start
 from tests.ulogs import write_log
+from tests.waits import wait_for
+
+from .test_terminal import OnTerminal, on_terminal
+
+__all__ = ["on_terminal"]  # a fixture
 
 
 def test_hint_needs_no_flag_that_it_lacks() -> None:
@@ -38,50 +40,24 @@ def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
     assert here == f"tcp/127.0.0.1:{port}"
     assert not re.search(r"/(0\.0\.0\.0|127\.|localhost)", elsewhere)
     for endpoint in (here, elsewhere):
-        listed = run_nedbus("get", "--wait", "-c", endpoint)
-        assert listed.wait() == 0, listed.err
+        listed = run_command("get", "--wait", "-c", endpoint)
+        assert listed.exit_code == 0, listed.err
     assert " list  what" in what_to_type(["tcp/0.0.0.0:7447"])
     assert re.search(r"^  nedbus list -c tcp/\S+:7448$", what_to_type(["tcp/[::]:7448"]).splitlines()[-1])
     assert "On another host" not in what_to_type(["tcp/192.0.2.1:7447"])
 
 
 @pytest.mark.process
-def test_terminal_shows_progress_and_what_to_type(tmp_path: Path) -> None:
+def test_terminal_shows_progress_and_what_to_type(tmp_path: Path, on_terminal: OnTerminal) -> None:
     """A bar for each source with its state and numbers, what went wrong, and the next commands with their endpoint."""
     path = write_log(tmp_path / "flight.ulg", range(0, 2_000_000, 10_000))
     endpoint = free_endpoint()
-    sources = [f"--source=ulog:{path}", "--source=sim:?vehicle=2", "--source=ulog:/nowhere.ulg"]
-    main, terminal = pty.openpty()
-    command = [sys.executable, "-m", "nedbus", "serve", "-l", endpoint, *sources]
-    environment = {**os.environ, "COLUMNS": "200", "TERM": "xterm"}
-    service = subprocess.Popen(command, stderr=terminal, stdin=subprocess.DEVNULL, env=environment)
-    os.close(terminal)
-    shown = bytearray()
-
-    def read() -> None:
-        try:
-            while chunk := os.read(main, 4096):
-                shown.extend(chunk)
-        except OSError:  # the other side is closed
-            pass
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    try:
-        for text in (
-            f"nedbus list -c {endpoint}",
-            "running",
-            "retrying",
-            "no such file",
-            "200 of 200 messages",
-            "done",
-        ):
-            wait_for(partial(shown.__contains__, text.encode()), what=text)
-        service.send_signal(signal.SIGTERM)
-        assert service.wait(DEADLINE) == 0
-    finally:
-        service.kill()
-        service.wait(DEADLINE)
-        reader.join(DEADLINE)
-        os.close(main)
-    assert b"Traceback" not in shown
+    sources = [f"--source=ulog:{path}?speed=10", "--source=sim:?vehicle=2", "--source=ulog:/nowhere.ulg"]
+    measured = {**os.environ, "COLUMNS": "200"}
+    with on_terminal("serve", "-l", endpoint, *sources, **measured) as terminal:
+        told = (f"nedbus list -c {endpoint}", "running", "retrying", "no such file", "200 of 200 messages", "done")
+        for text in told:
+            wait_for(lambda text=text: text in terminal.shown, what=text)  # type: ignore[misc]
+        terminal.popen.send_signal(signal.SIGTERM)
+        assert terminal.wait() == 0
+    assert "Traceback" not in terminal.shown

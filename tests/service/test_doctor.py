@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import math
 import re
 import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 import zenoh
@@ -22,30 +25,32 @@ import nedbus
 from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
 from nedbus.settings import load_settings
-from nedbus.transport import (
-    NO_HASH,
-    Certificate,
-    Session,
-    TopicKey,
-    make_authority,
-    make_certificate,
-    open_router,
-    publisher_token,
-)
+from nedbus.transport import NO_HASH, Certificate, Session, TopicKey, open_client, open_router, publisher_token
 from nedbus_msgs import ROS2_TYPE, dds_type, encode, status_key
-from tests.conftest import DEADLINE, Start, free_endpoint, free_port, message, repeating, wait_for
+from tests.certificates import files_of, pki, secure_endpoint, tls_of, write_config
+from tests.command_line import run_command
+from tests.messages import VLP, message
+from tests.ports import free_endpoint, free_port
+from tests.processes import Start
+from tests.waits import DEADLINE, repeating, wait_for
 
-CONFIG = Path(__file__).parents[2] / "config"
-VLP = "vehicle_local_position"
+__all__ = ["pki"]
+
 HOUR = 3600.0
 
 
-def look(
-    endpoint: str, tls: dict[str, Path] | None = None, *, vehicle: str | None = None, mavlink: str | None = None
-) -> list[Finding]:
-    """Examine with these settings; for a shorter time than a person would."""
-    settings = load_settings(None, connect=(endpoint,), **(tls or {}))
-    return examine(settings, version=nedbus.__version__, vehicle=vehicle, mavlink=mavlink, listen=1.0)
+@pytest.fixture(autouse=True)
+def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Listen for a shorter time than a person would: `look` says how long."""
+    monkeypatch.setattr("nedbus.doctor.observation._LEAST", 0.1)
+    monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", 0.1)
+    monkeypatch.setattr("nedbus.cli.doctor.examine", partial(examine, listen=0.5))
+
+
+def look(*endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any) -> list[Finding]:
+    """Examine with these settings. `listen`: longer where something has to arrive; answers are there before."""
+    settings = load_settings(None, connect=endpoints, **(tls or {}))
+    return examine(settings, version=nedbus.__version__, listen=listen, **options)
 
 
 def found(findings: list[Finding], check: str, state: State, text: str) -> Finding:
@@ -61,18 +66,23 @@ def is_well(findings: list[Finding]) -> bool:
 
 
 @contextmanager
-def flying(bus: nedbus.Bus, vehicle: str = "1") -> Iterator[None]:
-    """Publish a vehicle."""
-    with (
-        bus.publisher(VLP, vehicle=vehicle) as publisher,
-        repeating(lambda: publisher.publish(message(time.time_ns()))),
-    ):
+def flying(bus: nedbus.Bus, *vehicles: str) -> Iterator[None]:
+    """Publish these vehicles, or vehicle 1."""
+    publishers = [bus.publisher(VLP, vehicle=each) for each in vehicles or "1"]
+
+    def publish() -> None:
+        for publisher in publishers:
+            publisher.publish(message(time.time_ns()))
+
+    with repeating(publish):
         yield
+    for publisher in publishers:
+        publisher.close()
 
 
 @contextmanager
 def reporting(session: Session, name: str = "imitation", *, offset: float = 0.0, **status: object) -> Iterator[None]:
-    """Answer as a service with this status does, whose clock is ahead by so many seconds."""
+    """Answer as a service with this status does, whose clock is ahead by this many seconds."""
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
     server.answer_json(status_key(name), lambda: {"now": time.time() + offset, **known, **status})
@@ -84,109 +94,94 @@ def source(**fields: object) -> dict[str, object]:
     return {"source": "mavlink:x", "state": "running", "addresses": [], "stale": [], "rejected": 0, **fields}
 
 
-# The way to the router.
-
-
-def test_nothing_listens() -> None:
-    """A refused connection is told from a name without address."""
-    advice = found(look(free_endpoint()), "endpoint", "wrong", "nothing listens there").advice
-    assert "nedbus serve" in advice
-    found(look("tcp/no-such-host.invalid:7447"), "endpoint", "wrong", "has no address|no name server answers")
-    found(look("tcp/a..b:7447"), "endpoint", "wrong", r"a\.\.b has no address")
-
-
-def test_http_server_in_place_of_a_router() -> None:
-    """It is told from a router, and from TLS."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    port = server.server_address[1]
-    for protocol in ("tcp", "tls"):
-        found(look(f"{protocol}/127.0.0.1:{port}"), "endpoint", "wrong", "an HTTP server answers there")
-    server.shutdown()
-    thread.join(DEADLINE)
-    server.server_close()
-
-
-def test_listener_that_says_nothing() -> None:
-    """Whoever accepts and never answers does not hold up the doctor."""
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        port = silent.getsockname()[1]
-        found(look(f"tcp/127.0.0.1:{port}"), "endpoint", "wrong", "says nothing")
-        found(look(f"tls/127.0.0.1:{port}"), "endpoint", "wrong", "does not speak TLS")
-
-
-def test_one_of_two_routers_answers(endpoint: str) -> None:
-    """The other one is worth a warning only, as the first that answers is joined."""
-    settings = load_settings(connect=(free_endpoint(), endpoint))
-    findings = examine(settings, version="0", listen=1.0)
+def test_nothing_listens(endpoint: str) -> None:
+    """A refused connection is told from a name without address; where another router answers it is a warning only."""
+    refused = free_endpoint()
+    findings = look(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
+    assert "nedbus serve" in found(findings, "endpoint", "wrong", f"{refused}: nothing listens there").advice
+    found(findings, "endpoint", "wrong", "no-such-host.*(has no address|no name server answers)")
+    found(findings, "endpoint", "wrong", r"a\.\.b has no address")
+    findings = look(refused, endpoint)
     found(findings, "endpoint", "warning", "nothing listens")
     found(findings, "endpoint", "ok", "a Zenoh router answers")
 
 
-# What is behind it.
+def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An HTTP server is told from a router and from TLS; whoever never answers does not hold up the doctor."""
+    for name in ("doctor.endpoint._OPEN", "doctor.handshake._TIMEOUT", "doctor.speaker._TIMEOUT"):
+        monkeypatch.setattr(f"nedbus.{name}", 0.2)
+    monkeypatch.setattr("nedbus.transport.full_router._PATIENCE", 0.2)
+    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=[0.01])
+        thread.start()
+        http = f"127.0.0.1:{server.server_address[1]}"
+        with socket.create_server(("127.0.0.1", 0)) as silent:
+            mute = f"127.0.0.1:{silent.getsockname()[1]}"
+            findings = look(*(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute)))
+        server.shutdown()
+        thread.join(DEADLINE)
+    for protocol, of_mute in (("tcp", "says nothing"), ("tls", "does not speak TLS")):
+        found(findings, "endpoint", "wrong", f"{protocol}/{http}: an HTTP server answers there")
+        found(findings, "endpoint", "wrong", f"{protocol}/{mute}.*{of_mute}")
 
 
 def test_all_is_well(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
     """A vehicle that flies is no reason to complain: nothing is wrong, and each check says so."""
     with flying(bus), reporting(raw, sources=[source(addresses=[f"1/{VLP}"])]):
-        findings = look(endpoint, vehicle="1")
+        findings = look(endpoint, vehicle="1", listen=1.0)
     assert is_well(findings), findings
     for check in ("settings", "endpoint", "router", "read", "write", "service", "vehicle", "clock"):
         assert any(each.check == check and each.state == "ok" for each in findings), check
 
 
 def test_silent_vehicle(bus: nedbus.Bus, endpoint: str) -> None:
-    """Who has a token and sends nothing is found, with the age of the last message."""
+    """Who has a token and sends nothing is found, with the age of the last message; who is asked for must be there."""
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
     findings = look(endpoint)
-    found(findings, "vehicle", "wrong", "mute/.*silent for 1 s: it has sent nothing yet")
-    found(findings, "vehicle", "wrong", r"asleep/.*silent for 1 s: its last message is \S+ s old")
-
-
-def test_vehicle_that_is_not_there(bus: nedbus.Bus, endpoint: str) -> None:
-    """A vehicle that is asked for by name must be there."""
-    with flying(bus):
-        found(look(endpoint, vehicle="7"), "vehicle", "wrong", "7: it is not seen under nedbus/")
+    found(findings, "vehicle", "wrong", r"mute/.*silent for \d+ s: it has sent nothing yet")
+    found(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ s old")
+    found(look(endpoint, vehicle="7"), "vehicle", "wrong", "7: it is not seen under nedbus/")
 
 
 def test_two_publishers_of_one_address(bus: nedbus.Bus, endpoint: str) -> None:
-    """Tokens of two publishers are one token: they are told apart by who they are."""
-    with nedbus.connect(endpoint) as other, flying(bus), flying(other):
-        found(look(endpoint), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
-
-
-def test_two_publishers_at_rest(bus: nedbus.Bus, endpoint: str) -> None:
-    """They send nothing while the doctor listens but heartbeats, each its own."""
+    """Their tokens are one token: they are told apart by who they are, at rest by the heartbeats of each."""
     with nedbus.connect(endpoint) as other:
+        with flying(bus), flying(other):
+            found(look(endpoint, listen=0.5), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
         for each in (bus, other):
             each.publisher(VLP, vehicle="1").publish(message(1))
-        found(look(endpoint), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
+        found(look(endpoint, listen=1.0), "vehicle", "wrong", f"1/{VLP}: 2 publishers")
 
 
 def test_payload_that_is_no_message(raw: Session, endpoint: str) -> None:
     """It is found, with the decoder's reason; another layout is named as such."""
-    with repeating(lambda: raw.put(f"nedbus/1/{VLP}", b"junk")):
-        found(look(endpoint), "vehicle", "wrong", f"1/{VLP}: a payload that cannot be decoded")
-    newer = b"\x92\x63\x01"  # an array: layout 99, and one value
-    with repeating(lambda: raw.put(f"nedbus/1/{VLP}", newer)):
-        found(look(endpoint), "vehicle", "wrong", "cannot be decoded: .*layout 99")
+
+    def publish() -> None:
+        raw.put(f"nedbus/1/{VLP}", b"junk")
+        raw.put(f"nedbus/2/{VLP}", b"\x92\x63\x01")  # an array: layout 99, and one value
+
+    with repeating(publish):
+        findings = look(endpoint, listen=0.5)
+    found(findings, "vehicle", "wrong", f"1/{VLP}: a payload that cannot be decoded")
+    found(findings, "vehicle", "wrong", f"2/{VLP}: .*cannot be decoded: .*layout 99")
 
 
-def test_service_whose_clock_is_off(raw: Session, endpoint: str) -> None:
-    """Of two clocks nobody can tell which is right; of three the one that is alone is not."""
-    with reporting(raw, "ahead", offset=HOUR):
-        finding = found(look(endpoint), "clock", "wrong", "service ahead on elsewhere: .* 60 min ahead of this host's")
-        assert "cannot be told" in finding.advice
-        with reporting(raw, "right"):
-            assert "set its clock" in found(look(endpoint), "clock", "wrong", "service ahead").advice
-
-
-def test_clock_of_this_host_is_off(raw: Session, endpoint: str) -> None:
-    """Where all others agree with each other it is this one."""
-    with reporting(raw, "first", offset=-HOUR), reporting(raw, "second", offset=-HOUR):
-        found(look(endpoint), "clock", "wrong", r"this host's clock is 60 min ahead of 2 others")
+@pytest.mark.parametrize(
+    ("clocks", "text", "advice"),
+    [
+        ({"ahead": HOUR}, "service ahead on elsewhere: .* 60 min ahead of this host's", "cannot be told"),
+        ({"ahead": HOUR, "right": 0.0}, "service ahead", "set its clock"),
+        ({"first": -HOUR, "second": -HOUR}, "this host's clock is 60 min ahead of 2 others", "run NTP"),
+    ],
+    ids=["of a service", "of one service", "of this host"],
+)
+def test_clock_that_is_off(raw: Session, endpoint: str, clocks: Mapping[str, float], text: str, advice: str) -> None:
+    """Of two clocks nobody can tell which is right; of three the one that is alone is not, this host's perhaps."""
+    with ExitStack() as services:
+        for name, offset in clocks.items():
+            services.enter_context(reporting(raw, name, offset=offset))
+        assert advice in found(look(endpoint), "clock", "wrong", text).advice
 
 
 def test_publisher_whose_clock_is_off(raw: Session, endpoint: str) -> None:
@@ -198,15 +193,16 @@ def test_publisher_whose_clock_is_off(raw: Session, endpoint: str) -> None:
         raw.put(f"nedbus/1/{VLP}", payload, timestamp=zenoh.Timestamp(later, b"\x07"))
 
     with repeating(publish):
-        found(look(endpoint), "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
+        findings = look(endpoint, listen=0.5)
+    found(findings, "clock", "wrong", f"publisher of 1/{VLP}: its clock is 60 min ahead of this host's")
 
 
 def test_what_services_report(raw: Session, endpoint: str) -> None:
-    """Sources that fail, wait, lost their vehicle or reject messages are found, and another version is."""
+    """Sources that fail, wait, lost their vehicle or reject messages are found, the worst of many, and a version is."""
     sources = [
         source(state="failed", error="the disk is gone"),
-        source(source="px4-zenoh:", state="waiting"),
         source(stale=["9/x"], rejected=7, rejections={"xy_valid": 7}),
+        source(source="px4-zenoh:", state="waiting"),
     ]
     with reporting(raw, version="99.1.0", sources=sources):
         findings = look(endpoint)
@@ -215,9 +211,13 @@ def test_what_services_report(raw: Session, endpoint: str) -> None:
     found(findings, "source", "warning", "nothing arrives any more of 9/x")
     found(findings, "source", "warning", "7 messages were rejected: xy_valid")
     found(findings, "version", "warning", r"it is nedbus 99\.1\.0, this is")
+    with reporting(raw, sources=[*sources, *50 * [source(state="waiting")]]):
+        findings = look(endpoint)
+    found(findings, "source", "warning", "more of the same kind")
+    found(findings, "source", "wrong", "the disk is gone")
 
 
-@pytest.mark.parametrize("now", [10**400, float("nan"), float("-inf"), True, "noon", None, []])
+@pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])
 def test_status_that_makes_no_sense(raw: Session, endpoint: str, now: object) -> None:
     """A peer may answer anything: what can be understood of it is said, and no other check is lost."""
     states: list[object] = [[], {}, 7, None]
@@ -235,7 +235,7 @@ def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
     with nedbus.connect(endpoint, prefix="other/fleet") as other, flying(other):
         payload = encode(message(1))
         with repeating(lambda: raw.put(f"third/1/{VLP}", payload)):
-            findings = look(endpoint)
+            findings = look(endpoint, listen=0.5)
         found(findings, "prefix", "warning", "other/fleet: .*under nedbus/")
         found(findings, "prefix", "warning", "third: .*under nedbus/")
         found(findings, "ros2", "warning", f"publishes /fmu/out/{VLP}, and no service bridges it")
@@ -245,65 +245,46 @@ def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
 
 
 def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
-    """The report of a real service, a real process each: exit codes, words for people, JSON for programs."""
+    """What the service of another process reports: in words for people, in JSON for programs, exit code 1."""
     endpoint = free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", "-s", "ulog:nowhere.ulg")
     wait_for(lambda: "no such file" in service.err, what="the source that fails")
-    doctor = run_nedbus("doctor", "-c", endpoint)
-    assert doctor.wait() == 1, doctor.err
+    doctor = run_command("doctor", "-c", endpoint)
+    assert doctor.exit_code == 1, doctor.err
     words = " ".join(doctor.out.split())
     assert "wrong source ulog:nowhere.ulg: retrying: nowhere.ulg: no such file or directory" in words
     assert max(map(len, doctor.out.splitlines())) <= 80
     assert doctor.out.splitlines()[-1].endswith("1 wrong")
-    told = run_nedbus("doctor", "-c", endpoint, "--json")
-    assert told.wait() == 1
+    told = run_command("doctor", "-c", endpoint, "--json")
+    assert told.exit_code == 1
     report = json.loads(told.out)
     assert report["state"] == report["findings"][-1]["state"] == "wrong"
     assert set(report["findings"][0]) == {"check", "subject", "state", "seen", "advice"}
 
 
-def test_exit_codes(bus: nedbus.Bus, endpoint: str, run_nedbus: Start) -> None:
-    """0 when nothing is wrong, 2 for usage."""
-    with flying(bus):
-        doctor = run_nedbus("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
-        assert doctor.wait() == 0, doctor.out
+def test_exit_codes(bus: nedbus.Bus, endpoint: str, raw: Session, run_nedbus: Start) -> None:
+    """0 when nothing is wrong, though it may warn; 2 for usage."""
+    with flying(bus), reporting(raw, sources=[source(state="waiting")]):
+        doctor = run_command("doctor", "-v", "1", NEDBUS_CONNECT=endpoint)
+    assert (doctor.exit_code, doctor.out.splitlines()[-1].rpartition(", ")[2]) == (0, "1 warning"), doctor.out
     assert "set by NEDBUS_CONNECT" in " ".join(doctor.out.split())
-    for arguments in (["-v", "a/b"], ["-c", "nonsense"], ["--mavlink", "nonsense"], ["--config", "gone.toml"]):
-        refused = run_nedbus("doctor", *arguments)
-        assert refused.wait() == 2, refused.err
-        assert refused.err.count("\n") == 1
+    for arguments in (["-v", "a/b"], ["--mavlink", "nonsense"], ["--config", "gone.toml"]):
+        refused = run_command("doctor", *arguments)
+        assert (refused.exit_code, refused.err.count("\n")) == (2, 1), refused.err
+    process = run_nedbus("doctor", "-c", "nonsense")
+    assert (process.wait(), process.err.count("\n")) == (2, 1), process.err
 
 
-def test_what_peers_send_is_harmless(raw: Session, endpoint: str, run_nedbus: Start) -> None:
+def test_what_peers_send_is_harmless(raw: Session, endpoint: str) -> None:
     """Nothing acts on a terminal, adds a line of its own, or fills the screen."""
     evil = "\x1b[2J\nok all is well " + 1_000 * "x"
     with reporting(raw, sources=[source(source=evil, state="failed", error=evil)] * 50, host=evil, version=evil):
-        doctor = run_nedbus("doctor", "-c", endpoint)
-        assert doctor.wait() == 1
+        doctor = run_command("doctor", "-c", endpoint)
+    assert doctor.exit_code == 1
     assert "\x1b" not in doctor.out
     assert not [line for line in doctor.out.splitlines() if line.startswith("ok all")]
     assert len(doctor.out) < 20_000
     assert "more of the same kind" in doctor.out
-
-
-# With certificates.
-
-
-@pytest.fixture(scope="module")
-def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make the certificates of a small fleet, and some that are wrong."""
-    folder = tmp_path_factory.mktemp("pki")
-    make_authority(folder)
-    make_certificate(folder, "router", hosts=["127.0.0.1"])
-    make_certificate(folder, "router-expired", hosts=["127.0.0.1"], days=-1)
-    make_certificate(folder, "router-soon", hosts=["127.0.0.1"], days=10)
-    make_certificate(folder, "router-elsewhere", hosts=["gcs.local", "10.0.0.7"])
-    for name in ("vehicle-1", "reader"):
-        make_certificate(folder, name)
-    make_certificate(folder, "expired", days=-1)
-    make_authority(folder / "foreign")
-    make_certificate(folder / "foreign", "reader")
-    return folder
 
 
 Run = Callable[..., str]
@@ -312,145 +293,124 @@ Run = Callable[..., str]
 @pytest.fixture
 def run_router(pki: Path, tmp_path: Path) -> Iterator[Run]:
     """Run routers on the shipped configuration, with another certificate or other text in places."""
-    sessions: list[Session] = []
+    with ExitStack() as routers:
 
-    def run(certificate: str = "router", **replaced: str) -> str:
-        endpoint = free_endpoint().replace("tcp/", "tls/")
-        text = (CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(pki))
-        text = text.replace("/router.", f"/{certificate}.").replace("tls/0.0.0.0:7447", endpoint)
-        for old, new in replaced.items():
-            text = text.replace(old, new)
-        file = tmp_path / f"{len(sessions)}.json5"
-        file.write_text(text)
-        sessions.append(open_router(config_file=file))
-        return endpoint
+        def run(certificate: str = "router", **replaced: str) -> str:
+            endpoint, name = secure_endpoint(), tmp_path / "router-secure.json5"
+            file = write_config(pki, name, endpoint, **{"/router.": f"/{certificate}.", **replaced})
+            routers.enter_context(open_router(config_file=file))
+            return endpoint
 
-    yield run
-    for session in sessions:
-        session.close()
-
-
-def files(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
-    own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
-    return {"tls_ca": pki / ca, **own}
+        yield run
 
 
 def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
     """Whose, for which names, by whom, until when: of the router, of this client, of the authority."""
-    findings = look(run_router(), files(pki, "reader"))
+    findings = look(run_router(), run_router("router-soon"), tls=files_of(pki, "reader"))
     assert is_well(findings), findings
-    found(findings, "tls", "ok", r"the router shows router for 127\.0\.0\.1, issued by nedbus CA, valid until 20\d\d-")
+    router = r"the router shows router for 127\.0\.0\.1, localhost, issued by nedbus CA, valid until 20\d\d-"
+    found(findings, "tls", "ok", router)
+    found(findings, "tls", "warning", r"the router shows router-soon.*\d+ days from now")
     found(findings, "certificate", "ok", "this client is reader, issued by nedbus CA")
     found(findings, "certificate", "ok", "the authority is nedbus CA")
-    found(look(run_router("router-soon"), files(pki, "reader")), "tls", "warning", r"router-soon.*\d+ days from now")
 
 
 @pytest.mark.parametrize(
-    ("router", "name", "ca", "check", "text"),
+    ("case", "told"),
     [
-        ("router-expired", "reader", "ca.crt", "tls", "the router shows router-expired, which has expired"),
-        ("router-elsewhere", "reader", "ca.crt", "tls", r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"),
-        ("router", "reader", "foreign/ca.crt", "tls", "is not signed by the authority in .*, but by nedbus CA"),
-        ("router", None, "ca.crt", "tls", "it wants a certificate of this client, and none is given"),
-        ("router", "expired", "ca.crt", "certificate", "this client is expired, which has expired"),
-        ("router", "expired", "ca.crt", "tls", "the router refuses: .*expired"),
-        ("router", "foreign/reader", "ca.crt", "certificate", "is not signed by the authority in tls_ca"),
-        ("router", "foreign/reader", "ca.crt", "tls", "the router refuses: "),
+        (("router-expired", "reader", "ca.crt"), {"tls": "the router shows router-expired, which has expired"}),
+        (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
+        (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the authority in .*, but by nedbus CA"}),
+        (("router", None, "ca.crt"), {"tls": "it wants a certificate of this client, and none is given"}),
+        (("router", "expired", "ca.crt"), {"certificate": "which has expired", "tls": "the router refuses: .*expired"}),
+        (("router", "foreign/reader", "ca.crt"), {"certificate": "not signed by .*tls_ca", "tls": "router refuses: "}),
     ],
 )
 def test_certificate_that_is_wrong(
-    run_router: Run, pki: Path, *, router: str, name: str | None, ca: str, check: str, text: str
+    run_router: Run, pki: Path, monkeypatch: pytest.MonkeyPatch, case: tuple[str, str | None, str], told: dict[str, str]
 ) -> None:
     """The reason is told, which Zenoh never does, and the router's certificate is shown though no session opens."""
-    findings = look(run_router(router), files(pki, name, ca))
-    found(findings, check, "wrong", text)
+    router, name, ca = case
+    if name != "reader":  # it is rejected, perhaps slowly
+        monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", DEADLINE)
+    findings = look(run_router(router), tls=files_of(pki, name, ca))
+    for check, text in told.items():
+        found(findings, check, "wrong", text)
     assert any("the router shows" in each.seen for each in findings)
 
 
-def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str) -> None:
+def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """TLS where there is none, none where there is, no authority at all, and a key of another certificate."""
+    monkeypatch.setattr("nedbus.doctor.endpoint._OPEN", 0.1)
     secure = run_router()
-    found(look(secure.replace("tls/", "tcp/")), "endpoint", "wrong", "it speaks TLS")
-    found(look(endpoint.replace("tcp/", "tls/")), "endpoint", "wrong", "a Zenoh router answers there, without TLS")
-    found(look(secure), "tls", "wrong", "no authority is given")
-    swapped = {**files(pki, "reader"), "tls_key": pki / "vehicle-1.key"}
-    found(look(secure, swapped), "certificate", "wrong", "is not the key of")
-    found(look(secure, {"tls_ca": pki / "gone.crt"}), "certificate", "wrong", "cannot be read")
-    found(look(secure, {"tls_certificate": pki / "reader.crt"}), "certificate", "wrong", "not the authority to trust")
-
-
-def test_write_permission_is_probed(run_router: Run, pki: Path) -> None:
-    """A vehicle's own certificate may write it and no other, a reader's none; where that cannot be told, it says so."""
-    endpoint = run_router()
-    expected: list[tuple[str, str, State, str]] = [
-        ("vehicle-1", "1", "ok", "a probe came back"),
-        ("vehicle-1", "2", "warning", "the router drops what this client publishes as vehicle 2, without an error"),
-        ("reader", "1", "warning", "the router drops"),
-    ]
-    for name, vehicle, state, text in expected:
-        found(look(endpoint, files(pki, name), vehicle=vehicle), "write", state, text)
-    own = look(endpoint, files(pki, "vehicle-1"), vehicle="1")
-    assert is_well(own), own  # it cannot read, which is as it should be
-    older = run_router(**{"@doctor": "@probe"})  # rules that know nothing of probes
-    found(look(older, files(pki, "vehicle-1"), vehicle="1"), "write", "unknown", "cannot be told")
-
-
-def test_reader_that_looks_at_a_vehicle(run_router: Run, pki: Path, run_nedbus: Start) -> None:
-    """A vehicle that flies is well for a reader and for itself; another vehicle may neither read nor write it."""
-    endpoint = run_router()
-
-    def flags(name: str) -> list[str]:
-        return ["-c", endpoint, *(f"--{key.replace('_', '-')}={path}" for key, path in files(pki, name).items())]
-
-    run_nedbus("serve", *flags("vehicle-1"), "-s", "sim:?vehicle=1")
-    ready = run_nedbus("echo", "--wait", "--once", *flags("reader"))
-    assert ready.wait() == 0, ready.err
-    for name, vehicle, write, code in (
-        ("reader", "1", "ok", 0),
-        ("vehicle-1", "1", "ok", 0),
-        ("vehicle-1", "2", "wrong", 1),
+    findings = look(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
+    found(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
+    found(findings, "endpoint", "wrong", "tls/.*: a Zenoh router answers there, without TLS")
+    found(findings, "tls", "wrong", f"{secure}: no authority is given")
+    for files, reason in (
+        ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
+        ({"tls_ca": pki / "gone.crt"}, "cannot be read"),
+        ({"tls_certificate": pki / "reader.crt"}, "not the authority to trust"),
     ):
-        doctor = run_nedbus("doctor", "--json", "--vehicle", vehicle, *flags(name))
-        assert doctor.wait() == code, doctor.out
-        states = {each["check"]: each["state"] for each in json.loads(doctor.out)["findings"]}
-        assert states["write"] == write, name
+        found(look(secure, tls=files), "certificate", "wrong", reason)
 
 
-def test_service_that_may_not_write_its_vehicle(run_router: Run, pki: Path, run_nedbus: Start) -> None:
-    """It says that it publishes, a reader gets nothing of it, and the doctor says so."""
-    endpoint = run_router()
-    flags = [f"--{name.replace('_', '-')}={path}" for name, path in files(pki, "vehicle-1").items()]
-    run_nedbus("serve", "-c", endpoint, *flags, "-s", "sim:?vehicle=1", "-s", "sim:?vehicle=2")
-    tls = nedbus.Tls(pki / "ca.crt", pki / "reader.crt", pki / "reader.key")
-    with nedbus.connect(endpoint, tls=tls, timeout=DEADLINE) as bus:
-        wait_for(lambda: "2/" in str(bus.services()), what="the status")
-    findings = look(endpoint, files(pki, "reader"))
-    found(findings, "vehicle", "wrong", f"2/{VLP}: a service says that it publishes it, and nothing arrives")
-    found(look(endpoint, files(pki, "vehicle-1")), "read", "wrong", "nothing of it arrives here")
-    own = look(endpoint, files(pki, "vehicle-1"), vehicle="1")
-    assert "for writing" in found(own, "read", "warning", "nothing of it arrives here").advice
+@pytest.mark.parametrize(
+    ("client", "vehicle", "published", "check", "state", "text"),
+    [
+        ("vehicle-1", "1", "1", "write", "ok", "a probe came back"),
+        ("vehicle-1", "2", "1", "write", "wrong", "the router drops what this client publishes as vehicle 2, without"),
+        ("vehicle-1", "2", "", "write", "warning", "the router drops"),
+        ("reader", "1", "1", "write", "ok", "a reader needs no more"),
+        ("older", "1", "", "write", "unknown", "cannot be told"),
+        ("reader", None, "12", "vehicle", "wrong", f"2/{VLP}: a service says that it publishes it, and nothing"),
+        ("vehicle-1", None, "12", "read", "wrong", "nothing of it arrives here"),
+        ("vehicle-1", "1", "12", "read", "warning", "nothing of it arrives here.*for writing"),
+    ],
+)
+def test_what_may_be_read_and_written(
+    run_router: Run, pki: Path, *, client: str, vehicle: str | None, published: str, check: str, state: State, text: str
+) -> None:
+    """A vehicle's own certificate may write it, and not read; a reader's may not write, and finds what is dropped."""
+    older = {"@doctor": "@probe"} if client == "older" else {}  # rules that know nothing of probes
+    endpoint, own = run_router(**older), tls_of(pki, "vehicle-1")
+    with (
+        nedbus.connect(endpoint, tls=own, timeout=DEADLINE) as bus,
+        open_client([endpoint], tls=own, timeout=DEADLINE) as session,
+        flying(bus, *published or "2"),
+        reporting(session, sources=[source(addresses=[f"{each}/{VLP}" for each in published])]),
+    ):
+        files = files_of(pki, "vehicle-1" if older else client)
+        findings = look(endpoint, tls=files, vehicle=vehicle, listen=0.5 if client == "reader" else 0.1)
+    assert any(
+        (each.check, each.state) == (check, state) and re.search(text, f"{each.subject}: {each.seen} {each.advice}")
+        for each in findings
+    ), findings
+    if published:
+        assert is_well(findings) == (state != "wrong"), findings
 
 
 def test_certificates_without_the_package_that_reads_them(run_router: Run, pki: Path, start: Start) -> None:
     """Names and dates are unknown then, and what to install is said; whether to trust it is told all the same."""
-    endpoints = {name: run_router(name) for name in ("router", "router-expired", "router-elsewhere")}
-    settings = {name: str(path) for name, path in files(pki, "reader").items()}
+    endpoints = {run_router(name): name for name in ("router", "router-expired", "router-elsewhere")}
+    settings = {name: str(path) for name, path in files_of(pki, "reader").items()}
     program = f"""
 import sys
 sys.modules["cryptography"] = None
-from nedbus.doctor import examine
+from nedbus.doctor import examine, observation
 from nedbus.settings import load_settings
-for name, endpoint in {endpoints!r}.items():
-    for each in examine(load_settings(connect=(endpoint,), **{settings!r}), version="0", listen=0.5):
-        if each.check in ("tls", "certificate"):
-            print(name, each.check, each.state, each.seen, each.advice, sep="|")
+observation._LEAST = 0.1
+for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}), version="0", listen=0.1):
+    if each.check in ("tls", "certificate"):
+        print(each.subject, each.check, each.state, each.seen, each.advice, sep="|")
 """
     process = start("-c", program)
     assert process.wait() == 0, process.err
     lines = [line.split("|") for line in process.out.splitlines()]
-    unread = [check for name, check, state, _, advice in lines if name == "router" and "[pki]'" in advice]
-    assert sorted(unread) == ["certificate", "certificate", "tls"]
-    wrong = {name: seen for name, check, state, seen, _ in lines if state == "wrong"}
+    unread = [(endpoints.get(where, ""), check) for where, check, _, _, advice in lines if "[pki]'" in advice]
+    assert unread.count(("", "certificate")) == 2
+    assert ("router", "tls") in unread
+    wrong = {endpoints[where]: seen for where, _, state, seen, _ in lines if state == "wrong"}
     assert wrong.keys() == {"router-expired", "router-elsewhere"}
     assert wrong["router-expired"].endswith("cannot be trusted: certificate has expired")
     assert wrong["router-elsewhere"] == "the router's certificate is not for 127.0.0.1"
@@ -460,7 +420,7 @@ for name, endpoint in {endpoints!r}.items():
 def test_damaged_certificates_are_refused(pki: Path) -> None:
     """The bytes come from anybody: cut off or changed anywhere, they are a ValueError or a certificate."""
     pem = (pki / "router.crt").read_text()
-    assert Certificate.read(pki / "router.crt").hosts == ("127.0.0.1",)
+    assert Certificate.read(pki / "router.crt").hosts == ("127.0.0.1", "localhost")
     der = ssl.PEM_cert_to_DER_cert(pem)
     for index in range(len(der)):
         for damaged in (der[:index], der[:index] + bytes([der[index] ^ 0xFF]) + der[index + 1 :]):
@@ -470,26 +430,17 @@ def test_damaged_certificates_are_refused(pki: Path) -> None:
                 continue
 
 
-# MAVLink.
-
-
-@pytest.fixture
-def link() -> tuple[str, tuple[str, int]]:
-    """Return a link on a free port, and where to send."""
+def listen_to(*packets: bytes) -> list[Finding]:
+    """Look at a link while these packets arrive on it."""
     port = free_port()
-    return f"udpin:127.0.0.1:{port}", ("127.0.0.1", port)
-
-
-@contextmanager
-def sending(where: tuple[str, int], *packets: bytes) -> Iterator[None]:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
 
         def send() -> None:
             for packet in packets:
-                sender.sendto(packet, where)
+                sender.sendto(packet, ("127.0.0.1", port))
 
         with repeating(send):
-            yield
+            return look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
 
 
 def packets_of(system: int, *messages: object) -> list[bytes]:
@@ -497,31 +448,21 @@ def packets_of(system: int, *messages: object) -> list[bytes]:
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
-def test_what_comes_on_a_mavlink_link(link: tuple[str, tuple[str, int]]) -> None:
-    """Nothing, what is no MAVLink, heartbeats only, and positions are told from each other, by system id."""
-    name, where = link
-    nowhere = free_endpoint()
+def test_what_comes_on_a_mavlink_link() -> None:
+    """Nothing, what is no MAVLink, heartbeats only, and positions are told apart, by system id; who has the port is."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
-    found(look(nowhere, mavlink=name), "mavlink", "wrong", "nothing arrives within")
-    with sending(where, b"GET / HTTP/1.1"):
-        found(look(nowhere, mavlink=name), "mavlink", "wrong", r"packets from 127\.0\.0\.1:\d+ that are not MAVLink")
-    with sending(where, *packets_of(7, heartbeat), *packets_of(8, heartbeat, position), b"junk"):
-        findings = look(nowhere, mavlink=name)
+    found(listen_to(), "mavlink", "wrong", "nothing arrives within")
+    junk = listen_to(b"GET / HTTP/1.1")
+    found(junk, "mavlink", "wrong", r"packets from 127\.0\.0\.1:\d+ that are not MAVLink")
+    findings = listen_to(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position), b"junk")
     assert "requests it" in found(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
     found(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
     found(findings, "mavlink", "warning", "bytes that are not MAVLink")
-
-
-def test_mavlink_port_that_is_taken(link: tuple[str, tuple[str, int]]) -> None:
-    """The process that has it is named, where this user may see it."""
-    name, where = link
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as owner:
-        owner.bind(where)
-        found(look(free_endpoint(), mavlink=name), "mavlink", "warning", r"its port is taken by .*\(pid \d+\)")
-
-
-# Settings.
+    with socket.socket(type=socket.SOCK_DGRAM) as owner:
+        owner.bind(("127.0.0.1", free_port()))
+        findings = look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
+    found(findings, "mavlink", "warning", r"its port is taken by .*\(pid \d+\)")
 
 
 def test_settings_that_are_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -548,4 +489,5 @@ for each in examine(settings, version="0", mavlink="udpin:127.0.0.1:1"):
 """
     process = start("-c", program)
     assert process.wait() == 0, process.err
+    assert process.out.count("pymavlink is missing") >= 2, process.out
     assert process.out.count("[mavlink]'") >= 2, process.out

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import socket
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -10,7 +12,9 @@ from collections.abc import Iterator
 import pytest
 
 import nedbus
-from tests.conftest import Start, message, wait_for
+from tests.messages import VLP, message
+from tests.processes import Start
+from tests.waits import DEADLINE, repeating, wait_for
 
 LIMIT = 9.0  # s from the end of the script, when it said so: Zenoh needs 10 s where it is stuck, and the promise is 2 s
 
@@ -24,21 +28,8 @@ subscription = bus.subscribe("vehicle_local_position", vehicle="1", mode=MODE)
 subscription.receive()
 """
 
-ENDS = {
-    "forgets": 'print("end", flush=True)',
-    "raises": 'print("end", flush=True); raise RuntimeError("on purpose")',
-    "exits": 'print("end", flush=True); sys.exit(3)',
-    "never reads": 'time.sleep(1.0); print("end", flush=True)',
-    "reads in a thread": """
-threading.Thread(target=lambda: [None for _ in subscription], daemon=True).start()
-print("end", flush=True)""",
-    "has a pump": 'subscription.receive(5.0); print("end", flush=True)',
-    "asks and forgets": 'bus.latest("*"); bus.vehicles(); print("end", flush=True)',
-}
-CODES = {"raises": 1, "exits": 3}
-
 ASYNC = """
-import asyncio, sys
+import asyncio
 import nedbus
 async def main():
     bus = nedbus.connect_async()
@@ -46,59 +37,51 @@ async def main():
     subscription = bus.subscribe("*", vehicle="1", mode=MODE)
     await subscription.receive()
     print("end", flush=True)
-    RAISE
+    END
 asyncio.run(main())
 """
 
+END = 'print("end", flush=True)'
+SCRIPTS = {
+    "forgets": PREAMBLE + END,
+    "raises": PREAMBLE + 'print("end", flush=True); raise RuntimeError("on purpose")',
+    "exits": PREAMBLE + 'print("end", flush=True); sys.exit(3)',
+    "never reads": PREAMBLE + "time.sleep(1.0); " + END,
+    "reads in a thread": PREAMBLE + "threading.Thread(target=lambda: list(subscription), daemon=True).start(); " + END,
+    "has a pump": PREAMBLE + "subscription.receive(5.0); " + END,
+    "asks and forgets": PREAMBLE + 'bus.latest("*"); bus.vehicles(); ' + END,
+    "async forgets": ASYNC.replace("END", "pass"),
+    "async raises": ASYNC.replace("END", 'raise RuntimeError("on purpose")'),
+}
+CODES = {"raises": 1, "async raises": 1, "exits": 3}
+MODES = ["every", pytest.param("latest", marks=pytest.mark.slow)]  # the former has all threads of the latter, and more
+
 
 @pytest.fixture
-def flood(endpoint: str) -> Iterator[str]:
+def flood(endpoint: str, bus: nedbus.Bus) -> Iterator[str]:
     """Publish all the time, so that every queue of a script that does not read is full."""
-    stop = threading.Event()
-    with nedbus.connect(endpoint) as bus:
-        publisher = bus.publisher("vehicle_local_position", vehicle="1")
-
-        def publish() -> None:
-            sent = message(1)
-            while not stop.wait(0.001):
-                for _ in range(20):
-                    publisher.publish(sent)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
+    publisher, sent = bus.publisher(VLP, vehicle="1"), message(1)
+    with repeating(lambda: [publisher.publish(sent) for _ in range(400)]):  # type: ignore[func-returns-value] # many
         yield endpoint
-        stop.set()
-        thread.join()
 
 
-def assert_gone(process_start: Start, code: str, endpoint: str, expected: int) -> None:
-    process = process_start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_script_without_close_is_gone(start: Start, flood: str, script: str, mode: str) -> None:
+    """A bus that is never closed does not keep the process, whatever its queues hold; the same for asyncio."""
+    process = start("-c", SCRIPTS[script].replace("MODE", repr(mode)), NEDBUS_CONNECT=flood, measured=False)
     wait_for(lambda: "end" in process.out, what=f"the script to reach its end: {process.err}")
     ended = time.monotonic()
-    assert process.wait() == expected, process.err
+    assert process.wait() == CODES.get(script, 0), process.err
     assert time.monotonic() - ended < LIMIT
     assert "Traceback" not in process.err or "on purpose" in process.err
     assert "panicked" not in process.err
     assert "FATAL" not in process.err
 
 
-@pytest.mark.parametrize("mode", ["latest", "every"])
-@pytest.mark.parametrize("end", ENDS)
-def test_script_without_close_is_gone(start: Start, flood: str, end: str, mode: str) -> None:
-    """A bus that is never closed does not keep the process, whatever its queues hold."""
-    assert_gone(start, PREAMBLE.replace("MODE", repr(mode)) + ENDS[end], flood, CODES.get(end, 0))
-
-
-@pytest.mark.parametrize("mode", ["latest", "every"])
-@pytest.mark.parametrize("raises", ["pass", 'raise RuntimeError("on purpose")'])
-def test_async_script_without_close_is_gone(start: Start, flood: str, raises: str, mode: str) -> None:
-    """The same for asyncio."""
-    assert_gone(start, ASYNC.replace("MODE", repr(mode)).replace("RAISE", raises), flood, int(raises != "pass"))
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("vehicle", ["1", "silent"])
-@pytest.mark.parametrize("mode", ["latest", "every"])
+@pytest.mark.parametrize("mode", MODES)
 def test_signal_ends_a_reading_script(
     start: Start, flood: str, number: signal.Signals, vehicle: str, mode: str
 ) -> None:
@@ -119,26 +102,17 @@ for sample in subscription:
     assert time.monotonic() - signalled < LIMIT
 
 
-WAITS = {
-    "connect": """
-print("ready", flush=True)
-nedbus.connect("tcp/127.0.0.1:1", timeout=TIMEOUT)""",
-    "connect_async": """
-async def main():
-    print("ready", flush=True)
-    async with nedbus.connect_async("tcp/127.0.0.1:1", timeout=TIMEOUT):
-        pass
-asyncio.run(main())""",
-}
-
-
 @pytest.mark.parametrize("timeout", [600, None])
-@pytest.mark.parametrize("how", WAITS)
+@pytest.mark.parametrize(
+    "how", ["nedbus.connect(timeout=T)", "asyncio.run(nedbus.connect_async(timeout=T).__aenter__())"]
+)
 def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, timeout: float | None) -> None:
-    """Ctrl-C ends the wait for a router that is not there."""
-    code = "import asyncio, nedbus; nedbus.connect"
-    process = start("-c", code + WAITS[how].replace("TIMEOUT", repr(timeout)), measured=False)
-    wait_for(lambda: "ready" in process.out, what="the script")
+    """Ctrl-C ends the wait for a router that has gone."""
+    code = f"import asyncio, nedbus; T = {timeout}; {how}"
+    with socket.create_server(("127.0.0.1", 0)) as gone:
+        gone.settimeout(DEADLINE)
+        process = start("-c", code, NEDBUS_CONNECT=f"tcp/127.0.0.1:{gone.getsockname()[1]}", measured=False)
+        gone.accept()[0].close()  # it has begun to wait
     process.signal(signal.SIGINT)
     assert process.wait() == -signal.SIGINT, process.err
 
@@ -167,25 +141,28 @@ def test_closing_waits_for_threads_that_are_inside_zenoh(bus: nedbus.Bus, monkey
         join(thread, timeout)
 
     monkeypatch.setattr(threading.Thread, "join", note)
-    publisher = bus.publisher("vehicle_local_position", vehicle="0")
+    publisher = bus.publisher(VLP, vehicle="0")
     before = set(threading.enumerate())
     subscriptions = [bus.subscribe(vehicle=str(number), mode="every") for number in range(20)]
     reader = threading.Thread(target=lambda: list(subscriptions[0]))
     reader.start()
 
     def is_inside() -> bool:
+        """Send something; return whether the innermost function of the reader is the one that receives."""
         publisher.publish(message(1))
-        return subscriptions[0]._subscriber._reader_waits
+        frame = sys._current_frames().get(reader.ident or 0)
+        return frame is not None and frame.f_code.co_qualname == "ZenohSubscriber._receive"
 
     wait_for(is_inside, what="the reader to be inside Zenoh")
     for subscription in subscriptions:
         subscription.close()
-    assert not subscriptions[0]._subscriber._reader_waits
+    assert not is_inside()
     assert set(threading.enumerate()) - before <= {reader}
     assert {"nedbus-pump", "nedbus-ack", "nedbus-recovery"} <= set(joined)
     reader.join()
 
 
+@pytest.mark.slow
 def test_publisher_ends_amid_a_flood_of_queries(start: Start, endpoint: str) -> None:
     """Its schema is asked for more often than it can answer: what is being answered at its end does not abort it."""
     code = """
@@ -194,15 +171,15 @@ bus = nedbus.connect()
 publishers = [bus.publisher("vehicle_local_position", vehicle=str(number)) for number in range(2)]
 for publisher in publishers:
     publisher.publish({"timestamp": 1})
-print("ready", flush=True)
 time.sleep(0.5)
 """
     flood = """
-import time, nedbus, zenoh
-bus = nedbus.connect()
+import os, time, zenoh
+from nedbus.transport import open_client
+session = open_client([os.environ["NEDBUS_CONNECT"]], timeout=30.0)
 while True:
     for _ in range(50):
-        bus._session.get("nedbus/@schema/VehicleLocalPosition", zenoh.handlers.RingChannel(1), timeout=1.0)
+        session.get("nedbus/@schema/VehicleLocalPosition", zenoh.handlers.RingChannel(1), timeout=1.0)
     time.sleep(0.002)
 """
     for _ in range(2):

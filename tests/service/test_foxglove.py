@@ -5,41 +5,33 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
-import pytest
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 import nedbus
+from nedbus import Sample
 from nedbus.bridges import FoxgloveServer
-from nedbus_msgs import (
-    CURRENT,
-    DEFAULT_TOPIC,
-    ROS2_TYPE,
-    MapProjection,
-    decode_cdr,
-    message_definition,
-    to_global,
-    upgrade,
-)
-from tests.conftest import DEADLINE, Process, Start, free_port, message, wait_for
+from nedbus_msgs import CURRENT, ROS2_TYPE, Address, MapProjection, decode_cdr, message_definition, to_global, upgrade
+from tests.command_line import run_command
+from tests.messages import VLP, message
+from tests.ports import free_port
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
 
-VLP = DEFAULT_TOPIC
+X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # before the doubles 1, 2 and 3 of a message of protobuf
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
 
 
 class Client:
     """Do what the Foxglove app does: get the list of channels, subscribe, receive binary frames."""
 
-    def __init__(self, url: str) -> None:
-        self._opened = ExitStack()
-        self._socket = self._opened.enter_context(
-            connect(url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None, compression=None, proxy=None)
-        )
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
         self.channels: dict[int, dict[str, Any]] = {}
-        self.data: list[tuple[str, int, bytes]] = []
+        self.data: dict[str, tuple[int, bytes]] = {}  # the newest time and payload of each topic
         self.info = self.receive()
 
     def receive(self, seconds: float = DEADLINE) -> dict[str, Any]:
@@ -55,8 +47,13 @@ class Client:
             return content
         if frame[0] == 1:
             number, when = struct.unpack_from("<IQ", frame, 1)
-            self.data.append((self.channels[number]["topic"], when, frame[13:]))
+            self.data[self.channels[number]["topic"]] = when, frame[13:]
         return {}
+
+    def receive_soon(self) -> None:
+        """Receive the next frame if there is one."""
+        with suppress(TimeoutError):
+            self.receive(0.1)
 
     @property
     def topics(self) -> dict[str, int]:
@@ -72,85 +69,69 @@ class Client:
         subscriptions = [{"id": number, "channelId": number} for number in numbers]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
-    def close(self) -> None:
-        self._opened.close()
+
+@contextmanager
+def connected(url: str) -> Iterator[Client]:
+    protocols = [Subprotocol("foxglove.sdk.v1")]
+    with connect(url, subprotocols=protocols, max_size=None, compression=None, proxy=None) as socket:
+        yield Client(socket)
 
 
-@pytest.fixture
-def server(run_nedbus: Start, endpoint: str, start: Start) -> Iterator[tuple[Process, Client]]:
-    """Run `nedbus foxglove`, and connect a client."""
-    port = free_port()
-    process = run_nedbus("foxglove", "-c", endpoint, "--port", str(port), measured=False)
-    wait_for(lambda: "open ws://" in process.err or process.popen.poll() is not None, what=f"the server {process.err}")
-    client = Client(f"ws://127.0.0.1:{port}")
-    yield process, client
-    client.close()
-
-
-def test_vehicles_appear_and_every_field_can_be_plotted(server: tuple[Process, Client], bus: nedbus.Bus) -> None:
+def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """Channels come with vehicles and go with them; a plot's data is the message, with its definition."""
-    _, client = server
-    assert client.info["op"] == "serverInfo"
-    publisher = bus.publisher("estimator_local_position", vehicle="7", instance=1)
+    url = f"ws://127.0.0.1:{free_port()}"
+    process = run_nedbus("foxglove", "-c", endpoint, "--port", url.rpartition(":")[2], measured=False)
+    wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
-    publisher.publish(sent)
-    client.until(lambda: topic in client.topics)
-    channel = client.channels[client.topics[topic]]
-    assert (channel["encoding"], channel["schemaEncoding"], channel["schemaName"]) == ("cdr", "ros2msg", ROS2_TYPE)
-    assert channel["schema"] == message_definition(CURRENT.name)
-    client.subscribe(topic)
-
-    while not client.data:
+    with connected(url) as client, bus.publisher("estimator_local_position", vehicle="7", instance=1) as publisher:
+        assert client.info["op"] == "serverInfo"
         publisher.publish(sent)
-        with suppress(TimeoutError):  # a subscription takes effect some time after it was sent
-            client.receive(0.2)
-    _, when, payload = client.data[0]
-    assert upgrade(decode_cdr(payload, layout="1.16")) == sent
-    assert when > 1_700_000_000_000_000_000
-    publisher.close()
-    client.until(lambda: topic not in client.topics)
+        client.until(lambda: topic in client.topics)
+        channel = client.channels[client.topics[topic]]
+        assert (channel["encoding"], channel["schemaEncoding"], channel["schemaName"]) == ("cdr", "ros2msg", ROS2_TYPE)
+        assert channel["schema"] == message_definition(CURRENT.name)
+        client.subscribe(topic)
+        while topic not in client.data:  # a subscription takes effect some time after it was sent
+            publisher.publish(sent)
+            client.receive_soon()
+        when, payload = client.data[topic]
+        assert upgrade(decode_cdr(payload, layout="1.16")) == sent
+        assert when > 1_700_000_000_000_000_000
+        publisher.close()
+        client.until(lambda: topic not in client.topics)
 
 
-def test_poses_and_locations(endpoint: str, bus: nedbus.Bus) -> None:
+def test_poses_and_locations(bus: nedbus.Bus) -> None:
     """ENU poses with their frames, and positions on the map, as protobuf of Foxglove's own schemas."""
-    with FoxgloveServer(bus, port=0) as server:
-        client = Client(server.url)
-        with bus.subscribe(VLP, mode="every") as subscription:
-            here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)
-            there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
-            bus.publisher(VLP, vehicle="1").publish(here)
-            server.show(subscription.receive(DEADLINE))
-            bus.publisher(VLP, vehicle="2").publish(there)
-            sample = subscription.receive(DEADLINE)
+    here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)
+    there = here.model_copy(update={"ref_lat": 47.001, "ref_alt": 410.0})
+    with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
+        for vehicle, each in (("1", here), ("2", there)):
+            server.show(sample := Sample(each, Address(vehicle, VLP), received=1))
+        names = {"/1/pose", "/1/location", "/2/pose", "/2/location", "/tf", f"/1/{VLP}"}
+        client.until(lambda: names <= client.topics.keys())
+        assert client.channels[client.topics["/tf"]]["schemaName"] == "foxglove.FrameTransforms"
+        client.subscribe("/2/pose", "/2/location", "/tf")
+        while client.data.keys() < {"/2/pose", "/2/location", "/tf"}:
             server.show(sample)
-            names = {"/1/pose", "/1/location", "/2/pose", "/2/location", "/tf", f"/1/{VLP}"}
-            client.until(lambda: names <= client.topics.keys())
-            assert client.channels[client.topics["/tf"]]["schemaName"] == "foxglove.FrameTransforms"
-            client.subscribe("/2/pose", "/2/location", "/tf")
-            received: dict[str, bytes] = {}
-            while received.keys() < {"/2/pose", "/2/location", "/tf"}:
-                server.show(sample)
-                with suppress(TimeoutError):
-                    client.receive(0.2)
-                received = {topic: payload for topic, _, payload in client.data}
-        position = to_global(there)
-        assert position
-        for value in (position.latitude, position.longitude):
-            assert struct.pack("<d", value) in received["/2/location"]
-        for value in (4.0, 3.0, 5.0):
-            assert struct.pack("<d", value) in received["/2/pose"]
-        north, _ = MapProjection(47.0, 8.0).project(47.001, 8.0)
-        assert struct.pack("<d", north) in received["/tf"]
-        assert struct.pack("<d", 10.0) in received["/tf"]
-        assert b"2/local" in received["/tf"]
-        client.close()
+            client.receive_soon()
+    position = to_global(there)
+    assert position
+    north, _ = MapProjection(47.0, 8.0).project(47.001, 8.0)
+    for topic, coordinates in {
+        "/2/location": {LATITUDE: position.latitude, LONGITUDE: position.longitude},
+        "/2/pose": {X: 4.0, Y: 3.0, Z: 5.0},
+        "/tf": {Y: north, Z: 10.0},
+    }.items():
+        for tag, value in coordinates.items():
+            assert tag + struct.pack("<d", value) in client.data[topic][1]
+    assert b"2/local" in client.data["/tf"][1]
 
 
-def test_port_in_use_is_reported(server: tuple[Process, Client], run_nedbus: Start, endpoint: str) -> None:
+def test_port_in_use_is_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """Two servers cannot have one port."""
-    process, _ = server
-    port = process.err.split("127.0.0.1:")[1].split()[0]
-    other = run_nedbus("foxglove", "-c", endpoint, "--port", port)
-    assert other.wait() == 1
-    assert "address already in use): choose another port with --port" in other.err
+    with FoxgloveServer(bus, port=0) as server:
+        ended = run_command("foxglove", "-c", endpoint, "--port", server.url.rpartition(":")[2])
+    assert ended.exit_code == 1
+    assert "address already in use): choose another port with --port" in ended.err

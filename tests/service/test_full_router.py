@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import ssl
 import threading
@@ -11,39 +12,28 @@ import pytest
 
 import nedbus
 from nedbus.doctor.endpoint import check_endpoint
-from nedbus.transport import make_authority, make_certificate, open_router
+from nedbus.transport import open_router
 from nedbus.transport.full_router import full_router
-from tests.conftest import DEADLINE, free_endpoint
+from tests.certificates import pki, secure_endpoint, tls_of, write_config
+from tests.ports import free_endpoint
 from tests.service.test_pki_fleet import without_identifiers
+from tests.waits import DEADLINE, wait_for
 
-CONFIG = Path(__file__).parents[2] / "config"
+__all__ = ["pki"]
 
-
-def write_config(folder: Path, name: str, endpoint: str) -> Path:
-    """Return a shipped configuration with room for one session, on this endpoint."""
-    text = (CONFIG / name).read_text().replace("/etc/nedbus/pki", str(folder))
-    file = folder / name
-    file.write_text(
-        text.replace("max_sessions: 1000", "max_sessions: 1")
-        .replace("tcp/0.0.0.0:7447", endpoint)
-        .replace("tls/0.0.0.0:7447", endpoint)
-    )
-    return file
+FOR_ONE = {"max_sessions: 1000": "max_sessions: 1"}
 
 
 def test_who_is_turned_away_is_told(tmp_path: Path) -> None:
     """The second client of a router for one is told why it gets no session; when the first has gone it gets one."""
     endpoint = free_endpoint()
-    router = open_router(config_file=write_config(tmp_path, "router.json5", endpoint))
-    try:
+    with open_router(config_file=write_config(tmp_path, tmp_path / "router.json5", endpoint, **FOR_ONE)):
         with nedbus.connect(endpoint):
             with pytest.raises(nedbus.ConnectError, match=r"no room for more sessions.*max_sessions") as told:
-                nedbus.connect(endpoint, timeout=0.5)
+                nedbus.connect(endpoint, timeout=0.1)
             assert told.value.full == endpoint
         nedbus.connect(endpoint, timeout=DEADLINE).close()
-        assert full_router([endpoint], None) is None
-    finally:
-        router.close()
+        wait_for(lambda: full_router([endpoint], None) is None, what="room, as the last one has gone")
 
 
 def strict_context(**given: str) -> ssl.SSLContext:
@@ -55,37 +45,25 @@ def strict_context(**given: str) -> ssl.SSLContext:
 
 
 @pytest.mark.parametrize("old", [False, True], ids=["whole", "without identifiers"])
-def test_with_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, old: bool) -> None:
+def test_with_certificates(tmp_path: Path, pki: Path, monkeypatch: pytest.MonkeyPatch, *, old: bool) -> None:
     """The same over mutual TLS, on any Python, with old certificates too, and in the words of the doctor."""
     monkeypatch.setattr(ssl, "create_default_context", strict_context)
-    make_authority(tmp_path)
-    make_certificate(tmp_path, "router", hosts=["127.0.0.1"])
-    make_certificate(tmp_path, "reader")
+    monkeypatch.setattr("nedbus.doctor.endpoint._OPEN", 0.1)
+    monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", 0.1)
+    folder = Path(shutil.copytree(pki, tmp_path / "pki"))
     for name in ("ca", "router", "reader") if old else ():
-        without_identifiers(tmp_path / f"{name}.crt", tmp_path / "ca.key")
-    files = [str(tmp_path / name) for name in ("ca.crt", "reader.crt", "reader.key")]
-    endpoint = free_endpoint().replace("tcp/", "tls/")
-    router = open_router(config_file=write_config(tmp_path, "router-secure.json5", endpoint))
-    try:
-        with nedbus.connect(endpoint, tls=nedbus.Tls(*files)):
-            with pytest.raises(nedbus.ConnectError, match="no room for more sessions"):
-                nedbus.connect(endpoint, tls=nedbus.Tls(*files), timeout=0.5)
-            *_, finding = check_endpoint(endpoint, nedbus.Tls(*files))
-        assert (finding.state, finding.seen) == ("wrong", "the router has no room for more sessions")
-    finally:
-        router.close()
+        without_identifiers(folder / f"{name}.crt", folder / "ca.key")
+    endpoint, tls = secure_endpoint(), tls_of(folder, "reader")
+    file = write_config(folder, tmp_path / "router-secure.json5", endpoint, **FOR_ONE)
+    with open_router(config_file=file), nedbus.connect(endpoint, tls=tls):
+        with pytest.raises(nedbus.ConnectError, match="no room for more sessions"):
+            nedbus.connect(endpoint, tls=tls, timeout=0.1)
+        *_, finding = check_endpoint(endpoint, tls)
+    assert (finding.state, finding.seen) == ("wrong", "the router has no room for more sessions")
 
 
 @pytest.mark.parametrize(
-    "answer",
-    [
-        b"",
-        b"\x00",
-        b"HTTP/1.0 400 Bad Request\r\n\r\n",
-        b"\x02\x00\x03\x02",
-        b"\x04\x00\x01\x09\xf2\xff",
-        b"\xff" * 5000,
-    ],
+    "answer", [b"", b"\x00", b"HTTP/1.0 400 Bad Request\r\n\r\n", b"\2\0\3\2", b"\4\0\1\t\xf2\xff", b"\xff" * 5000]
 )
 def test_other_answers_are_not_full(answer: bytes) -> None:
     """What is no router, or says something else, is not called full, whatever it sends."""

@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Mapping
 
 import pytest
 
 from nedbus import Health, Monitor, Sample, StreamHealth
 from nedbus.client import describe_stream, stream_state
-from nedbus_msgs import DOUBT_FLAGS, Address, VehicleLocalPosition
+from nedbus_msgs import DOUBT_FLAGS, Address
+from tests.messages import VALID, VLP, message
 
 SECOND = 1_000_000_000
+Fields = Mapping[str, object]
 
 
-def follow(*times: float, boot: float = 0.0, every: float = 0.01, **flags: bool) -> StreamHealth:
+def follow(
+    *times: float, boot: float = 0.0, every: float = 0.01, latency: float | None = None, fields: Fields = VALID
+) -> StreamHealth:
     """Return a stream that came at these times [s], of PX4's times from `boot` on."""
-    stream = StreamHealth("vehicle_local_position")
+    stream = StreamHealth(VLP)
     for index, came in enumerate(times):
-        stream.add(message(boot + index * every, **flags), received=round(came * SECOND))
+        seconds = boot + index * every
+        stream.add(message(round(seconds * 1e6), **fields), received=round(came * SECOND), latency=latency)
     return stream
 
 
-def message(seconds: float, **flags: bool) -> VehicleLocalPosition:
-    zeros = dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0)
-    return VehicleLocalPosition.model_validate({"timestamp": round(seconds * 1e6), **zeros, **flags})
+def follow_clock(*clock: float) -> Health:
+    """Return the health of a stream by PX4's own time of its messages [s]."""
+    stream = StreamHealth(VLP)
+    for seconds in clock:
+        stream.add(message(round(seconds * 1e6)), received=0)
+    return stream.snapshot(0)
 
 
 def test_rate_and_jitter_are_of_the_last_second() -> None:
@@ -41,47 +50,58 @@ def test_rate_and_jitter_are_of_the_last_second() -> None:
 
 
 def test_silence_has_no_rate() -> None:
-    """A stream that stopped has an age, and no rate."""
+    """A stream that stopped has an age, and no rate; before the first message there is nothing to measure."""
     health = follow(1.0, 1.01, 1.02).snapshot(10 * SECOND)
     assert health.rate is None
     assert health.age == pytest.approx(8.98)
-
-
-def test_stream_without_messages_has_no_measures() -> None:
-    """Before the first message there is nothing to measure."""
     health = StreamHealth("estimator_local_position").snapshot(SECOND)
-    assert dataclasses.replace(health, resets={}) == Health(
-        None, 2.0, None, None, None, None, 0, 0, 0, 0, 0, None, None
-    )
+    nothing = Health(None, 2.0, None, None, None, None, 0, 0, 0, 0, 0, None, None)
+    assert dataclasses.replace(health, resets={}) == nothing
     assert set(health.resets.values()) == {0}
 
 
-def test_gaps_are_of_px4s_own_time() -> None:
+def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
     """A step of more than three usual ones is a gap, whenever it arrives, and does not become the usual one."""
-    stream = StreamHealth("vehicle_local_position")
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
-    for index, seconds in enumerate(clock):
-        stream.add(message(seconds), received=index)
-    assert stream.snapshot(0).gaps == 2
-
-
-def test_disorder_and_reboot_are_told_apart() -> None:
-    """Back by a little is disorder; back by more than a second is a vehicle that started again."""
-    stream = StreamHealth("vehicle_local_position")
-    for index, seconds in enumerate((10.0, 10.1, 10.05, 10.2, 0.5, 0.6)):
-        stream.add(message(seconds), received=index)
-    health = stream.snapshot(0)
+    assert follow_clock(*clock).gaps == 2
+    # Back by a little is disorder; back by more than a second is a vehicle that started again.
+    health = follow_clock(10.0, 10.1, 10.05, 10.2, 0.5, 0.6)
     assert (health.out_of_order, health.reboots) == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("counters", "resets", "reboots"),
+    [
+        ([(10.0, 7), (10.1, 7), (10.2, 8), (10.3, 8), (10.4, 10)], 3, 0),
+        ([(10.0, 254), (10.1, 255), (10.2, 0), (10.3, 1)], 3, 0),
+        ([(10.0, 5)], 0, 0),
+        ([(10.0, 3), (10.1, 4), (0.1, 0), (0.2, 1)], 2, 1),
+    ],
+    ids=["rises", "wraps at 255", "began before", "reboots"],
+)
+def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, reboots: int) -> None:
+    """A counter that rises has counted resets, across 255 too; what it counted before the first message is unknown.
+
+    A reboot sets the counters to 0, which is no reset; what comes after it counts.
+    """
+    stream = StreamHealth(VLP)
+    for seconds, counter in counters:
+        fields = {"z_reset_counter": counter, "heading_reset_counter": 9}
+        stream.add(message(round(seconds * 1e6), **fields), received=0)
+    health = stream.snapshot(0)
+    assert (health.resets["z"], health.resets["heading"], health.resets["xy"]) == (resets, 0, 0)
+    assert health.reboots == reboots
 
 
 def test_flags_are_shares() -> None:
     """The share of the last second, and of all time."""
-    stream = StreamHealth("vehicle_local_position")
+    stream = StreamHealth(VLP)
     for index in range(400):
         late = index >= 200
-        stream.add(message(index / 100, xy_valid=late, dead_reckoning=not late), received=index * SECOND // 100)
+        fields = {"x": 0.0, "y": 0.0, "xy_valid": late, "dead_reckoning": not late}
+        stream.add(message(index * 10_000, **fields), received=index * SECOND // 100)
     health = stream.snapshot(4 * SECOND)
     assert health.flags == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 1.0}
     assert health.flags_ever == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 0.5, "dead_reckoning": 0.5}
@@ -89,7 +109,7 @@ def test_flags_are_shares() -> None:
 
 def test_latency_and_loss() -> None:
     """The median and the worst latency of the second, and all losses."""
-    stream = StreamHealth("vehicle_local_position")
+    stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
         stream.add(message(index), received=index, latency=latency, lost=index)
     health = stream.snapshot(0)
@@ -114,13 +134,13 @@ def test_slow_stream_is_stale_later() -> None:
     assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
 
 
-def sample(vehicle: str, seconds: float = 0.0) -> Sample:
-    return Sample(message(seconds), Address(vehicle, "vehicle_local_position"), received=time.time_ns())
+def sample(vehicle: str, timestamp: int = 0) -> Sample:
+    return Sample(message(timestamp), Address(vehicle, VLP), received=time.time_ns())
 
 
 def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rate and age are of the monotonic clock: an hour back on the wall clock changes nothing."""
-    monitor, now, address = Monitor(), 100 * SECOND, Address("1", "vehicle_local_position")
+    monitor, now, address = Monitor(), 100 * SECOND, Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
     monkeypatch.setattr("time.time_ns", lambda: 0)
     monitor.add(sample("1"))
@@ -128,7 +148,7 @@ def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
         now += SECOND // 100
         if index == 150:
             monkeypatch.setattr("time.time_ns", lambda: -3600 * SECOND)
-        monitor.add(sample("1", index / 100))
+        monitor.add(sample("1", index * 10_000))
     assert monitor.snapshot()[address].rate == pytest.approx(100.0)
     now += 7 * SECOND
     health = monitor.snapshot()[address]
@@ -137,48 +157,45 @@ def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_monitor_is_bounded() -> None:
-    """A flood of 20,000 keys leaves 4096 streams, and never takes the place of one that still sends."""
-    monitor = Monitor()
-    monitor.add(sample("real"))
-    for index in range(20_000):
-        assert not monitor.add(sample(f"flood-{index}"))
-        assert monitor.add(sample("real"))
-    assert len(monitor._streams) == 4096
-    assert list(monitor.snapshot()) == [Address("real", "vehicle_local_position")]
-    monitor.forget(Address("real", "vehicle_local_position"))
-    assert not monitor.snapshot()
-
-
-def late(seconds: float) -> Health:
-    """Return the health of a stream at 100 Hz that comes so late."""
-    stream = StreamHealth("vehicle_local_position")
-    for index in range(300):
-        stream.add(message(index / 100), received=index * SECOND // 100, latency=seconds)
-    return stream.snapshot(3 * SECOND)
+    """A flood of keys leaves the 4096 streams that came last, and never takes the place of one that still sends."""
+    monitor, real = Monitor(), sample("real")
+    monitor.add(real)
+    flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
+    for junk in flood:
+        assert not monitor.add(junk)
+        assert monitor.add(real)
+    assert list(monitor.snapshot()) == [real.address]
+    assert monitor.add(flood[-4095])
+    assert not monitor.add(flood[-4096])
+    monitor.forget(real.address)
+    assert real.address not in monitor.snapshot()
 
 
 def test_states_have_reasons() -> None:
     """The worst state wins, and each but "ok" has its reason; the clock is the test's."""
-    fresh = late(0.01)
-    assert str(stream_state(fresh)) == "ok"
-    assert str(stream_state(fresh, alive=True)) == "ok"
-    assert str(stream_state(fresh, alive=False)) == "ok"  # other languages publish without tokens
-    assert str(stream_state(late(4.4))) == "slow: 4.4 s late, or clocks differ"
+    second = [index / 100 for index in range(300)]
+    fresh, late = (follow(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
     stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
+    silent, longer = (stream.snapshot(seconds * SECOND) for seconds in (40, 3 * 3600))
+    for health, known, text in (
+        (fresh, {}, "ok"),
+        (fresh, {"alive": True}, "ok"),
+        (fresh, {"alive": False}, "ok"),  # other languages publish without tokens
+        (late, {}, "slow: 4.4 s late, or clocks differ"),
+        (silent, {"alive": True}, "stale: nothing for 7.2 s"),
+        (silent, {}, "stale: nothing for 7.2 s"),
+        (silent, {"alive": False}, "gone: last message 7.2 s ago"),
+        (longer, {}, "stale: nothing for 3 h"),
+        (silent, {"alive": False, "connected": False}, "disconnected: no link"),
+    ):
+        assert str(stream_state(health, **known)) == text
     assert str(stream_state(stream.snapshot(33 * SECOND))).startswith("slow: 5.0 Hz, usually ")
-    silent = stream.snapshot(40 * SECOND)
-    assert str(stream_state(silent, alive=True)) == "stale: nothing for 7.2 s"
-    assert str(stream_state(silent)) == "stale: nothing for 7.2 s"
-    assert str(stream_state(silent, alive=False)) == "gone: last message 7.2 s ago"
-    assert str(stream_state(silent, alive=False, connected=False)) == "disconnected: no link"
-    assert stream_state(fresh).severity > stream_state(late(4.4)).severity > stream_state(silent).severity
+    assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
 
 
 def test_description_has_state_flags_and_events() -> None:
     """What is shown in a table: state, flags, then gaps, disorder and reboots; "ok" when there is nothing to say."""
-    valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
-    health = follow(0.0, 0.01, 0.02, **valid).snapshot(SECOND // 10)
+    health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
-    doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, **{**valid, "xy_valid": False}).snapshot(4 * SECOND)
-    state = stream_state(doubtful)
-    assert describe_stream(doubtful, state) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
+    doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
+    assert describe_stream(doubtful, stream_state(doubtful)) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"

@@ -5,15 +5,12 @@ from __future__ import annotations
 import ast
 import json
 import logging
-import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -26,30 +23,25 @@ from nedbus.cli.log_limit import BURST, PER_MINUTE, RateLimit
 from nedbus.log_event import EVENTS, about
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
-from tests.conftest import DEADLINE, Process, Start, message, wait_for, wait_for_reader
+from tests.command_line import run_command
+from tests.hasty import start_hasty
+from tests.messages import VLP, message
+from tests.processes import Start
+from tests.waits import wait_for, wait_for_reader
 
 from .test_px4_zenoh import Px4
 
+REPLAY = "sim:?duration=1&speed=max"
 ROOT = Path(__file__).parents[2]
 SERVICE = ROOT / "service" / "nedbus"
-VLP = "vehicle_local_position"
 EVIL = 'a\x1b[2J\n{"event": "forged"}\u2028'
 VEHICLES = 2 * BURST + 10
 
 
-def record(
-    text: str = "%s is stale", *values: object, event: str | None = "stale", **more: object
-) -> logging.LogRecord:
+def record(text: str = "%s is stale", *args: object, event: str | None = "stale", **more: object) -> logging.LogRecord:
     """Return a record as a log call of a service makes it."""
-    extra = about(event) if event else {}
-    return logging.makeLogRecord(
-        {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": values}
-        | extra
-        | more
-    )
-
-
-# Events
+    warning = {"name": "nedbus.x", "levelname": "WARNING", "levelno": logging.WARNING, "msg": text, "args": args}
+    return logging.makeLogRecord(warning | (about(event) if event else {}) | more)
 
 
 def log_calls(tree: ast.AST) -> Iterator[ast.Call]:
@@ -73,9 +65,8 @@ def values_of(node: ast.expr, tree: ast.AST) -> Iterator[ast.expr]:
         yield from values_of(node.orelse, tree)
     elif isinstance(node, ast.Name):
         for other in ast.walk(tree):
-            if isinstance(other, ast.Assign) and any(
-                isinstance(t, ast.Name) and t.id == node.id for t in other.targets
-            ):
+            targets = other.targets if isinstance(other, ast.Assign) else []
+            if isinstance(other, ast.Assign) and node.id in [getattr(target, "id", None) for target in targets]:
                 yield from values_of(other.value, tree)
     else:
         yield node
@@ -93,8 +84,8 @@ def events_of(call: ast.Call, tree: ast.AST) -> set[str]:
 def test_each_line_has_an_event_of_the_table() -> None:
     """Whatever is logged above DEBUG has an event that EVENTS documents; no event of the table is left over."""
     used: set[str] = set()
-    for path in sorted(SERVICE.rglob("*.py")):
-        tree = ast.parse(path.read_text())
+    for path, text in ((path, path.read_text()) for path in sorted(SERVICE.rglob("*.py"))):
+        tree = ast.parse(text if "_log." in text else "")
         for call in log_calls(tree):
             events = events_of(call, tree)
             assert events <= EVENTS.keys(), f"{path}, line {call.lineno}"
@@ -111,11 +102,8 @@ def test_manual_lists_every_event() -> None:
     assert f"{PER_MINUTE} a minute" in section
 
 
-# Formats
-
-
 def test_json_is_one_harmless_object() -> None:
-    """Whatever a peer sent, a line is one object of ASCII, and its texts act on no terminal."""
+    """Whatever a peer sent, a line is one object of ASCII that acts on no terminal; null is only a missing event."""
     address = Address("7", "estimator_local_position", 2)
     extra = about("rejected", address, source=EVIL, reason=EVIL * 1000)
     line = JsonFormatter().format(record("%s: rejected", EVIL * 1000, about=extra["about"], created=1.5))
@@ -123,18 +111,13 @@ def test_json_is_one_harmless_object() -> None:
     assert line.isprintable()
     assert len(line) < 20_000
     fields = json.loads(line)
-    assert list(fields) == [
-        "time", "level", "event", "message", "logger", "vehicle", "topic", "instance", "source", "reason",
-    ]  # fmt: skip
+    names = ["time", "level", "event", "message", "logger"]
+    assert list(fields) == [*names, "vehicle", "topic", "instance", "source", "reason"]
     assert (fields["time"], fields["level"]) == ("1970-01-01T00:00:01.500Z", "warning")
     assert (fields["vehicle"], fields["topic"], fields["instance"]) == ("7", "estimator_local_position", 2)
     assert all(text.isprintable() for text in fields.values() if isinstance(text, str))
-
-
-def test_json_leaves_out_what_is_not_known() -> None:
-    """Lines of other packages have no event; nothing is null but that."""
     fields = json.loads(JsonFormatter().format(record("plain", event=None)))
-    assert list(fields) == ["time", "level", "event", "message", "logger"]
+    assert list(fields) == names
     assert fields["event"] is None
 
 
@@ -164,97 +147,63 @@ def test_journal_gets_a_priority_for_each_line() -> None:
     assert all(line.startswith("<4>") for line in lines)
 
 
-# The commands
+def test_service_logs_json(start: Start) -> None:
+    """Each line of a service is an object with an event, of its source if there is one.
+
+    What a person would read beside the log is in an object; what to type in a second terminal is left out.
+    """
+    sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
+    soon = {"nedbus.cli.progress._REPORT_INTERVALS": (0.2,)}
+    service = start_hasty(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
+    for event in ("done", "progress"):  # a report comes after what to type
+        wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - it is called at once
+    service.signal(signal.SIGTERM)
+    assert service.wait() == 0
+    lines = [json.loads(line) for line in service.err.splitlines()]
+    events = [line["event"] for line in lines]
+    assert set(events) <= EVENTS.keys() - {"notice"}
+    assert (events[:3], events[-1]) == (["router", "opened", "opened"], "ending")
+    assert {line["source"] for line in lines if line["event"] == "opened"} == {REPLAY, "sim:?vehicle=2"}
 
 
-def has_event(service: Process, event: str) -> bool:
-    return f'"event": "{event}"' in service.err
-
-
-def test_service_logs_json(run_nedbus: Start, endpoint: str) -> None:
-    """Each line of a service is an object with an event; NEDBUS_LOG_FORMAT does what the option does."""
-    by_option = run_nedbus("--log-format", "json", "serve", "-c", endpoint, "-s", "sim:?duration=1&speed=max")
-    by_variable = run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=2", NEDBUS_LOG_FORMAT="json")
-    for service, event in ((by_option, "done"), (by_variable, "opened")):
-        wait_for(partial(has_event, service, event), what=event)
-        service.signal(signal.SIGTERM)
-        assert service.wait() == 0
-        lines = [json.loads(line) for line in service.err.splitlines()]
-        assert [line["event"] for line in lines][:2] == ["client", "opened"]
-        assert lines[-1]["event"] == "ending"
-        assert {line["source"] for line in lines if line["event"] in {"opened", "done"}} <= {
-            "sim:?duration=1&speed=max",
-            "sim:?vehicle=2",
-        }
-
-
-def test_error_of_a_command_is_an_object(run_nedbus: Start) -> None:
+@pytest.mark.parametrize("level", ["info", "debug"])
+def test_error_of_a_command_is_an_object(run_nedbus: Start, level: str) -> None:
     """What ends a command is one object too, with the traceback where the level is debug."""
-    for level in ("info", "debug"):
-        ended = run_nedbus("--log-format", "json", "--log-level", level, "get", "-c", "tcp/127.0.0.1:1")
-        assert ended.wait() == 1
-        (fields,) = [json.loads(line) for line in ended.err.splitlines()]
-        assert (fields["event"], fields["level"]) == ("error", "error")
-        assert fields["message"].startswith("nothing answers at tcp/127.0.0.1:1")
-        assert ("exception" in fields) == (level == "debug")
+    ended = run_nedbus("--log-format", "json", "--log-level", level, "get", "-c", "tcp/127.0.0.1:1")
+    assert ended.wait() == 1
+    (fields,) = [json.loads(line) for line in ended.err.splitlines()]
+    assert (fields["event"], fields["level"]) == ("error", "error")
+    assert fields["message"].startswith("nothing answers at tcp/127.0.0.1:1")
+    assert ("exception" in fields) == (level == "debug")
 
 
-def test_router_logs_nothing_for_people_in_json(run_nedbus: Start) -> None:
-    """What a person would read beside the log is in an object; what to type in a second terminal is left out."""
-    service = run_nedbus("--log-format", "json", "serve", "-l", "tcp/127.0.0.1:0", "-s", "sim:")
-    wait_for(lambda: '"progress"' in service.err, what="a report, which comes after what to type")
-    events = {json.loads(line)["event"] for line in service.err.splitlines()}
-    assert events <= EVENTS.keys() - {"notice"}
-
-
-def test_level_selects(run_nedbus: Start, endpoint: str) -> None:
+def test_level_selects(endpoint: str) -> None:
     """With --log-level warning a service says nothing while all is well; --debug wins; other words are refused."""
-    quiet = run_nedbus(
-        "--log-level", "warning", "serve", "-c", endpoint, "-s", "sim:?duration=1&speed=max", "--until-done"
-    )
-    assert quiet.wait() == 0
-    assert quiet.err == ""
-    loud = run_nedbus("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
-    assert loud.wait() == 1
-    assert "Traceback" in loud.err
-    wrong = run_nedbus("list", "-c", endpoint, NEDBUS_LOG_LEVEL="loud")
-    assert wrong.wait() == 2
+    quiet = run_command("--log-level", "warning", "serve", "-c", endpoint, "-s", REPLAY, "--until-done")
+    assert (quiet.exit_code, quiet.err) == (0, "")
+    loud = run_command("--log-level", "error", "--debug", "get", "-c", "tcp/127.0.0.1:1")
+    assert (loud.exit_code, "Traceback" in loud.err, "(tried for 1 s)" in loud.err) == (1, True, True)
+    wrong = run_command("list", "-c", endpoint, NEDBUS_LOG_LEVEL="loud")
+    assert wrong.exit_code == 2
     assert "NEDBUS_LOG_LEVEL" in wrong.err
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("is_journal", [True, False])
-def test_journal_is_recognised(endpoint: str, tmp_path: Path, is_journal: bool) -> None:
+@pytest.mark.parametrize("other", [0, 1], ids=["journal", "another file"])
+def test_journal_is_recognised(start: Start, endpoint: str, other: int) -> None:
     """Lines have priorities and no date where JOURNAL_STREAM names stderr, and only there."""
-    path = tmp_path / "journal"
-    with path.open("wb") as stderr:
-        status = os.fstat(stderr.fileno())
-        stream = f"{status.st_dev}:{status.st_ino + (not is_journal)}"
-        ended = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "nedbus",
-                "serve",
-                "-c",
-                endpoint,
-                "-s",
-                "sim:?duration=1&speed=max",
-                "--until-done",
-            ],
-            stderr=stderr,
-            timeout=DEADLINE,
-            check=False,
-            env={**os.environ, "JOURNAL_STREAM": stream},
-        )
-    assert ended.returncode == 0
-    lines = path.read_text().splitlines()
-    pattern = r"<6>[^\d<].*" if is_journal else r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    .*"
+    script = """
+import os, sys
+from nedbus.cli import main
+status = os.fstat(2)
+os.environ["JOURNAL_STREAM"] = f"{status.st_dev}:{status.st_ino + int(sys.argv.pop(1))}"
+main()
+"""
+    service = start("-c", script, str(other), "serve", "-c", endpoint, "-s", REPLAY, "--until-done")
+    assert service.wait() == 0
+    lines = service.err.splitlines()
+    pattern = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    .*" if other else r"<6>[^\d<].*"
     assert lines
     assert all(re.fullmatch(pattern, line) for line in lines), lines
-
-
-# The limit
 
 
 class Limited:
@@ -277,38 +226,36 @@ class Limited:
         return len(self.lines) - before
 
 
-def test_burst_then_a_few_a_minute() -> None:
+def test_flood_of_any_length_is_bounded() -> None:
     """A burst passes, then so many a minute, each after a line that says how many were left out before it."""
     limited = Limited()
     assert limited.flood(1000) == BURST
     limited.now += 60 / PER_MINUTE
     assert limited.flood(1000) == 2
-    assert limited.lines[-2:] == [
-        f"{1000 - BURST} more lines like this one were left out: {BURST} is stale",
-        "0 is stale",
-    ]
+    left_out = f"{1000 - BURST} more lines like this one were left out: {BURST} is stale"
+    assert limited.lines[-2:] == [left_out, "0 is stale"]
     limited.now += 3600
     assert limited.flood(1000) == 1 + BURST
-
-
-def test_an_hour_of_flood_is_bounded() -> None:
-    """Ten lines a second for an hour are a burst, and two lines for each that is due."""
     limited = Limited()
-    for _ in range(3600):
+    for _ in range(600):
         limited.flood(10)
         limited.now += 1
-    assert len(limited.lines) <= BURST + 2 * 60 * PER_MINUTE
+    assert len(limited.lines) <= BURST + 2 * 10 * PER_MINUTE
     limited.limit.flush()
     told = [int(line.split()[0]) for line in limited.lines if "left out" in line]
-    assert sum(told) + len(limited.lines) - len(told) == 36_000
+    assert sum(told) + len(limited.lines) - len(told) == 6000
 
 
 def test_kinds_are_limited_each_for_itself() -> None:
-    """A flood of one kind leaves the lines of another alone, and the same text of another event."""
+    """A flood leaves lines of other events and texts alone, and lines of the life of the process always pass."""
     limited = Limited()
     limited.flood(1000)
     assert limited.flood(3, "%s is back", event="back") == 3
     assert limited.flood(3, event="back") == 3
+    own = [name for name, event in EVENTS.items() if not event.limited]
+    assert {"retrying", "failed", "done", "router", "ending", "error"} <= set(own)
+    for name in own:
+        assert limited.flood(2 * BURST, event=name) == 2 * BURST
 
 
 def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
@@ -325,40 +272,24 @@ def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
     assert limited.lines[-1].startswith("5 more lines")
 
 
-def test_lifecycle_is_never_left_out() -> None:
-    """What the process says of its own life passes, however much was logged before."""
-    limited = Limited()
-    own = [name for name, event in EVENTS.items() if not event.limited]
-    assert {"retrying", "failed", "done", "router", "ending", "error"} <= set(own)
-    for name in own:
-        assert limited.flood(10 * BURST, event=name) == 10 * BURST
-
-
 def test_lines_of_other_packages_are_limited() -> None:
-    """A line without an event is limited, and texts without placeholders take up no more than so much memory."""
+    """A line without an event is limited; beyond a number of texts without placeholders all others are one kind."""
     limited = Limited()
     assert limited.flood(1000, event=None) == BURST
-    for number in range(5000):
-        limited.handle(record(f"text {number}", event=None))
-    assert len(limited.limit._buckets) <= 1001
-    assert len(limited.lines) <= 1000 + 2 * BURST
+    assert sum(limited.flood(1, f"text {number} %s", event=None) for number in range(5000)) <= 1000 + BURST
 
 
 def test_report_is_an_event() -> None:
     """A line that says what was left out has its number, the event, and the level of what it stands for."""
-    limited = Limited()
     reports: list[logging.LogRecord] = []
-    limited.limit = RateLimit(reports.append, now=lambda: limited.now)
+    limit = RateLimit(reports.append, now=lambda: 0.0)
     for _ in range(BURST + 3):
-        limited.limit.filter(record("\x1b[2J"))
-    limited.limit.flush()
+        limit.filter(record("\x1b[2J"))
+    limit.flush()
     (report,) = reports
     fields = json.loads(JsonFormatter().format(report))
     assert (fields["event"], fields["of"], fields["count"], fields["level"]) == ("left-out", "stale", 3, "warning")
     assert fields["message"].isprintable()
-
-
-# Attacks
 
 
 def count_lines(text: str, elapsed: float) -> Counter[str]:
@@ -393,10 +324,11 @@ def test_flood_of_invalid_payloads_is_bounded(run_nedbus: Start, endpoint: str, 
     assert happened["invalid"] == 100  # keys; further ones are only counted
 
 
-def test_flapping_vehicles_are_bounded(run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
+def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session, bus: nedbus.Bus) -> None:
     """Vehicles that appear, reboot and fall silent by the hundred make a service log a few lines of each event."""
-    start = time.monotonic()
-    service = run_nedbus("--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
+    began = time.monotonic()
+    soon = {"nedbus.daemon.output._STALE": 0.5}
+    service = start_hasty(start, soon, "--log-format", "json", "serve", "-c", endpoint, "-s", "px4-zenoh:")
     wait_for(lambda: '"listening"' in service.err, what="the source")
     fleet = [Px4(raw, namespace=f"wing{number}") for number in range(VEHICLES)]
 
@@ -415,7 +347,7 @@ def test_flapping_vehicles_are_bounded(run_nedbus: Start, endpoint: str, raw: Se
     wait_for(lambda: len(cast("list[str]", status("stale"))) == VEHICLES, what="the silence")
     service.signal(signal.SIGTERM)
     assert service.wait() == 0
-    happened = count_lines(service.err, time.monotonic() - start)
+    happened = count_lines(service.err, time.monotonic() - began)
     assert happened["published"] == happened["rebooted"] == VEHICLES
     assert happened["stale"] >= VEHICLES
     assert happened["ending"] == 1

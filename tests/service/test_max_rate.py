@@ -5,174 +5,57 @@ Publishers thin by a clock that these tests turn: 10 ms a message, however fast 
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
-import socket
-import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing, suppress
-from typing import TYPE_CHECKING, cast
 
 import pytest
 import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client import thinned_streams
 from nedbus.client.rate_gate import rate_step
 from nedbus.client.thinned_streams import ThinnedStreams
+from nedbus.client.unthinned import Unthinned
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
-from tests.conftest import DEADLINE, Start, message, wait_for, wait_for_reader
+from tests.messages import VLP, message
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for, wait_for_reader
 
-if TYPE_CHECKING:
-    from nedbus.client.demand import Demand
-    from nedbus.client.thinned_subscriber import ThinnedSubscriber
+from .answering import answering, reply_with
+from .publishing import is_read, take, wait_for_subscriber
+from .thinning import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 
-VLP = "vehicle_local_position"
+__all__ = ["Clock", "clock", "publish", "take", "wait_for_demand"]  # for others that thin
+
 BOTH: list[Mode] = ["latest", "every"]
-MS = 1_000_000  # ns
-
-
-class ThinLink:
-    """A TCP link to a router, of 10 kB/s each way unless it is told otherwise; `carried` counts its bytes."""
-
-    def __init__(self, endpoint: str, *, rate: float = 10_000) -> None:
-        self.carried = 0
-        self.broken = False
-        self._to = endpoint.removeprefix("tcp/").split(":")
-        self._rate = rate
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._sockets: list[socket.socket] = []
-        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def cut(self) -> None:
-        """Break all connections, and accept no others until `broken` is false again."""
-        self.broken = True
-        for each in self._sockets:
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self._sockets.append(self._listener)
-        self.cut()
-        for each in self._sockets:
-            each.close()
-
-    def _accept(self) -> None:
-        with suppress(OSError):  # closed
-            while True:
-                near, _ = self._listener.accept()
-                if self.broken:
-                    near.close()
-                    continue
-                far = socket.create_connection((self._to[0], int(self._to[1])))
-                self._sockets += [near, far]
-                for source, target in ((near, far), (far, near)):
-                    source.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-                    threading.Thread(target=self._carry, args=(source, target), daemon=True).start()
-
-    def _carry(self, source: socket.socket, target: socket.socket) -> None:
-        with suppress(OSError):  # closed
-            while data := source.recv(512):
-                self.carried += len(data)
-                target.sendall(data)
-                time.sleep(len(data) / self._rate)  # the link, not the test
-
-
-class Clock:
-    """What publishers take for the time."""
-
-    def __init__(self) -> None:
-        self.now = 10**18
-
-    def monotonic_ns(self) -> int:
-        return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Let publishers of this process thin by a clock of the test's."""
-    clock = Clock()
-    monkeypatch.setattr(thinned_streams, "time", clock)
-    return clock
-
-
-def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -> None:
-    """Publish messages with the timestamps `first`, `first + 1`, ..., 10 ms apart."""
-    for timestamp in range(first, first + count):
-        clock.now += 10 * MS
-        publisher.publish(message(timestamp))
-
-
-def wait_for_demand(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher knows that somebody reads it thinned."""
-    wait_for(publisher._thinned.vehicle.is_wanted, what="the demand for a thinned stream")
-
-
-def take(subscription: nedbus.Subscription, count: int) -> list[int]:
-    """Return the timestamps of the next messages."""
-    return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]
-
-
-def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription) -> None:
-    """Wait until a subscription has begun: with message 0, which was published before it, and a demand.
-
-    The last message is queried, and one that is published meanwhile may be overtaken by the answer.
-    """
-    assert take(subscription, 1) == [0]
-    wait_for_demand(publisher)
 
 
 @pytest.mark.parametrize("mode", BOTH)
-@pytest.mark.parametrize("max_rate", [1, 2, 5, 7.5, 10, 20, 50, 99])
-def test_exactly_so_many_arrive(endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, max_rate: float) -> None:
+@pytest.mark.parametrize("max_rate", [1, 7.5, 20, 99])
+def test_exactly_so_many_arrive(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, mode: Mode, max_rate: float) -> None:
     """Of 10 s at 100 Hz there arrive 10 times the rate, evenly, after the last message; the rest is not lost."""
     step = rate_step(max_rate)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode=mode, max_rate=max_rate) as subscription:
-        take_last(publisher, subscription)
-        timestamps = []
-        for second in range(10):  # no more at once than a reader of mode "latest" can take one by one
-            for first in range(1 + 100 * second, 101 + 100 * second, 100 // step):
-                publish(publisher, clock, first, 100 // step)
-                timestamps += take(subscription, 1)
-        assert timestamps == list(range(1, 1001, 100 // step))
-        assert subscription.counts == nedbus.Counts(received=1 + 10 * step)
+    subscription = client.subscribe(VLP, mode=mode, max_rate=max_rate)
+    take_last(publisher, subscription)
+    timestamps = []
+    for first in range(1, 1001, 100 // step):  # no more at once than a reader of mode "latest" can take one by one
+        publish(publisher, clock, first, 100 // step)
+        timestamps += take(subscription, 1)
+    assert timestamps == list(range(1, 1001, 100 // step))
+    assert subscription.counts == nedbus.Counts(received=1 + 10 * step)
 
 
-def test_asyncio_twin(endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
-    """The twin takes the same option, and refuses the same values."""
-    publisher = bus.publisher(VLP, vehicle="7")
-    publisher.publish(message(1))
-
-    async def read() -> list[int]:
-        async with nedbus.connect_async(endpoint) as other:
-            for value in (0, -1, math.nan):
-                with pytest.raises(nedbus.ConfigError, match="max_rate"):
-                    other.subscribe(max_rate=value)
-            async with other.subscribe(VLP, mode="every", max_rate=5) as subscription:
-                timestamps = [(await subscription.receive(DEADLINE)).message.timestamp]
-                await asyncio.to_thread(wait_for_demand, publisher)
-                publish(publisher, clock, 2, 100)
-                timestamps += [(await subscription.receive(DEADLINE)).message.timestamp for _ in range(5)]
-                assert subscription.counts == nedbus.Counts(received=6)
-                return timestamps
-
-    assert asyncio.run(read()) == [1, 2, 22, 42, 62, 82]
-
-
-@pytest.mark.parametrize("value", [0, -5, math.nan, math.inf])
-def test_invalid_rate_is_refused(bus: nedbus.Bus, value: float) -> None:
-    """A rate that is none is a ConfigError that names it."""
-    with pytest.raises(nedbus.ConfigError, match=f"max_rate: {value!r} is invalid"):
-        bus.subscribe(max_rate=value)
-    with pytest.raises(nedbus.ConfigError, match="max_rate"):
-        bus.subscribe_to(Selection(VLP), max_rate=value)
+def test_invalid_rate_is_refused(client: nedbus.Bus) -> None:
+    """A rate that is none is a ConfigError that names it, from either client."""
+    with pytest.raises(nedbus.ConfigError, match="max_rate: 0 is invalid"):
+        client.subscribe(max_rate=0)
+    with pytest.raises(nedbus.ConfigError, match="max_rate: nan is invalid"):
+        client.subscribe_to(Selection(VLP), max_rate=math.nan)
 
 
 def test_every_topic_and_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
@@ -198,7 +81,7 @@ def test_messages_arrive_as_they_were(bus: nedbus.Bus, clock: Clock) -> None:
     publisher = bus.publisher(VLP, vehicle="7", source="ins")
     with bus.subscribe(VLP, mode="every") as whole, bus.subscribe(VLP, mode="every", max_rate=5) as thinned:
         wait_for_demand(publisher)
-        wait_for_reader(bus._session, publisher.key)
+        wait_for_subscriber(publisher)
         clock.now += 10 * MS
         publisher.publish({"timestamp": 5, "x": 0.1})
         one, other = whole.receive(DEADLINE), thinned.receive(DEADLINE)
@@ -220,40 +103,39 @@ def test_array_is_thinned(bus: nedbus.Bus, clock: Clock) -> None:
         assert take(subscription, 2) == [1, 1]
 
 
-def demands_of(publisher: nedbus.Publisher) -> list[Demand]:
-    """Return what a publisher knows of its readers: Zenoh tells of each declaration for itself."""
-    thinned = publisher._thinned
-    assert thinned._demand is not None
-    return [thinned.vehicle, thinned._demand, *(step._demand for step in thinned._steps)]
+def thinned_by(raw: Session) -> list[str]:
+    """Return the thinned streams that are declared, by their liveliness tokens."""
+    return [str(reply.ok.key_expr) for reply in raw.liveliness().get("nedbus/**/@rate/*") if reply.ok]
 
 
-def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, clock: Clock) -> None:
+def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
     """A publisher declares thinned streams for who reads them, and withdraws them a minute after; not for others."""
-    publisher = bus.publisher(VLP, vehicle="7")
-    other = bus.publisher(VLP, vehicle="8")
-    with bus.subscribe(VLP, mode="every") as subscription:
-        wait_for_reader(bus._session, publisher.key)
-        publish(publisher, clock, 1, 10)
-        assert take(subscription, 10) == list(range(1, 11))
-        assert not publisher._thinned.opened
+    publisher, other = (bus.publisher(VLP, vehicle=vehicle) for vehicle in "78")
+    subscription = bus.subscribe(VLP, mode="every")
+    wait_for_subscriber(publisher)
+    publish(publisher, clock, 1, 10)
+    assert take(subscription, 10) == list(range(1, 11))
+    assert thinned_by(raw) == []
     for _ in range(2):
         with bus.subscribe(VLP, vehicle="7", mode="every", max_rate=5):
             wait_for_demand(publisher)
             publish(publisher, clock, 11, 2)
             publish(other, clock, 11, 2)
-            assert [step._rate for step in publisher._thinned._steps if step.opened] == [5]
-            assert not other._thinned.opened
-        wait_for(lambda: not any(demand.is_wanted() for demand in demands_of(publisher)), what="the end of the demand")
-        publish(publisher, clock, 13, 100)
-        assert publisher._thinned.opened
-        clock.now += 61_000 * MS
-        publish(publisher, clock, 113, 1)
-        assert not publisher._thinned.opened
+            wait_for(lambda: thinned_by(raw) == [f"{publisher.key}/@rate/5"], what="the thinned stream")
+        wait_for(lambda: not is_wanted(publisher), what="the end of the demand")
+        publish(publisher, clock, 13, 3000)
+        assert thinned_by(raw)
+
+        def withdraws() -> bool:
+            clock.now += 61_000 * MS
+            publish(publisher, clock, 4000, 1)
+            return not thinned_by(raw)
+
+        wait_for(withdraws, what="the end of the thinned stream")
 
 
 def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
     """Closed publishers leave nothing, and another one of the same vehicle is thinned again."""
-    demands = bus._publishers._thinned_demands
     first = bus.publisher(VLP, vehicle="8")
     first.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
@@ -264,31 +146,24 @@ def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock
                 wait_for_demand(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
-            assert not demands
+            assert not bus._publishers._thinned_demands  # as nobody else could see
         assert subscription.counts == nedbus.Counts(received=11)
 
 
 def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
     """A subscription starts with last messages of publishers, and not with what a storage kept of vehicles."""
-    stored = "nedbus/8/vehicle_local_position"
-
-    def reply(query: zenoh.Query) -> None:
-        with query:
-            query.reply(stored, encode(message(99)), timestamp=raw.new_timestamp())
-
-    storage = raw.declare_queryable("nedbus/*/vehicle_local_position", zenoh.handlers.Callback(reply, indirect=False))
+    stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=raw.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
-    with bus.subscribe(VLP, max_rate=5) as subscription:
+    with answering(raw, f"nedbus/*/{VLP}", stored), bus.subscribe(VLP, max_rate=5) as subscription:
         assert subscription.receive(DEADLINE).vehicle == "7"
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)
         assert subscription.receive(DEADLINE).vehicle == "7"
-    storage.undeclare()
 
 
 def publish_over_a_break(
-    publisher: nedbus.Publisher, subscription: nedbus.Subscription, clock: Clock, link: ThinLink, seconds: int
+    publisher: nedbus.Publisher, subscription: nedbus.Subscription, clock: Clock, link: Link, seconds: int
 ) -> list[nedbus.Sample]:
     """Publish 1 s of 100 Hz, so many while the link is cut, and on; return what arrived, up to something after that."""
     take_last(publisher, subscription)
@@ -297,7 +172,7 @@ def publish_over_a_break(
         publish(publisher, clock, first, 20)
         taken.append(subscription.receive(DEADLINE))
     link.cut()
-    wait_for(lambda: not publisher._thinned.vehicle.is_wanted(), what="the end of the link")
+    wait_for(lambda: not is_wanted(publisher), what="the end of the link")
     last = 100 + 100 * seconds
     publish(publisher, clock, 101, last - 100)
     link.broken = False
@@ -322,7 +197,7 @@ def test_broken_link(endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, s
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with (
-        closing(ThinLink(endpoint, rate=math.inf)) as link,
+        closing(Link(endpoint)) as link,
         nedbus.connect(link.endpoint) as other,
         other.subscribe(VLP, mode=mode, max_rate=5) as subscription,
     ):
@@ -360,24 +235,15 @@ def test_lossless_publisher_does_not_wait(endpoint: str, bus: nedbus.Bus) -> Non
         assert subscription.waiting <= seconds + 2
 
 
-@pytest.fixture
-def link(endpoint: str) -> Iterator[ThinLink]:
-    """Make a thin link to the router."""
-    with closing(ThinLink(endpoint)) as link:
-        yield link
-
-
-@pytest.mark.parametrize("mode", BOTH)
-@pytest.mark.parametrize("thin", ["reader", "vehicle"])
-def test_thin_link_carries_what_is_asked_for(
-    endpoint: str, link: ThinLink, clock: Clock, mode: Mode, thin: str
-) -> None:
+@pytest.mark.parametrize(("mode", "thin"), [("latest", "reader"), ("every", "vehicle")])
+def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: Mode, thin: str) -> None:
     """5 Hz of a 100 Hz stream take less than 5 kB/s of a link, be it the reader's or the vehicle's."""
-    near, far = (link.endpoint, endpoint) if thin == "reader" else (endpoint, link.endpoint)
-    with nedbus.connect(far, timeout=DEADLINE) as vehicle, nedbus.connect(near, timeout=DEADLINE) as reader:
-        publisher = vehicle.publisher(VLP, vehicle="7")
-        publisher.publish(message(0))
-        with reader.subscribe(VLP, mode=mode, max_rate=5) as subscription:
+    with closing(Link(endpoint)) as link:
+        near, far = (link.endpoint, endpoint) if thin == "reader" else (endpoint, link.endpoint)
+        with nedbus.connect(far) as vehicle, nedbus.connect(near) as reader:
+            publisher = vehicle.publisher(VLP, vehicle="7")
+            publisher.publish(message(0))
+            subscription = reader.subscribe(VLP, mode=mode, max_rate=5)
             take_last(publisher, subscription)
             carried = link.carried
             timestamps = []
@@ -403,9 +269,9 @@ def test_publisher_of_an_older_nedbus(
     put = ThinnedStreams.put
     monkeypatch.setattr(ThinnedStreams, "put", lambda *args: put(*args) if knows else None)
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=1) as subscription:
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
         for publisher in publishers:
-            wait_for_reader(bus._session, publisher.key)
+            wait_for_subscriber(publisher)
         taken: list[nedbus.Sample] = []
         last = 0
 
@@ -421,19 +287,19 @@ def test_publisher_of_an_older_nedbus(
         wait_for(publish_until_taken, what="messages")
         for vehicle in ("7", "8"):
             sent = [each.sent for each in taken if each.vehicle == vehicle if each.sent is not None]
-            assert len(sent) <= (sent[-1] - sent[0]) / 1e9 + 2.01  # two at once perhaps, after a pause of this process
+            # Two at once perhaps, after a pause of this process.
+            assert len(sent) <= 10 * (sent[-1] - sent[0]) / 1e9 + 2.1
         assert subscription.counts == nedbus.Counts(received=len(taken))
         assert caplog.text.count("nobody sends it thinned") == 1
         knows = True
-        thinned = cast("ThinnedSubscriber", subscription._subscriber)
-        wait_for(lambda: publish_until_taken() and not thinned._wholes, what="the end of the whole streams")
+        wait_for(lambda: publish_until_taken() and not any(map(is_read, publishers)), what="no more whole streams")
         assert subscription.counts.lost == 0
 
 
 def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, caplog: pytest.LogCaptureFixture) -> None:
     """One without a liveliness token is read whole by who asks for this one stream; a timestamp it need not have."""
     key = "nedbus/7/vehicle_local_position"
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, vehicle="7", max_rate=2) as subscription:
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, vehicle="7", max_rate=10) as subscription:
         wait_for_reader(raw, key)
         publisher = raw.declare_publisher(key)
         taken: list[int] = []
@@ -449,14 +315,22 @@ def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, cap
 
         start = time.monotonic()
         wait_for(put_until_taken, what="messages")
-        assert time.monotonic() - start >= 1.0  # 4 messages at 2 Hz, two of them at once perhaps
+        assert time.monotonic() - start >= 0.2  # 4 messages at 10 Hz, two of them at once perhaps
         assert caplog.text.count("nobody sends it thinned") == 1
 
 
-def test_reader_of_all_waits_for_vehicles_that_thin(
-    bus: nedbus.Bus, clock: Clock, caplog: pytest.LogCaptureFixture
+def test_vehicle_that_thins_is_never_read_whole(
+    bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Who sends thinned is never read whole, also when the last message was long ago."""
+    """Who sends thinned is not read whole, also when the last message was long ago."""
+    looks: list[set[str]] = []
+    needed = Unthinned.needed
+
+    def look(unthinned: Unthinned, heard: set[str], now: float) -> set[str]:
+        looks.append(needed(unthinned, heard, now))
+        return looks[-1]
+
+    monkeypatch.setattr(Unthinned, "needed", look)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
     with caplog.at_level(logging.WARNING), bus.subscribe(VLP, max_rate=5) as subscription:
@@ -464,13 +338,14 @@ def test_reader_of_all_waits_for_vehicles_that_thin(
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)
         assert take(subscription, 1) == [2]
-        thinned = cast("ThinnedSubscriber", subscription._subscriber)
-        wait_for(lambda: thinned._unthinned._since, what="the vehicle's token")
-        assert not thinned._wholes
+        monkeypatch.setattr("nedbus.client.unthinned.PATIENCE", 0.0)
+        before = len(looks)
+        wait_for(lambda: len(looks) > before + 1, what="a look at streams that nobody thins")
+        assert not any(looks)
+        assert not is_read(publisher)
     assert not caplog.text
 
 
-@pytest.mark.process
 def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
     """`nedbus echo --max-rate 5` prints each 20th message of 100 Hz."""
     publisher = bus.publisher(VLP, vehicle="7")
@@ -484,16 +359,6 @@ def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -
     column = head.split(",").index("timestamp")
     assert [int(row.split(",")[column]) for row in rows] == [0, *range(1, 1001, 20)]
     assert not echo.err
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("value", ["0", "-1", "nan"])
-def test_echo_refuses_what_is_no_rate(run_nedbus: Start, value: str) -> None:
-    """A rate that is none ends with 2 and one line, before a router is looked for."""
-    echo = run_nedbus("echo", "--wait", "-c", "tcp/127.0.0.1:1", "--max-rate", value)
-    assert echo.wait() == 2
-    assert "max" in echo.err
-    assert "rate" in echo.err
 
 
 def test_rate_keys() -> None:

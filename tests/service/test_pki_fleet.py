@@ -1,4 +1,4 @@
-"""Certificates and access rules of many vehicles, in a real zenohd: what is made is used, not only read."""
+"""Certificates and access rules of many vehicles, in real routers: what is made is used, not only read."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -28,48 +29,43 @@ from nedbus.transport import (
     make_authority,
     make_bundle,
     make_certificate,
+    open_client,
+    open_router,
     read_access_rules,
     renew_certificate,
     write_access_rules,
 )
 from nedbus_msgs import AddressError
-from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for
-from tests.zenohd import start_zenohd
+from tests import certificates
+from tests.certificates import secure_endpoint, tls_of, write_config
+from tests.command_line import run_command
+from tests.messages import VLP, message
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
+from tests.zenohd import EITHER, start_zenohd
 
 ROOT = Path(__file__).parents[2]
-CONFIG = ROOT / "config" / "router-secure.json5"
-VLP = "vehicle_local_position"
+CONFIG = certificates.CONFIG / "router-secure.json5"
 FLEET = [str(number) for number in range(1, 201)]
 SAMPLE = ("1", "99", "200")
 
+made = certificates.pki
 Join = Callable[..., nedbus.Bus]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make an authority with the certificates of two routers, some vehicles of a fleet, a reader and an operator."""
-    folder = tmp_path_factory.mktemp("pki")
-    make_authority(folder)
-    for name in ("router", "router-2"):
-        make_certificate(folder, name, hosts=["127.0.0.1"])
-    for name in ("reader", "operator", *map(certificate_name, SAMPLE)):
-        make_certificate(folder, name)
-    return folder
+RunRouter = Callable[[Path], Callable[[], None]]
 
 
 @pytest.fixture
 def pki(made: Path, tmp_path: Path) -> Path:
-    """Copy them, as a test may change its own."""
-    return Path(shutil.copytree(made, tmp_path / "pki"))
+    """Copy an authority with the certificates of routers, some vehicles and readers: a test may change its own."""
+    bad = shutil.ignore_patterns("foreign", "*expired*", "router-soon*", "router-elsewhere*")
+    return Path(shutil.copytree(made, tmp_path / "pki", ignore=bad))
 
 
 @pytest.fixture
 def file(pki: Path) -> Path:
     """Copy the shipped router file, with these certificates and a free port."""
-    text = CONFIG.read_text().replace("/etc/nedbus/pki", str(pki))
-    path = Path("router.json5").resolve()
-    path.write_text(text.replace("tls/0.0.0.0:7447", free_endpoint().replace("tcp/", "tls/")))
-    return path
+    return write_config(pki, Path("router-secure.json5").resolve(), secure_endpoint())
 
 
 def endpoint_of(file: Path) -> str:
@@ -77,24 +73,32 @@ def endpoint_of(file: Path) -> str:
     return "tls/" + file.read_text().split('listen: { endpoints: ["tls/')[1].split('"')[0]
 
 
-def tls_of(pki: Path, name: str) -> nedbus.Tls:
-    return nedbus.Tls(pki / "ca.crt", pki / f"{name}.crt", pki / f"{name}.key")
+@pytest.fixture(params=EITHER)
+def run_router(request: pytest.FixtureRequest) -> Iterator[RunRouter]:
+    """Run a router with a file, of this process or the real zenohd, and return what ends it."""
+    with ExitStack() as ending:
+
+        def run(file: Path) -> Callable[[], None]:
+            if request.param == "nedbus":
+                end = open_router(config_file=file).close
+            else:
+                end = start_zenohd(request.getfixturevalue("start"), "-c", str(file)).kill
+            ending.callback(end)
+            return end
+
+        yield run
 
 
 @pytest.fixture
 def join(file: Path, pki: Path) -> Iterator[Join]:
     """Connect as somebody, to the router of the file or to others."""
-    opened: list[nedbus.Bus] = []
+    with ExitStack() as opened:
 
-    def join_as(name: str, *endpoints: str, tls: nedbus.Tls | None = None) -> nedbus.Bus:
-        where = list(endpoints) or [endpoint_of(file)]
-        bus = nedbus.connect(where, tls=tls or tls_of(pki, name), timeout=DEADLINE)
-        opened.append(bus)
-        return bus
+        def join_as(name: str, *endpoints: str, tls: nedbus.Tls | None = None) -> nedbus.Bus:
+            where = endpoints or endpoint_of(file)
+            return opened.enter_context(nedbus.connect(where, tls=tls or tls_of(pki, name), timeout=DEADLINE))
 
-    yield join_as
-    for bus in opened:
-        bus.close()
+        yield join_as
 
 
 def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others: list[str]) -> None:
@@ -117,25 +121,24 @@ def assert_writes_only(bus: nedbus.Bus, reader: nedbus.Bus, vehicle: str, others
 
 
 def test_bundle_is_all_that_a_vehicle_needs(
-    start: Start, run_nedbus: Start, tmp_path: Path, *, file: Path, pki: Path, join: Join
+    run_router: RunRouter, run_nedbus: Start, tmp_path: Path, *, file: Path, pki: Path, join: Join
 ) -> None:
     """One command makes it; a service with its nedbus.toml publishes its vehicle and no other."""
     bundle, endpoint = tmp_path / "wing", endpoint_of(file)
-    enrolled = run_nedbus(
+    enrolled = run_command(
         *("pki", "enroll", str(pki), "wing", "--router", endpoint, "--output", str(bundle), "--target", str(bundle)),
         *("--source", "sim:", "--source", "sim:?vehicle=99"),
     )
-    assert enrolled.wait() == 0, enrolled.err
+    assert enrolled.exit_code == 0, enrolled.err
     files = {str(Path(line).relative_to(bundle)) for line in enrolled.out.splitlines()}
     own = {"pki/ca.crt", "pki/vehicle-wing.crt", "pki/vehicle-wing.key"}
     assert files == own | {"nedbus.toml", "compose.yml", "README.txt"}
     assert stat.S_IMODE((bundle / "pki" / "vehicle-wing.key").stat().st_mode) == 0o600
     assert (pki / "vehicle-wing.crt").is_file()
     assert not (pki / "vehicle-wing.key").exists()
-    added = run_nedbus("pki", "rules", str(file), "--add", "99", "wing")
-    assert added.wait() == 0, added.err
-    assert added.out.split("\n") == ["+ 99", "+ wing", ""]
-    start_zenohd(start, "-c", str(file))
+    added = run_command("pki", "rules", str(file), "--add", "99", "wing")
+    assert (added.exit_code, added.out) == (0, "+ 99\n+ wing\n"), added.err
+    run_router(file)
     reader = join("reader")
     run_nedbus("serve", "--config", str(bundle / "nedbus.toml"))
     wait_for(lambda: "wing" in reader.vehicles(), what="the vehicle of the bundle")
@@ -144,6 +147,7 @@ def test_bundle_is_all_that_a_vehicle_needs(
     assert list(reader.vehicles()) == ["wing"]
 
 
+@pytest.mark.slow
 def test_documented_commands_lead_from_nothing_to_a_vehicle_that_is_read(run_nedbus: Start, tmp_path: Path) -> None:
     """The commands of docs/security.md, one after the other in an empty folder, on loopback and without /etc."""
     page = (ROOT / "docs" / "security.md").read_text()
@@ -215,20 +219,21 @@ def test_each_suggested_source_is_one(pki: Path, tmp_path: Path) -> None:
         assert check_service(bundle / "nedbus.toml", offline=True) == []
 
 
-def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path, run_nedbus: Start) -> None:
+def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path) -> None:
     """Nothing is overwritten, and where it fails nothing is left, in the authority's folder either."""
     routers = ["tls/10.0.0.1:7447", "tls/10.0.0.2:7447"]
     before = sorted(pki.iterdir())
     (tmp_path / "taken").mkdir()
-    for output, vehicle in ((tmp_path / "taken", "7"), (tmp_path / "new", "1"), (Path("/proc/nowhere/new"), "7")):
-        with pytest.raises(nedbus.PkiError, match=r"exists: it is not overwritten|cannot be made"):
-            make_bundle(pki, vehicle, output, routers=routers)
-    with pytest.raises(nedbus.ConfigError, match="shows no certificate"):
-        make_bundle(pki, "7", tmp_path / "new", routers=["tcp/10.0.0.1:7447"])
-    with pytest.raises(AddressError):
-        make_bundle(pki, "../7", tmp_path / "new", routers=routers)
-    with pytest.raises(AddressError):
-        make_bundle(pki, "x" * 60, tmp_path / "new", routers=routers)
+    for vehicle, output, router, error, reason in (
+        ("7", tmp_path / "taken", routers[0], nedbus.PkiError, "exists: it is not overwritten"),
+        ("1", tmp_path / "new", routers[0], nedbus.PkiError, "exists: it is not overwritten"),
+        ("7", Path("/proc/nowhere/new"), routers[0], nedbus.PkiError, "cannot be made"),
+        ("7", tmp_path / "new", "tcp/10.0.0.1:7447", nedbus.ConfigError, "shows no certificate"),
+        ("../7", tmp_path / "new", routers[0], AddressError, "vehicle"),
+        ("x" * 60, tmp_path / "new", routers[0], AddressError, "vehicle"),
+    ):
+        with pytest.raises(error, match=reason):
+            make_bundle(pki, vehicle, output, routers=[router])
     assert sorted(pki.iterdir()) == before
     assert not (tmp_path / "new").exists()
     make_bundle(pki, "7", tmp_path / "new", routers=routers)
@@ -241,15 +246,15 @@ def test_bundle_is_made_once_whole_or_not_at_all(pki: Path, tmp_path: Path, run_
         "vehicle": "7",
     }
     assert not list(tmp_path.glob(".*"))
-    again = run_nedbus("pki", "enroll", str(pki), "7", "--router", routers[0], "-o", str(tmp_path / "other"))
-    assert again.wait() == 1
+    again = run_command("pki", "enroll", str(pki), "7", "--router", routers[0], "-o", str(tmp_path / "other"))
+    assert again.exit_code == 1
     assert "vehicle-7.crt exists: it is not overwritten" in again.err
 
 
-def test_renewed_certificate_works_beside_the_old_one(start: Start, file: Path, pki: Path, join: Join) -> None:
+def test_renewed_certificate_works_beside_the_old_one(run_router: RunRouter, file: Path, pki: Path, join: Join) -> None:
     """Name and key stay; who is connected with the old one stays, and both may connect."""
     write_access_rules(file, SAMPLE)
-    start_zenohd(start, "-c", str(file))
+    run_router(file)
     old = Path(shutil.copytree(pki, "old"))
     before, reader = join("vehicle-99"), join("reader")
     entry = next(entry for entry in list_certificates(pki) if entry.name == "vehicle-99")
@@ -265,38 +270,43 @@ def test_renewed_certificate_works_beside_the_old_one(start: Start, file: Path, 
         assert_writes_only(bus, reader, "99", ["1"])
 
 
-def test_connection_reads_the_certificate_again(start: Start, file: Path, pki: Path, join: Join) -> None:
+def test_connection_reads_the_certificate_again(run_router: RunRouter, file: Path, pki: Path, join: Join) -> None:
     """A renewed file takes effect at the next connection, without a restart: here it is another vehicle's."""
     write_access_rules(file, SAMPLE)
-    router = start_zenohd(start, "-c", str(file))
-    for end in ("crt", "key"):
-        shutil.copy(pki / f"vehicle-1.{end}", pki / f"own.{end}")
+    end = run_router(file)
+    for suffix in (".crt", ".key"):
+        shutil.copy(pki / f"vehicle-1{suffix}", pki / f"own{suffix}")
     bus = join("own")
     assert_writes_only(bus, join("reader"), "1", ["99"])
-    for end in ("crt", "key"):
-        shutil.copy(pki / f"vehicle-99.{end}", pki / f"own.{end}")
-    router.kill()
-    start_zenohd(start, "-c", str(file))
+    for suffix in (".crt", ".key"):
+        shutil.copy(pki / f"vehicle-99{suffix}", pki / f"own{suffix}")
+    end()
+    run_router(file)
     assert_writes_only(bus, join("reader"), "99", ["1"])
 
 
-def test_only_what_is_due_is_renewed(pki: Path, run_nedbus: Start) -> None:
+def pki_command(code: int, command: str, *arguments: str) -> tuple[list[str], str]:
+    """Run `nedbus pki` and return what it printed, on stdout by lines, and on stderr."""
+    ended = run_command("pki", command, *arguments)
+    assert ended.exit_code == code, ended.err
+    return ended.out.splitlines(), ended.err
+
+
+def test_only_what_is_due_is_renewed(tmp_path: Path) -> None:
     """By default what ends within 30 days; hosts of a router are kept; list says who has what, and until when."""
-    for name in ("router", "vehicle-1", "vehicle-99"):
-        (pki / f"{name}.key").unlink()
-        (pki / f"{name}.crt").unlink()
-    make_certificate(pki, "router", hosts=["127.0.0.1", "gcs", "::1"], days=29)
-    make_certificate(pki, "vehicle-1", days=-1)
-    make_certificate(pki, "vehicle-99", days=40)
-    make_authority(pki / "foreign")
-    make_certificate(pki / "foreign", "alien", days=5)
-    shutil.copy(pki / "foreign" / "alien.crt", pki)
-    shutil.copy(pki / "reader.key", pki / "operator.key")
+    folder = tmp_path / "fleet"
+    make_authority(folder)
+    make_authority(folder / "foreign")
+    make_certificate(folder, "router", hosts=["127.0.0.1", "gcs", "::1"], days=29)
+    for name, days in (("vehicle-1", -1), ("vehicle-99", 40), ("reader", 800), ("operator", 800)):
+        make_certificate(folder, name, days=days)
+    make_certificate(folder / "foreign", "alien", days=5)
+    shutil.copy(folder / "foreign" / "alien.crt", folder)
+    shutil.copy(folder / "reader.key", folder / "operator.key")
 
     def states() -> dict[str, tuple[str, str]]:
-        listed = run_nedbus("pki", "list", str(pki), "--json")
-        assert listed.wait() == 0, listed.err
-        return {row["name"]: (row["use"], row["state"]) for row in json.loads(listed.out)}
+        listed = "\n".join(pki_command(0, "list", str(folder), "--json")[0])
+        return {row["name"]: (row["use"], row["state"]) for row in json.loads(listed)}
 
     assert states() == {
         "ca": ("authority", "valid"),
@@ -306,46 +316,41 @@ def test_only_what_is_due_is_renewed(pki: Path, run_nedbus: Start) -> None:
         "vehicle-99": ("client", "valid"),
         "operator": ("client", "not of the key beside it"),
         "reader": ("client", "valid"),
-        "router-2": ("router", "valid"),
-        "vehicle-200": ("client", "valid"),
     }
-    renewed = run_nedbus("pki", "renew", str(pki))
-    assert renewed.wait() == 0, renewed.err
-    assert renewed.out.splitlines() == [str(pki / "vehicle-1.crt"), str(pki / "router.crt")]
-    entries = {entry.name: entry for entry in list_certificates(pki)}
+    assert pki_command(0, "renew", str(folder))[0] == [str(folder / "vehicle-1.crt"), str(folder / "router.crt")]
+    entries = {entry.name: entry for entry in list_certificates(folder)}
     assert entries["router"].hosts == ("127.0.0.1", "gcs", "::1")
     assert entries["router"].until > datetime.now(UTC) + timedelta(days=800)
-    again = run_nedbus("pki", "renew", str(pki))
-    assert again.wait() == 0
-    assert (again.out, "nothing expires within 30 days" in again.err) == ("", True)
-    by_name = run_nedbus("pki", "renew", str(pki), "operator", "--new-key", "--days", "10")
-    assert by_name.wait() == 0, by_name.err
+    out, said = pki_command(0, "renew", str(folder))
+    assert (out, "nothing expires within 30 days" in said) == ([], True)
+    pki_command(0, "renew", str(folder), "operator", "--new-key", "--days", "10")
     assert states()["operator"] == ("client", "expires soon")
     for name, reason in (("nobody", "has no certificate of 'nobody'"), ("alien", "renew it where that authority is")):
-        refused = run_nedbus("pki", "renew", str(pki), name)
-        assert refused.wait() == 1
-        assert reason in refused.err
-    table = run_nedbus("pki", "list", str(pki))
-    assert table.wait() == 0
-    assert [line.split()[0] for line in table.out.splitlines()][:2] == ["NAME", "ca"]
+        assert reason in pki_command(1, "renew", str(folder), name)[1]
+    assert [line.split()[0] for line in pki_command(0, "list", str(folder))[0]][:2] == ["NAME", "ca"]
 
 
-def test_authority_is_renewed_under_what_it_signed(start: Start, file: Path, pki: Path, join: Join) -> None:
+def test_authority_is_renewed_under_what_it_signed(run_router: RunRouter, tmp_path: Path) -> None:
     """It keeps its key: old certificates are valid under the new one, and none ends after its authority."""
-    for name in ("ca.crt", "ca.key"):
-        (pki / name).unlink()
-    make_authority(pki, days=20)
-    for name in ("router", "reader"):
-        for end in ("crt", "key"):
-            (pki / f"{name}.{end}").unlink()
-        make_certificate(pki, name, hosts=["127.0.0.1"] if name == "router" else ())
-    first, *others = list_certificates(pki)
+    folder, endpoint = tmp_path / "fleet", secure_endpoint()
+    make_authority(folder, days=20)
+    make_certificate(folder, "router", hosts=["127.0.0.1"])
+    make_certificate(folder, "reader")
+    first, *others = list_certificates(folder)
     assert first.use == "authority"
-    assert {entry.until for entry in others if not entry.problem} == {first.until}
-    assert renew_certificate(first) == [pki / "ca.crt"]
-    assert list_certificates(pki)[0].until > first.until + timedelta(days=3000)
-    start_zenohd(start, "-c", str(file))
-    join("reader")
+    assert {entry.until for entry in others} == {first.until}
+    assert renew_certificate(first) == [folder / "ca.crt"]
+    assert list_certificates(folder)[0].until > first.until + timedelta(days=3000)
+    run_router(write_config(folder, tmp_path / "router-secure.json5", endpoint))
+    nedbus.connect(endpoint, tls=tls_of(folder, "reader"), timeout=DEADLINE).close()
+
+
+def test_authority_that_has_expired_is_no_reason_beside_its_new_one(pki: Path, tmp_path: Path) -> None:
+    """Of several in one file one that is valid is enough; where all have expired that is why nothing connects."""
+    expired, both = make_authority(tmp_path / "old", days=-1)[1], tmp_path / "both.crt"
+    both.write_bytes(expired.read_bytes() + (pki / "ca.crt").read_bytes())
+    assert nedbus.Tls(expired).explain() == f"{expired} has expired"
+    assert nedbus.Tls(both).explain() is None
 
 
 def mistrust(ca: Path, server: nedbus.Tls, client: nedbus.Tls, *, strict: bool) -> str:
@@ -388,26 +393,17 @@ def without_identifiers(path: Path, authority: Path) -> None:
     path.write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
 
 
-def test_certificates_are_whole(pki: Path) -> None:
-    """Python's TLS takes them as it is from 3.13 on (VERIFY_X509_STRICT), renewed ones too."""
+@pytest.mark.parametrize("earlier", [False, True], ids=["of this version", "of earlier ones"])
+def test_certificates_are_whole(pki: Path, *, earlier: bool) -> None:
+    """Python's TLS takes them as strictly as from 3.13 on; earlier ones are as good as before, whole once renewed."""
     router, reader = tls_of(pki, "router"), tls_of(pki, "reader")
-    assert mistrust(pki / "ca.crt", router, reader, strict=True) == ""
-    for entry in list_certificates(pki):
-        renew_certificate(entry, replace_key=entry.name == "reader")
-        assert mistrust(pki / "ca.crt", router, reader, strict=True) == "", f"after {entry.name} was renewed"
-
-
-def test_certificates_without_identifiers_go_on_working(pki: Path) -> None:
-    """Those of earlier versions are as good as before, with renewed ones too, and whole when all are renewed."""
-    for name in ("ca", "router", "reader"):
+    for name in ("ca", "router", "reader") if earlier else ():
         without_identifiers(pki / f"{name}.crt", pki / "ca.key")
-    router, reader = tls_of(pki, "router"), tls_of(pki, "reader")
-    assert mistrust(pki / "ca.crt", router, reader, strict=False) == ""
-    assert "Identifier" in mistrust(pki / "ca.crt", router, reader, strict=True)
+    assert ("Identifier" in mistrust(pki / "ca.crt", router, reader, strict=True)) == earlier
     entries = {entry.name: entry for entry in list_certificates(pki)}
     for name in ("reader", "ca", "router"):
-        renew_certificate(entries[name])
-        assert mistrust(pki / "ca.crt", router, reader, strict=False) == "", f"after {name} was renewed"
+        assert mistrust(pki / "ca.crt", router, reader, strict=not earlier) == "", f"before {name} was renewed"
+        renew_certificate(entries[name], replace_key=not earlier and name == "reader")
     assert mistrust(pki / "ca.crt", router, reader, strict=True) == ""
 
 
@@ -423,27 +419,27 @@ def test_shipped_file_is_what_rules_writes(tmp_path: Path) -> None:
     assert copy.read_text() == CONFIG.read_text()
 
 
-def test_rules_are_written_from_a_list(file: Path, pki: Path, run_nedbus: Start, tmp_path: Path) -> None:
-    """The list is complete unless it says --add or --remove; nothing is written that is wrong."""
+def test_rules_are_written_from_a_list(file: Path, pki: Path, tmp_path: Path) -> None:
+    """The list is complete unless it says --add or --remove; nothing wrong is written, and the file keeps its mode."""
+    file.chmod(0o640)
     names = tmp_path / "names"
     names.write_text("10\n2   # the second\n\nwing\n")
 
     def rules(*arguments: str, code: int = 0) -> tuple[list[str], str]:
-        process = run_nedbus("pki", "rules", *arguments)
-        assert process.wait() == code, process.err
-        return process.out.splitlines(), process.err
+        return pki_command(code, "rules", str(file), *arguments)
 
-    assert rules(str(file))[0] == ["1"]
-    changes, said = rules(str(file), "--from", str(names))
+    assert rules()[0] == ["1"]
+    changes, said = rules("--from", str(names))
     assert changes == ["+ 2", "+ 10", "+ wing", "- 1"]
     assert "names 3 vehicles: the router takes it when it starts again" in said
-    assert rules(str(file), "--add", "2", "1")[0] == ["+ 1"]
-    assert rules(str(file), "--remove", "wing", "10")[0] == ["- 10", "- wing"]
-    assert rules(str(file))[0] == ["1", "2"]
-    assert rules(str(file), "--from", str(pki))[0] == ["+ 99", "+ 200", "- 2"]
+    assert rules("--add", "2", "1")[0] == ["+ 1"]
+    assert rules("--remove", "wing", "10")[0] == ["- 10", "- wing"]
+    assert rules()[0] == ["1", "2"]
+    assert rules("--from", str(pki))[0] == ["+ 99", "+ 200"]
+    assert stat.S_IMODE(file.stat().st_mode) == 0o640
     before = file.read_bytes()
-    assert "it does not name vehicle '7'" in rules(str(file), "--remove", "7", code=2)[1]
-    assert "cannot be combined" in rules(str(file), "--add", "--remove", "7", code=2)[1]
+    assert "it does not name vehicle '7'" in rules("--remove", "7", code=2)[1]
+    assert "cannot be combined" in rules("--add", "--remove", "7", code=2)[1]
     for vehicles, prefix in (([], "nedbus"), (["a/b"], "nedbus"), (["1"], "a*"), (["x" * 60], "nedbus")):
         with pytest.raises((nedbus.ConfigError, AddressError)):
             write_access_rules(file, vehicles, prefix=prefix)
@@ -454,52 +450,49 @@ def test_rules_are_written_from_a_list(file: Path, pki: Path, run_nedbus: Start,
             write_access_rules(path, ["1"])
 
 
-def test_rules_of_200_vehicles_hold(start: Start, file: Path, join: Join) -> None:
+def test_rules_of_200_vehicles_hold(run_router: RunRouter, file: Path, join: Join) -> None:
     """A router takes them all, each vehicle may write its own keys only, and one that was removed nothing."""
     write_access_rules(file, FLEET)
     assert read_access_rules(file) == FLEET
-    router = start_zenohd(start, "-c", str(file))
+    end = run_router(file)
     reader = join("reader")
     for vehicle in SAMPLE:
         others = [each for each in ("1", "2", "99", "100", "200", "201") if each != vehicle]
         assert_writes_only(join(certificate_name(vehicle)), reader, vehicle, others)
-    router.kill()
+    end()
     write_access_rules(file, FLEET[:-1])
-    start_zenohd(start, "-c", str(file))
+    run_router(file)
     removed, reader = join("vehicle-200"), join("reader")
     removed.publisher(VLP, vehicle="200").publish(message(200))
     assert_writes_only(join("vehicle-1"), reader, "1", ["200"])
     assert not reader.latest(VLP, vehicle="200")
 
 
-def test_rules_cannot_change_while_zenohd_runs(start: Start, file: Path, join: Join) -> None:
-    """Its admin space takes no access control, with all permissions either: docs/security.md says what to do instead.
-
-    Where this fails, Zenoh has learned it, and the page can be simpler.
-    """
+@pytest.mark.slow
+def test_rules_cannot_change_while_zenohd_runs(start: Start, file: Path, pki: Path, join: Join) -> None:
+    """Its admin space takes no access control: where this fails, Zenoh has learned it; simplify docs/security.md."""
+    queried = 'messages: ["query"],\n        key_exprs: ["@/'
     text = file.read_text().replace("write: false", "write: true")
-    file.write_text(
-        text.replace(
-            'messages: ["query"],\n        key_exprs: ["@/', 'messages: ["query", "put"],\n        key_exprs: ["@/'
-        )
-    )
+    file.write_text(text.replace(queried, queried.replace('"query"', '"query", "put"')))
     router = start_zenohd(start, "-c", str(file))
-    operator = join("operator")
-    found = [reply.ok for reply in operator._session.get("@/*/router") if reply.ok]
-    for name, value in (("access_control", '{ "enabled": false }'), ("access_control/default_permission", '"allow"')):
-        operator._session.put(f"{found[0].key_expr}/config/{name}", value)
-        refused = f"Error inserting conf value {name} : updating config is only supported for keys starting with"
-        wait_for(lambda: refused in router.out + router.err, what=refused)  # noqa: B023 - it is called at once
+    refused = "Error inserting conf value {} : updating config is only supported for keys starting with"
+    values = {"access_control": '{ "enabled": false }', "access_control/default_permission": '"allow"'}
+    with open_client([endpoint_of(file)], tls=tls_of(pki, "operator"), timeout=DEADLINE) as operator:
+        (answer,) = [reply.ok for reply in operator.get("@/*/router") if reply.ok]
+        for name, value in values.items():
+            operator.put(f"{answer.key_expr}/config/{name}", value)
+        for said in map(refused.format, values):
+            wait_for(lambda: said in router.out + router.err, what=said)  # noqa: B023 - it is called at once
     assert_writes_only(join("vehicle-1"), join("reader"), "1", ["99"])
 
 
-def test_two_routers_take_new_rules_in_turn_without_a_loss(start: Start, file: Path, pki: Path, join: Join) -> None:
+def test_two_routers_take_new_rules_in_turn_without_a_loss(run_router: RunRouter, file: Path, join: Join) -> None:
     """Whoever knows both moves to the other; a reader of mode `every` gets every message, and the new vehicle's too."""
-    first, second = endpoint_of(file), free_endpoint().replace("tcp/", "tls/")
-    other = file.with_name("router-2.json5")
+    first, second = endpoint_of(file), secure_endpoint()
+    other = file.with_name("second.json5")
     text = file.read_text().replace(f'["{first}"]', f'["{second}"]').replace("router.", "router-2.")
     other.write_text(text.replace("connect: { retry:", f'connect: {{ endpoints: ["{first}"], retry:'))
-    routers: list[Process] = [start_zenohd(start, "-c", str(each)) for each in (file, other)]
+    ends = [run_router(each) for each in (file, other)]
     publisher = join("vehicle-1", first, second).publisher(VLP, vehicle="1")
     reader = join("reader", second, first)
     with reader.subscribe(VLP, mode="every") as subscription:
@@ -516,10 +509,10 @@ def test_two_routers_take_new_rules_in_turn_without_a_loss(start: Start, file: P
         wait_for(receive_one_more, what="the first message, through both routers")
         for index, each in enumerate((file, other)):
             write_access_rules(each, ["1", "99"])
-            routers[index].kill()
+            ends[index]()
             known = len(received)
             wait_for(lambda: receive_one_more() and len(received) > known + 20, what="messages")  # noqa: B023 - at once
-            routers[index] = start_zenohd(start, "-c", str(each))
+            run_router(each)
             for name in ("vehicle-99", "reader"):
                 join(name, endpoint_of(each)).close()
             wait_for(lambda: receive_one_more() and len(received) > known + 40, what="messages")  # noqa: B023 - at once

@@ -1,8 +1,4 @@
-"""What a real PX4 sent, played into a real service: Zenoh and MAVLink, beside the vehicle's own log.
-
-The recordings are in ../shared/data/px4, whose README says how they were made.
-They are played as fast as the service takes them, so that no test depends on the machine's speed.
-"""
+"""What a real PX4 sent (../shared/data/px4), played into a service as fast as it takes it, beside the vehicle's log."""
 
 from __future__ import annotations
 
@@ -12,11 +8,11 @@ import json
 import socket
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Self, cast
+from typing import Final, Self
 
 import pytest
 import zenoh
@@ -26,11 +22,17 @@ import nedbus
 from nedbus.sources.mavlink_vehicle import Vehicle, request_rates
 from nedbus.transport import Attachment, Session
 from nedbus_msgs import ANY, Address, VehicleLocalPosition, decode_cdr, encode_cdr, split_ros2_topic, upgrade
-from tests.conftest import DEADLINE, LOGS, Start, free_endpoint, wait_for
+from tests.listening import Listener, status_of_source
+from tests.messages import VLP
+from tests.ports import free_endpoint
+from tests.processes import Start
 from tests.replays import open_replay
+from tests.ulogs import LOGS
+from tests.waits import DEADLINE, wait_for
 from tests.zenohd import start_zenohd
 
-from .test_mavlink import is_in_use, port
+from .test_mavlink import port
+from .test_px4_zenoh import is_read
 
 __all__ = ["port"]  # a fixture
 
@@ -40,7 +42,6 @@ FLIGHT: Final = PX4 / "gps_loss_zenoh.jsonl.gz"
 ALIKE: Final = PX4 / "two_alike_zenoh.jsonl.gz"
 MAVLINK: Final = PX4 / "gps_loss_mavlink.bin.gz"
 WINDOW: Final = 100  # messages that are on their way at once
-VLP = "vehicle_local_position"
 FLAGS = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
 
 pytestmark = [
@@ -98,7 +99,6 @@ class Px4:
     """The session of one PX4: its messages may be dropped wherever there is no room, but by its own queue."""
 
     def __init__(self, endpoint: str) -> None:
-        config = zenoh.Config()
         settings = {
             "scouting/multicast/enabled": False,
             "mode": "client",
@@ -107,6 +107,7 @@ class Px4:
             "listen/endpoints": [],
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 10_000_000,  # us; zenoh-pico waits
         }
+        config = zenoh.Config()
         for name, value in settings.items():
             config.insert_json5(name, json.dumps(value))
         self.session: Session = zenoh.open(config)
@@ -120,8 +121,7 @@ class Px4:
                 drop = zenoh.CongestionControl.DROP
                 publisher = self.session.declare_publisher(sent.key, congestion_control=drop, express=sent.express)
                 self._publishers[sent.key] = publisher
-                matching = cast("Callable[[], zenoh.MatchingStatus]", lambda: publisher.matching_status)
-                wait_for(lambda: matching().matching, what="the service to subscribe")
+                wait_for(lambda: is_read(publisher), what="the service to subscribe")
             self._publishers[sent.key].put(sent.payload, attachment=sent.attachment)
         elif sent.kind == "PUT":
             self._tokens[sent.key] = self.session.liveliness().declare_token(sent.key)
@@ -135,17 +135,22 @@ class Px4:
         self.session.close()
 
 
-def status(bus: nedbus.Bus) -> Mapping[str, Any]:
-    """Return the status of the service's only source."""
-    services = cast("list[dict[str, Any]]", bus.services())
-    return services[0]["sources"][0] if services else {}
+def play(bus: nedbus.Bus, px4s: Sequence[Px4], lines: Iterable[Sent], played: int) -> int:
+    """Send what each PX4 sent, after so many messages, as fast as the service takes it; return how many there are."""
+    for sent in lines:
+        px4s[sent.px4].send(sent)
+        played += bool(sent.payload)
+        if sent.payload and played % WINDOW == 0:
+            wait_until_counted(bus, played)
+    wait_until_counted(bus, played)
+    return played
 
 
 def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
     """Wait until the service published or rejected so many messages; it counts one after it was sent."""
 
     def is_counted() -> bool:
-        now = status(bus)
+        now = status_of_source(bus)
         return bool(now["published"] + now["rejected"] == count)
 
     wait_for(is_counted, what=f"{count} messages")
@@ -160,7 +165,7 @@ def log_rows() -> dict[tuple[Address, int], bytes]:
     return rows
 
 
-@pytest.fixture(params=["embedded", "zenohd"])
+@pytest.fixture(params=["embedded", pytest.param("zenohd", marks=pytest.mark.slow)])
 def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_path: Path) -> str:
     """Start a service that receives from PX4s, as the router or as the client of a zenohd; return the endpoint."""
     endpoint = free_endpoint()
@@ -180,11 +185,9 @@ def where(request: pytest.FixtureRequest, run_nedbus: Start, start: Start, tmp_p
     return endpoint
 
 
+@pytest.mark.slow
 def test_flight_arrives_as_it_was_logged(where: str) -> None:
-    """26,514 messages of a flight, four streams, GPS lost and back: all arrive, to the bit those of PX4's own log.
-
-    Recorded from a real PX4: gps_loss_zenoh.jsonl.gz, gps_loss.ulg.
-    """
+    """26,514 messages of a flight, four streams, GPS lost and back: all arrive, to the bit those of PX4's own log."""
     logged = log_rows()
     equal: Counter[str] = Counter()
     total = 0
@@ -209,7 +212,7 @@ def test_flight_arrives_as_it_was_logged(where: str) -> None:
                 window.setdefault(sent.address, []).append(sent.cdr)
                 total += 1
         wait_until_counted(bus, total)
-        now = status(bus)
+        now = status_of_source(bus)
         assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (total, 0, 0, 0)
         assert (total, every.counts.lost) == (26_514, 0)
     assert equal == {
@@ -220,12 +223,11 @@ def test_flight_arrives_as_it_was_logged(where: str) -> None:
     }
 
 
+@pytest.mark.slow
 def test_two_that_are_alike_are_not_mixed(where: str) -> None:
     """Two PX4s with equal keys and gids: the first is published until the second appears, then neither, and it says so.
 
-    A key with which the second one only announces itself is closed too: nobody knows what it will send.
-    Nothing counts as lost, nothing as a reboot.
-    Recorded from two real PX4s, started 5 s apart: two_alike_zenoh.jsonl.gz.
+    A key with which the second one only announces itself is closed too. Nothing counts as lost or as a reboot.
     """
     lines = list(read_recording(ALIKE))
     second = next(number for number, sent in enumerate(lines) if sent.px4 == 1)
@@ -240,24 +242,13 @@ def test_two_that_are_alike_are_not_mixed(where: str) -> None:
         Px4(where) as first,
         Px4(where) as other,
     ):
-
-        def play(part: list[Sent]) -> None:
-            nonlocal played
-            for sent in part:
-                (first, other)[sent.px4].send(sent)
-                played += bool(sent.payload)
-                if sent.payload and played % WINDOW == 0:
-                    wait_until_counted(bus, played)
-            wait_until_counted(bus, played)
-
-        play(lines[:second])
-        play([sent for sent in meanwhile if sent.px4])
-        play([sent for sent in meanwhile if not sent.px4])
-        play([sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"])
+        later = [sent for sent in lines[its_first + 1 :] if sent.kind == "PUT"]
+        of_both = ([sent for sent in meanwhile if bool(sent.px4) == is_second] for is_second in (True, False))
+        for part in (lines[:second], *of_both, later):
+            played = play(bus, (first, other), part, played)
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
-        wait_until_counted(bus, played)
-        now = status(bus)
+        now = status_of_source(bus)
         assert (now["published"], now["rejected"]) == (len(alone), played - len(alone))
         assert (now["lost"], now["reboots"], every.counts.lost) == (0, 0, 0)
         assert len(now["warnings"]) == 4
@@ -265,24 +256,15 @@ def test_two_that_are_alike_are_not_mixed(where: str) -> None:
 
 
 def test_restart_is_one_reboot(where: str) -> None:
-    """A PX4 that is shut down and started again is one reboot, whatever number of topics it has, and nothing is lost.
-
-    The first 2 s of a real flight, twice: gps_loss_zenoh.jsonl.gz.
-    """
+    """A PX4 that is shut down and started again is one reboot, however many topics it has, and nothing is lost."""
     lines = list(islice(read_recording(FLIGHT), 1100))
     messages = [sent for sent in lines if sent.payload]
     assert len({sent.address for sent in messages}) == 4
     with nedbus.connect(where, timeout=DEADLINE) as bus:
-        for times in (1, 2):
+        for played in (0, len(messages)):
             with Px4(where) as px4:
-                played = (times - 1) * len(messages)
-                for sent in lines:
-                    px4.send(sent)
-                    played += bool(sent.payload)
-                    if sent.payload and played % WINDOW == 0:
-                        wait_until_counted(bus, played)
-                wait_until_counted(bus, played)
-        now = status(bus)
+                play(bus, [px4], lines, played)
+        now = status_of_source(bus)
         assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (2 * len(messages), 0, 0, 1)
 
 
@@ -339,6 +321,7 @@ def count_late_flags(name: str, rate: float) -> int:
     return late
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gps_loss", "twelve_messages"])
 def test_flags_are_hardly_late_at_the_rate_that_is_requested(name: str) -> None:
     """Over a link of 57,600 baud a third, at most, of the positions have late flags that had with two a second."""
@@ -346,15 +329,12 @@ def test_flags_are_hardly_late_at_the_rate_that_is_requested(name: str) -> None:
     assert 0 < 3 * often <= seldom
 
 
-def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
+@pytest.mark.slow
+def test_mavlink_says_what_was_logged(port: int) -> None:
     """Position and velocity equal the log's to the bit, and so do the flags, but for what is younger than their source.
 
-    ESTIMATOR_STATUS comes once a second, so that a flag is up to a second late, and not there before the first one.
-    In this flight that is: both vertical flags 11 times until the first status (1.15 s after the start), both
-    horizontal ones 11 times until GPS is used (3.15 s), 8 times after it was lost (28.15 s), and 4 times after it was
-    back (30.15 s).
-    A vehicle at rest is valid, though PX4 sets the bit of the constant position mode then.
-    Recorded from a real PX4, which nobody had asked for anything: gps_loss_mavlink.bin.gz, gps_loss.ulg.
+    ESTIMATOR_STATUS comes once a second, so that a flag is up to a second late: here at the first status (after
+    1.15 s), and when GPS is used (3.15 s), lost (28.15 s) and back (30.15 s).
     """
     names = ("timestamp", "x", "y", "z", "vx", "vy", "vz")
     logged = {}
@@ -362,23 +342,16 @@ def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
         if message.address.topic == VLP:
             fields = upgrade(message.fields).__dict__
             logged[fields["timestamp"]] = fields
-    endpoint = free_endpoint()
-    run_nedbus("serve", "--listen", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}")
-    wait_for(lambda: is_in_use(port), what="the service to listen")
     differing: Counter[tuple[str, int]] = Counter()
-    compared = pending = 0
-    with (
-        nedbus.connect(endpoint, timeout=DEADLINE) as bus,
-        bus.subscribe(mode="every") as every,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4,
-    ):
+    compared = 0
+    with Listener(f"mavlink:udpin:127.0.0.1:{port}") as listener, socket.socket(type=socket.SOCK_DGRAM) as px4:
         for _, datagram in read_datagrams(MAVLINK):
             px4.sendto(datagram, ("127.0.0.1", port))
-            pending += 1
             if not is_position(datagram):
                 continue
-            fields = every.receive(DEADLINE).message.__dict__
-            pending = 0
+            [received] = listener.receive()
+            assert (received.lost, received.rebooted, listener.rejections) == (0, False, [])
+            fields = upgrade(received.fields).__dict__
             row = logged.get(fields["timestamp"])
             if row is None:
                 continue  # the very last one, after the log was closed
@@ -386,9 +359,6 @@ def test_mavlink_says_what_was_logged(run_nedbus: Start, port: int) -> None:
             assert [fields[name] for name in names] == [row[name] for name in names]
             for flag in FLAGS:
                 differing[flag, (fields["timestamp"] + 850_000) // 1_000_000] += fields[flag] != row[flag]
-        wait_until_counted(bus, 1276)
-        now = status(bus)
-    assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (1276, 0, 0, 0)
     assert compared == 1275
     vertical, horizontal = {1: 11}, {3: 11, 28: 8, 30: 4}
     for flag in FLAGS:

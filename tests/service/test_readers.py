@@ -2,104 +2,114 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
 
 import nedbus
 from nedbus.client.acknowledgement import WINDOW
-from nedbus.transport import open_router
-from nedbus_msgs.arrays import to_array
-from tests.conftest import DEADLINE, Process, Start, free_endpoint, message, wait_for, wait_for_reader
+from nedbus.transport import LEASE, open_router
+from nedbus.transport.session import COMMON_SETTINGS
+from tests.messages import VLP
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
 
-VLP = "vehicle_local_position"
+from .publishing import is_read, numbered, publish, take, wait_for_subscriber
+
 COUNT = 3 * WINDOW
 
 READER = """
-import sys, nedbus
-with nedbus.connect(sys.argv[1]) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
+import os, signal, sys, time, nedbus
+from nedbus.transport import session
+endpoint, last, mode, *lease = sys.argv[1:]
+if lease:
+    session.COMMON_SETTINGS["transport/link/tx/lease"] = 1000 * int(lease[0])
+with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mode="every") as subscription:
     print("ready", flush=True)
     for number, sample in enumerate(subscription, 1):
         if sample.message.timestamp != number or sample.lost:
             sys.exit(f"{sample.message.timestamp} in place of {number}, {sample.lost} lost")
-        if number == 10 and len(sys.argv) > 2:
+        if number == 10:
             print("ten", flush=True)
-        if number == int(sys.argv[-1]):
+        if mode == "slow":
+            time.sleep(0.05)
+        if mode == "amid" and number == 300:
+            os.kill(os.getpid(), signal.SIGSTOP)
+        if number == int(last):
             break
     counts = subscription.counts
-print("whole" if counts == nedbus.Counts(received=number) else counts, flush=True)
+    print("whole" if counts == nedbus.Counts(received=number) else counts, flush=True)
+    signal.pause()  # a publisher waits 5 s for one that has ended
 """
+
+
+def subscribe(endpoint: str) -> Iterator[nedbus.Subscription]:
+    """Open a reader; named before `bus` it ends after that, which would wait 5 s for one that has gone."""
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        yield subscription
+
+
+reader = pytest.fixture(name="reader")(subscribe)
+stuck_reader = pytest.fixture(name="stuck")(subscribe)
 
 
 def publish_all(bus: nedbus.Bus, *, count: int = COUNT) -> tuple[nedbus.Publisher, threading.Thread]:
     """Start to publish messages without losing any, once there is a reader."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
-    wait_for_reader(bus._session, publisher.key)
-    messages = to_array([message(number) for number in range(1, count + 1)])
-    thread = threading.Thread(target=publisher.publish_many, args=[messages], daemon=True)
+    wait_for_subscriber(publisher)
+    thread = threading.Thread(target=publisher.publish_many, args=[numbered(count)], daemon=True)
     thread.start()
     return publisher, thread
 
 
-def test_subscription_that_is_never_read_harms_nobody(endpoint: str, bus: nedbus.Bus) -> None:
-    """Neither another subscription of its own bus, nor another process's, nor closing: all get all that is live."""
-    with nedbus.connect(endpoint) as own, nedbus.connect(endpoint) as other:
-        unread = [own.subscribe(VLP, mode="every") for _ in range(3)]
-        read = [own.subscribe(VLP, mode="every"), other.subscribe(VLP, mode="every")]
-        publisher = bus.publisher(VLP, vehicle="1")
-        wait_for_reader(bus._session, publisher.key)
-        publisher.publish(message(1))
-        assert [each.receive(DEADLINE).message.timestamp for each in read] == [1, 1]
-        for start in range(2, 20_002, 200):
-            for number in range(start, start + 200):
-                publisher.publish(message(number))
-            for each in read:
-                got = [each.receive(DEADLINE).message.timestamp for _ in range(200)]
-                assert got == list(range(start, start + 200))
-        assert [each.receive(DEADLINE).message.timestamp for each in unread] == [1, 1, 1]
-
-
-def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(endpoint: str, bus: nedbus.Bus) -> None:
+def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
+    stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
+) -> None:
     """More than a window is not sent at once while one reader reads nothing, but others see more; both get all."""
-    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as two:
-        stuck, healthy = one.subscribe(VLP, mode="every"), two.subscribe(VLP, mode="every")
-        publisher, sending = publish_all(bus)
-        got = [healthy.receive(DEADLINE).message.timestamp for _ in range(WINDOW + 5)]
-        assert got == list(range(1, WINDOW + 6))
-        assert publisher.published < COUNT
-        late: list[int] = []
-        reading = threading.Thread(
-            target=lambda: late.extend(stuck.receive(DEADLINE).message.timestamp for _ in range(COUNT)), daemon=True
-        )
-        reading.start()
-        got += [healthy.receive(DEADLINE).message.timestamp for _ in range(COUNT - WINDOW - 5)]
-        reading.join(DEADLINE)
-        assert late == got == list(range(1, COUNT + 1))
-        sending.join(DEADLINE)
-        assert not sending.is_alive()
-        assert stuck.counts == healthy.counts == nedbus.Counts(received=COUNT)
-
-
-@pytest.mark.parametrize("when", ["before", "amid"])
-def test_stopped_reader_gets_everything(start: Start, endpoint: str, bus: nedbus.Bus, when: str) -> None:
-    """One that is stopped (SIGSTOP) until Zenoh's lease has ended comes back, and has lost nothing."""
-    stops = "if number == 300: import os, signal; os.kill(os.getpid(), signal.SIGSTOP)\n        if number == int"
-    reader = start("-c", READER.replace("if number == int", stops) if when == "amid" else READER, endpoint, str(COUNT))
-    wait_for(lambda: "ready" in reader.out, what="the reader")
-    if when == "before":
-        reader.popen.send_signal(signal.SIGSTOP)
     publisher, sending = publish_all(bus)
-    wait_for(lambda: publisher._acknowledgement._readers.away, what="the end of the lease")
-    assert sending.is_alive()
-    reader.popen.send_signal(signal.SIGCONT)
-    assert reader.wait(60.0) == 0, reader.err
-    assert reader.out.split()[-1] == "whole"
+    got = take(reader, WINDOW + 5)
+    assert publisher.published < COUNT
+    late: list[int] = []
+    reading = threading.Thread(target=lambda: late.extend(take(stuck, COUNT)), daemon=True)
+    reading.start()
+    got += take(reader, COUNT - len(got))
+    reading.join(DEADLINE)
+    assert late == got == list(range(1, COUNT + 1))
     sending.join(DEADLINE)
     assert not sending.is_alive()
+    assert stuck.counts == reader.counts == nedbus.Counts(received=COUNT)
+
+
+@pytest.mark.parametrize(
+    ("when", "lease"), [("before", 1), ("amid", 1), pytest.param("amid", 5, marks=pytest.mark.slow)]
+)
+def test_stopped_reader_gets_everything(
+    start: Start, endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, when: str, lease: int
+) -> None:
+    """One that is stopped (SIGSTOP) until Zenoh's lease has ended, of 5 s or here 1 s, comes back, and lost nothing."""
+    assert COMMON_SETTINGS["transport/link/tx/lease"] == 1000 * LEASE == 5000
+    begin = time.monotonic()
+    if lease != LEASE:
+        monkeypatch.setattr("nedbus.client.acknowledgement.LEASE", float(lease))
+    stopped = start("-c", READER, endpoint, str(COUNT), when, *([str(lease)] if lease != LEASE else []))
+    wait_for(lambda: "ready" in stopped.out, what="the reader")
+    if when == "before":
+        stopped.popen.send_signal(signal.SIGSTOP)
+    publisher, sending = publish_all(bus)
+    wait_for(lambda: not is_read(publisher), what="the end of the lease")
+    assert sending.is_alive()
+    stopped.popen.send_signal(signal.SIGCONT)
+    sending.join(2 * DEADLINE)
+    assert not sending.is_alive()
+    wait_for(lambda: "whole" in stopped.out or stopped.popen.poll() is not None, what="the last message")
+    assert "whole" in stopped.out, stopped.err
+    assert time.monotonic() - begin > lease - 1
+    publisher.close()
 
 
 @pytest.mark.parametrize("lossless", [False, True])
@@ -114,65 +124,62 @@ def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: ned
         publishers = [bus.publisher(VLP, vehicle=vehicle, lossless=lossless) for vehicle in vehicles]
         last = 0
 
-        def publish() -> None:
+        def publish_next() -> None:
             nonlocal last
             last += 1
             for publisher in publishers:
-                publisher.publish(message(last))
+                publish(publisher, last)
 
         for _ in range(100):
-            publish()
+            publish_next()
         router = open_router(listen=(near,), connect=(endpoint,))
         got: dict[str, list[int]] = {vehicle: [] for vehicle in vehicles}
 
-        def take() -> bool:
-            publish()
+        def take_all() -> bool:
+            publish_next()
             with suppress(nedbus.NoDataError):
                 while True:
                     sample = subscription.receive(0.005)
                     got[sample.vehicle].append(sample.message.timestamp)
             return all(len(each) > 100 for each in got.values())
 
-        wait_for(take, what="messages of all")
+        wait_for(take_all, what="messages of all")
         for each in got.values():
             assert each == list(range(1, len(each) + 1))
         assert subscription.counts.lost == 0
+        bus.close()
     router.close()
 
 
-def kill(reader: Process) -> None:
-    os.kill(reader.popen.pid, signal.SIGKILL)
-
-
-def interrupt(reader: Process) -> None:
-    reader.signal(signal.SIGINT)
-
-
-@pytest.mark.parametrize("end", [kill, interrupt])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_reader_that_dies_is_given_up(
-    start: Start, endpoint: str, bus: nedbus.Bus, end: Callable[[Process], None]
+    start: Start,
+    endpoint: str,
+    reader: nedbus.Subscription,
+    bus: nedbus.Bus,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    number: signal.Signals,
 ) -> None:
     """A replay goes on without one that is killed, or ends, and others miss nothing."""
-    slow = READER.replace("if number ==", "import time; time.sleep(0.05)\n        if number ==", 1)
-    reader = start("-c", slow, endpoint, "slow", str(COUNT), measured=False)
-    wait_for(lambda: "ready" in reader.out, what="the reader")
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
-        _, sending = publish_all(bus)
-        wait_for(lambda: "ten" in reader.out, what="the first messages")
-        end(reader)
-        got = [subscription.receive(DEADLINE).message.timestamp for _ in range(COUNT)]
-        assert got == list(range(1, COUNT + 1))
-        sending.join(DEADLINE)
-        assert not sending.is_alive()
+    monkeypatch.setattr("nedbus.client.readers.RETURN", 0.5)
+    dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
+    wait_for(lambda: "ready" in dying.out, what="the reader")
+    _, sending = publish_all(bus)
+    wait_for(lambda: "ten" in dying.out, what="the first messages")
+    dying.signal(number)
+    assert take(reader, COUNT) == list(range(1, COUNT + 1))
+    sending.join(DEADLINE)
+    assert not sending.is_alive()
 
 
-def test_flush_waits_for_arrival_and_not_for_scripts(endpoint: str, bus: nedbus.Bus) -> None:
+def test_flush_waits_for_arrival_and_not_for_scripts(
+    stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
+) -> None:
     """What has arrived at a script that reads nothing is safe: the end of a replay does not wait until it is read."""
-    with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as two:
-        unread, read = one.subscribe(VLP, mode="every"), two.subscribe(VLP, mode="every")
-        publisher, sending = publish_all(bus, count=WINDOW // 2)
-        assert [read.receive(DEADLINE).message.timestamp for _ in range(WINDOW // 2)][-1] == WINDOW // 2
-        read.close()
-        sending.join(DEADLINE)
-        assert publisher.flush(DEADLINE)
-        assert [unread.receive(DEADLINE).message.timestamp for _ in range(WINDOW // 2)][-1] == WINDOW // 2
+    publisher, sending = publish_all(bus, count=WINDOW // 2)
+    assert take(reader, WINDOW // 2)[-1] == WINDOW // 2
+    reader.close()
+    sending.join(DEADLINE)
+    assert publisher.flush(DEADLINE)
+    assert take(stuck, WINDOW // 2)[-1] == WINDOW // 2

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -12,9 +14,10 @@ import nedbus
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.settings import load_settings
-from tests.conftest import DEADLINE, Process, Start, free_endpoint, wait_for
-
-VLP = "vehicle_local_position"
+from tests.messages import VLP
+from tests.ports import free_endpoint
+from tests.processes import Process, Start
+from tests.waits import DEADLINE, wait_for
 
 
 def write(file: Path, vehicles: Iterable[object], *, more: str = "") -> None:
@@ -39,21 +42,27 @@ def test_ten_reloads_under_load_lose_nothing(run_nedbus: Start, tmp_path: Path) 
     with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(VLP, mode="every") as subscription:
         times: dict[str, list[int]] = {}
 
-        def take(count: int) -> None:
-            for _ in range(count):
+        def take_until(vehicle: str) -> None:
+            begin = time.time_ns()
+            while True:
                 sample = subscription.receive(DEADLINE)
                 times.setdefault(sample.vehicle, []).append(sample.message.timestamp)
+                if sample.vehicle == vehicle and (sample.sent or 0) > begin:
+                    return
 
         for number in range(1, 11):
-            take(500)
+            take_until("0")
             write(file, [*vehicles, "guest"] if number % 2 else vehicles)
             changed = "1 started, 0 stopped" if number % 2 else "0 started, 1 stopped"
             assert f"{changed}, 10 unchanged" in reload(service, number)
-        take(500)
+            if number % 2:
+                take_until("guest")
+        for vehicle in vehicles:
+            take_until(vehicle)
         assert subscription.counts.lost == subscription.counts.dropped == 0
     assert times.keys() == {*vehicles, "guest"}
     for vehicle in vehicles:
-        steps = {after - before for before, after in zip(times[vehicle], times[vehicle][1:], strict=False)}
+        steps = {after - before for before, after in pairwise(times[vehicle])}
         assert steps == {10_000}, vehicle  # us; a source that began anew would begin at 0
     assert "retrying" not in service.err
 
@@ -68,9 +77,8 @@ def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> No
         write(file, ["1", "2", "a b"])
         assert f"{file}, line 11, column 1: source 'sim:?vehicle=a+b': " in reload(service, 1)
         write(file, ["2"], more='prefix = "other"\n')
-        assert f"{file}, line 1, column 1: prefix cannot change while the service runs: restart it" in reload(
-            service, 2
-        )
+        reason = "prefix cannot change while the service runs: restart it"
+        assert f"{file}, line 1, column 1: {reason}" in reload(service, 2)
         file.write_text("[[source")
         assert f"{file}, line 1, column 9: " in reload(service, 3)
         file.unlink()
@@ -82,15 +90,20 @@ def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> No
 
 
 def test_address_can_move_from_one_source_to_another(run_nedbus: Start, tmp_path: Path) -> None:
-    """What is gone has given its addresses back before what is new takes them; a replay as fast as possible too."""
+    """What is gone has given its addresses back before what is new takes them; a replay as fast as possible too.
+
+    A source that names no vehicle is another one where the default vehicle is.
+    """
     endpoint, file = free_endpoint(), tmp_path / "nedbus.toml"
-    file.write_text('source = "sim:?vehicle=1&speed=max&duration=1e8"\n')
+    file.write_text('source = "sim:?speed=max&duration=1e8"\n')
     service = run_nedbus("serve", "--listen", endpoint, "--config", str(file))
     wait_for(lambda: "seed 0" in service.err, what="the first")
-    file.write_text('source = "sim:?vehicle=1&seed=5"\n')
-    assert "1 started, 1 stopped, 0 unchanged" in reload(service, 1)
-    with nedbus.connect(endpoint, timeout=DEADLINE) as bus, bus.subscribe(VLP) as subscription:
-        assert subscription.receive(DEADLINE).vehicle == "1"
+    with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
+        for number, vehicle in enumerate(("1", "2"), 1):
+            file.write_text(f'vehicle = "{vehicle}"\nsource = "sim:?seed=5"\n')
+            assert "1 started, 1 stopped, 0 unchanged" in reload(service, number)
+            with bus.subscribe(VLP, vehicle=vehicle) as subscription:
+                subscription.receive(DEADLINE)
     assert "published by this process already" not in service.err
 
 

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
-import os
+import re
 import resource
-import subprocess
-import sys
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -34,10 +32,13 @@ from nedbus.transport import (
 )
 from nedbus.transport.file_limit import allow_sessions
 from nedbus.transport.router_state import read_state
-from tests.conftest import DEADLINE, Start, free_endpoint, wait_for
+from tests.certificates import CONFIG
+from tests.certificates import write_config as write_shipped
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
 from tests.zenohd import start_zenohd
 
-CONFIG = Path(__file__).parents[2] / "config"
 ZID = "1ae1e25d2f7221abc366ddc8a944c8a4"
 
 
@@ -46,17 +47,29 @@ def write_config(folder: Path, endpoint: str, **settings: object) -> Path:
     file = folder / "router.json5"
     known = {"mode": "router", "listen": {"endpoints": [endpoint]}, "transport": {"unicast": {"max_sessions": 10}}}
     admin = {"adminspace": {"enabled": True, "permissions": {"read": True, "write": False}}}
-    file.write_text(json.dumps({**known, **admin, "scouting": {"multicast": {"enabled": False}}, **settings}))
+    alone = {"scouting": {"multicast": {"enabled": False}, "delay": 0}}
+    file.write_text(json.dumps({**known, **admin, **alone, **settings}))
     return file
+
+
+@contextmanager
+def in_thread(target: Callable[..., object], *arguments: object, end: Callable[[], None]) -> Iterator[None]:
+    """Run something meanwhile, and end it."""
+    thread = threading.Thread(target=target, args=arguments)
+    thread.start()
+    try:
+        yield
+    finally:
+        end()
+        thread.join(DEADLINE)
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[str]:
     """Run a router with room for ten sessions, whose file says otherwise to those who ask."""
     where = free_endpoint()
-    session = open_router(config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"}))
-    yield where
-    session.close()
+    with open_router(config_file=write_config(tmp_path, where, metadata={"max_sessions": 7, "name": "base"})):
+        yield where
 
 
 def router_in(endpoint: str, seen: str) -> Finding:
@@ -64,11 +77,13 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network([endpoint], None, prefix="nedbus", version="0", vehicle=None, listen=0.1)
+        findings = check_network([endpoint], None, prefix="nedbus", version="0", vehicle=None, listen=0.0)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
-    wait_for(look, what=f"{seen}, not {found}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nedbus.doctor.observation._LEAST", 0.0)
+        wait_for(look, what=f"{seen}, not {found}")
     return found[0]
 
 
@@ -77,21 +92,15 @@ def ask(endpoint: str) -> list[RouterState]:
         return ask_routers(session, timeout=5.0)
 
 
-# What a router says.
-
-
 def test_every_router_of_a_mesh_answers(endpoint: str) -> None:
     """Each has its own sessions, a joined router among them, and Zenoh's default of 1,000."""
     second = free_endpoint()
-    router = open_router(listen=[second], connect=[endpoint])
-    try:
+    with open_router(listen=[second], connect=[endpoint]) as router:
         wait_for(lambda: sorted(state.sessions for state in ask(endpoint)) == [1, 2], what="both routers")
         states = ask(endpoint)
         assert [state.max_sessions for state in states] == [1000, 1000]
         assert str(router.zid()) in {state.zid for state in states}
         assert [state.zid for state in states] == sorted(state.zid for state in states)
-    finally:
-        router.close()
 
 
 def test_router_tells_what_it_really_accepts(small: str) -> None:
@@ -102,27 +111,22 @@ def test_router_tells_what_it_really_accepts(small: str) -> None:
     assert json.loads(answer.payload.to_bytes())["metadata"] == {"max_sessions": 10, "name": "base"}
 
 
-def test_other_metadata_is_left_alone(tmp_path: Path) -> None:
-    """It is the user's, and may be anything: then the limit is not known."""
-    where = free_endpoint()
-    with closing(open_router(config_file=write_config(tmp_path, where, metadata=["a", "list"]))):
-        assert [(state.max_sessions, state.load) for state in ask(where)] == [(None, None)]
-
-
 @pytest.mark.parametrize("name", ["router.json5", "router-secure.json5"])
 def test_shipped_files_say_it_twice_alike(name: str) -> None:
-    """A zenohd tells only what stands in `metadata`: it is the limit itself."""
+    """A zenohd tells only what stands in `metadata`: it is the limit itself; both files have the same blocks."""
     config = zenoh.Config.from_file(CONFIG / name)
     limit = json.loads(config.get_json("transport/unicast/max_sessions"))
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
+    blocks = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
+    assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(blocks)
     assert router_max_sessions() == limit == 1000
 
 
+@pytest.mark.slow
 def test_zenohd_tells_what_its_file_says(start: Start, tmp_path: Path) -> None:
     """The shipped file, in the real program."""
-    where, file = free_endpoint(), tmp_path / "router.json5"
-    file.write_text((CONFIG / "router.json5").read_text().replace("tcp/0.0.0.0:7447", where))
-    start_zenohd(start, "-c", str(file))
+    where = free_endpoint()
+    start_zenohd(start, "-c", str(write_shipped(tmp_path, tmp_path / "router.json5", where)))
     with open_client([where], timeout=DEADLINE) as session:
         assert [(state.sessions, state.max_sessions) for state in ask_routers(session, timeout=5.0)] == [(1, 1000)]
 
@@ -136,27 +140,19 @@ def test_limit_of_a_broken_file_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "answer",
+    ("key", "answer"),
     [
-        b"",
-        b"\xff\xfe",
-        b"[" * 100_000,
-        b"[]",
-        b"null",
-        b'{"sessions": 7}',
-        b'{"sessions": {"a": 1}}',
-        b'{"sessions": [], "metadata": {"max_sessions": ' + b"9" * 5000 + b"}}",
+        *((f"@/{ZID}/router", answer) for answer in (b"", b"\xff\xfe", b"[" * 100_000, b"[]", b"null")),
+        (f"@/{ZID}/router", b'{"sessions": 7}'),
+        (f"@/{ZID}/router", b'{"sessions": {"a": 1}}'),
+        (f"@/{ZID}/router", b'{"sessions": [], "metadata": {"max_sessions": ' + b"9" * 5000 + b"}}"),
+        *((key, b'{"sessions": []}') for key in ("@/x y/router", f"@/{ZID}0/router", f"@/{ZID}/router/config")),
+        (f"a/{ZID}/router", b'{"sessions": []}'),
     ],
 )
-def test_answers_that_make_no_sense(answer: bytes) -> None:
-    """Any peer may answer anything: it is no router."""
-    assert read_state(f"@/{ZID}/router", answer) is None
-
-
-@pytest.mark.parametrize("key", ["@/x y/router", f"@/{ZID}0/router", f"@/{ZID}/router/config", f"a/{ZID}/router"])
-def test_keys_that_are_no_routers(key: str) -> None:
-    """An id is at most 16 bytes in hexadecimal digits: it becomes a label."""
-    assert read_state(key, b'{"sessions": []}') is None
+def test_answers_that_make_no_sense(key: str, answer: bytes) -> None:
+    """Any peer may answer anything: it is no router; an id is at most 16 bytes in hexadecimal digits, for a label."""
+    assert read_state(key, answer) is None
 
 
 @pytest.mark.parametrize("room", [True, False, 0, -1, 0.5, 1e3, "1000", None, [1000], {}, 2**33])
@@ -171,7 +167,6 @@ def test_limits_that_make_no_sense(room: object) -> None:
 
 def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who claims to be many routers, or one with a book of sessions, fills nobody's memory."""
-    impostor = nedbus.connect(endpoint)
     (real,) = ask_routers(raw, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
@@ -179,18 +174,12 @@ def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest
             query.reply(f"@/f{number:x}/router", b'{"sessions": []}')
         query.reply("@/abc/router", b'{"sessions": [' + b"1," * 2**20 + b"1]}")
 
-    declared = impostor._session.declare_queryable("@/*/router", answer)
-    try:
+    with open_client([endpoint], timeout=DEADLINE) as impostor:
+        impostor.declare_queryable("@/*/router", answer)
         wait_for(lambda: len(ask_routers(raw, timeout=5.0)) == 21, what="the answers of the impostor")
         assert real.zid in {state.zid for state in ask_routers(raw, timeout=5.0)}
         monkeypatch.setattr("nedbus.transport.router_state._MAX_ROUTERS", 5)
         assert len(ask_routers(raw, timeout=5.0)) == 5
-    finally:
-        declared.undeclare()
-        impostor.close()
-
-
-# Who shows it.
 
 
 def test_doctor_warns_from_four_fifths_on(small: str) -> None:
@@ -207,120 +196,110 @@ def test_doctor_warns_from_four_fifths_on(small: str) -> None:
         assert "docs/hosts.md" in finding.advice
 
 
-def test_doctor_where_the_limit_is_not_told(tmp_path: Path) -> None:
-    """The count alone is no reason to warn, nor is a router that tells nothing."""
+def test_router_whose_limit_is_not_told(tmp_path: Path) -> None:
+    """Metadata is the user's, and may be anything: the count alone is no reason to warn, nor is no answer at all."""
     where = free_endpoint()
-    with closing(open_router(config_file=write_config(tmp_path, where, metadata="mine"))):
-        assert router_in(where, "sessions that are connected: 1").state == "ok"
-    where = free_endpoint()
-    with closing(open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False}))):
+    for metadata in (["a", "list"], "mine"):
+        with open_router(config_file=write_config(tmp_path, where, metadata=metadata)):
+            assert [(state.max_sessions, state.load) for state in ask(where)] == [(None, None)]
+            assert router_in(where, "sessions that are connected: 1").state == "ok"
+    with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
         assert router_in(where, "joined; who else is connected this client is not told").state == "ok"
 
 
 def test_metrics_of_a_service_with_a_router(tmp_path: Path) -> None:
     """They have the limit of the embedded router; a client has none."""
     where = free_endpoint()
-    settings = load_settings(source=("sim:",), router_config=write_config(tmp_path, where))
-    daemon = Daemon(settings, version="0")
-    pages = service_pages(daemon)
-    running = threading.Thread(target=daemon.run)
-    running.start()
-    try:
+    daemon = Daemon(load_settings(source=("sim:",), router_config=write_config(tmp_path, where)), version="0")
+
+    def shows(text: str, daemon: Daemon = daemon) -> bool:
+        return text in service_pages(daemon)["/metrics"]().content.decode()
+
+    with in_thread(daemon.run, end=daemon.stop):
         wait_for(daemon.ready.is_set, what="the service")
         with open_client([where], timeout=5.0):
-            one = 'nedbus_sessions{role="router"} 1.0\n'
-            wait_for(lambda: one in pages["/metrics"]().content.decode(), what="the session")
-        assert 'nedbus_sessions_max{role="router"} 10.0\n' in pages["/metrics"]().content.decode()
-        client = service_pages(Daemon(load_settings(source=("sim:",), connect=(where,)), version="0"))
-        assert "nedbus_sessions_max{" not in client["/metrics"]().content.decode()
-    finally:
-        daemon.stop()
-        running.join()
+            wait_for(lambda: shows('nedbus_sessions{role="router"} 1.0\n'), what="the session")
+        assert shows('nedbus_sessions_max{role="router"} 10.0\n')
+        client = Daemon(load_settings(source=("sim:",), connect=(where,)), version="0")
+        assert not shows("nedbus_sessions_max{", client)
+
+
+@contextmanager
+def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
+    """Run an exporter, and yield whether its metrics of routers have all of these lines."""
+    exporter = Exporter(bus, nedbus.Selection(), version="0")
+
+    def shows(*wanted: str) -> bool:
+        text = exporter.pages["/metrics"]().content.decode()
+        return all(f"nedbus_router_{each}" in text for each in wanted)
+
+    assert not shows("sessions{")
+    stop = threading.Event()
+    with in_thread(exporter.run, stop, end=stop.set):
+        yield shows
 
 
 def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It asks the routers now and then, keeps the first few, and knows nothing of them when they are silent."""
-    monkeypatch.setattr(router_watch, "_PAUSE", 0.1)
-    with nedbus.connect(small) as bus:
-        exporter = Exporter(bus, nedbus.Selection(), version="0")
-
-        def shows(*wanted: str) -> bool:
-            text = exporter.pages["/metrics"]().content.decode()
-            return all(f"nedbus_router_{each}\n" in text for each in wanted)
-
-        assert not shows("sessions{")
-        stop = threading.Event()
-        running = threading.Thread(target=exporter.run, args=[stop])
-        running.start()
-        try:
-            (state,) = ask(small)
-            label = f'{{router="{state.zid}"}}'
-            wait_for(lambda: shows(f"sessions{label} 2.0", f"sessions_max{label} 10.0"), what="the exporter's sessions")
-            with open_client([small], timeout=5.0):
-                wait_for(lambda: shows(f"sessions{label} 3.0"), what="one more")
-            wait_for(lambda: shows(f"sessions{label} 2.0"), what="its end")
-            monkeypatch.setattr(router_watch, "MAX_ROUTERS", 0)
-            wait_for(lambda: label not in exporter.pages["/metrics"]().content.decode(), what="nobody")
-        finally:
-            stop.set()
-            running.join()
+    monkeypatch.setattr(router_watch, "_PAUSE", 0.05)
+    with nedbus.connect(small) as bus, exporting(bus) as shows:
+        (state,) = ask(small)
+        label = f'{{router="{state.zid}"}}'
+        wait_for(lambda: shows(f"sessions{label} 2.0\n", f"sessions_max{label} 10.0\n"), what="the exporter's sessions")
+        with open_client([small], timeout=5.0):
+            wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="one more")
+        wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its end")
+        monkeypatch.setattr(router_watch, "MAX_ROUTERS", 0)
+        wait_for(lambda: not shows(f"sessions{label}"), what="nobody")
 
 
 def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a session to ask with it goes on reading, and asks as soon as there is room for one."""
-    monkeypatch.setattr(router_watch, "_PAUSE", 0.1)
-    where = free_endpoint()
-    room = {"unicast": {"max_sessions": 2}}
+    monkeypatch.setattr(router_watch, "_PAUSE", 0.05)
+    monkeypatch.setattr(router_watch, "_OPEN", 0.1)
+    where, tries, original = free_endpoint(), [], nedbus.Bus.open_session
+
+    def count(bus: nedbus.Bus, *, timeout: float) -> Session:
+        tries.append(timeout)
+        return original(bus, timeout=timeout)
+
+    monkeypatch.setattr(nedbus.Bus, "open_session", count)
+    file = write_config(tmp_path, where, transport={"unicast": {"max_sessions": 2}})
     with (
-        closing(open_router(config_file=write_config(tmp_path, where, transport=room))),
+        open_router(config_file=file),
         nedbus.connect(where) as bus,
-        ExitStack() as last,
+        open_client([where], timeout=5.0) as last,
+        exporting(bus) as shows,
     ):
-        last.enter_context(open_client([where], timeout=5.0))
-        exporter = Exporter(bus, nedbus.Selection(), version="0")
-        stop = threading.Event()
-        running = threading.Thread(target=exporter.run, args=[stop])
-        tries: list[int] = []
-        original = nedbus.Bus.open_session
+        wait_for(lambda: len(tries) > 1, what="a second attempt")
+        assert not shows("sessions{")
+        last.close()
+        wait_for(lambda: shows("sessions{"), what="room")
 
-        def count(*arguments: object, **options: object) -> Session:
-            tries.append(1)
-            return original(*arguments, **options)  # type: ignore[arg-type] # passed on as it came
 
-        monkeypatch.setattr(nedbus.Bus, "open_session", count)
-        running.start()
-        try:
-            wait_for(lambda: len(tries) > 1, what="a second attempt")
-            assert not exporter._routers.states
-            last.close()
-            wait_for(lambda: [state.load for state in exporter._routers.states] == [1.0], what="room")
-        finally:
-            stop.set()
-            running.join()
+class Once(threading.Event):
+    """What ends a loop where it would wait."""
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.set()
+        return True
 
 
 def test_watch_that_is_closed_opens_nothing(bus: nedbus.Bus) -> None:
-    """Whoever closes it while its session opens leaves none behind."""
+    """Whoever closes it while its session opens leaves none behind, and it opens no other."""
     watch = router_watch.RouterWatch(bus)
     original, opened = bus.open_session, []
 
     def open_late(*, timeout: float) -> Session:
         watch.close()
         opened.append(original(timeout=timeout))
-        return opened[0]
+        return opened[-1]
 
     bus.open_session = open_late  # type: ignore[method-assign,assignment] # as the end of a process may come
-    stop = threading.Event()
-    running = threading.Thread(target=watch.run, args=[stop])
-    running.start()
-    wait_for(lambda: opened and opened[0].is_closed(), what="the end of its session")
-    stop.set()
-    running.join()
+    for _ in range(2):
+        watch.run(Once())
+    assert [session.is_closed() for session in opened] == [True]
     assert watch.states == ()
-    assert watch._open() is None
-
-
-# How many files it may open.
 
 
 class Limits:
@@ -368,34 +347,27 @@ def test_files_of_a_router(
         assert f"only {soft} open files are allowed: room for about {soft - 100} sessions" in caplog.text
 
 
-@pytest.mark.process
-def test_router_takes_more_sessions_than_the_soft_limit(tmp_path: Path) -> None:
+LIMITED = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv.pop(1)), int(sys.argv.pop(1))))
+from nedbus.cli import main
+main()
+"""
+
+
+def test_router_takes_more_sessions_than_the_soft_limit(start: Start) -> None:
     """With `ulimit -S -n 64` a router takes a hundred sessions, each of them an open file."""
-    where = free_endpoint()
-    program = f"ulimit -S -n 64; exec {sys.executable} -m nedbus router --listen {where}"
-    with (tmp_path / "log").open("wb") as log:
-        router = subprocess.Popen(["bash", "-c", program], stdout=log, stderr=log, env={**os.environ})
-    try:
-        with ExitStack() as sessions:
-            for _ in range(100):
-                sessions.enter_context(open_client([where], timeout=30.0))
-            assert len(list(Path(f"/proc/{router.pid}/fd").iterdir())) > 100
-        assert "open files" not in (tmp_path / "log").read_text()
-    finally:
-        router.kill()
-        router.wait()
+    where, hard = free_endpoint(), resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    router = start("-c", LIMITED, "64", str(hard), "router", "--listen", where)
+    with ExitStack() as sessions:
+        for _ in range(100):
+            sessions.enter_context(open_client([where], timeout=DEADLINE))
+        assert len(list(Path(f"/proc/{router.popen.pid}/fd").iterdir())) > 100
+    assert "open files" not in router.err
 
 
-@pytest.mark.process
-def test_router_that_may_not_says_so(tmp_path: Path) -> None:
+def test_router_that_may_not_says_so(start: Start) -> None:
     """With a hard limit of 300 it starts, and logs how many sessions it has room for."""
-    program = f"ulimit -n 300; exec {sys.executable} -m nedbus router --listen {free_endpoint()}"
-    log = tmp_path / "log"
-    with log.open("wb") as output:
-        router = subprocess.Popen(["bash", "-c", program], stdout=output, stderr=output, env={**os.environ})
-    try:
-        wait_for(lambda: "router on" in log.read_text(), what="the router")
-        assert "only 300 open files are allowed: room for about 200 sessions" in log.read_text()
-    finally:
-        router.kill()
-        router.wait()
+    router = start("-c", LIMITED, "300", "300", "router", "--listen", free_endpoint())
+    wait_for(lambda: "router on" in router.err, what="the router")
+    assert "only 300 open files are allowed: room for about 200 sessions" in router.err

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import sys
 
-from tests.conftest import Start, free_port
+import pytest
+
+from tests.ports import free_port
+from tests.processes import Start
 
 
+@pytest.mark.slow
 def test_process_never_stands_still_while_publishers_come_and_go(start: Start) -> None:
     """No Python code runs on Zenoh's threads, and none holds the interpreter's lock while it waits for Zenoh's.
 

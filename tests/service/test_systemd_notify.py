@@ -1,15 +1,17 @@
-"""What a service tells systemd: a real datagram socket in its place, and real services."""
+"""What a service tells systemd: a real datagram socket in its place, and real services; and its units."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,7 +21,9 @@ from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.transport import open_router
-from tests.conftest import DEADLINE, Start, free_endpoint, free_port, repeating, wait_for
+from tests.ports import free_endpoint, free_port
+from tests.processes import Start
+from tests.waits import DEADLINE, repeating, wait_for
 
 Datagram = dict[str, str]
 
@@ -29,13 +33,13 @@ class Systemd:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
-        self._socket.settimeout(DEADLINE)
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.bind(f"\0{address[1:]}" if address.startswith("@") else address)
+        self.socket.settimeout(DEADLINE)
 
     def receive(self) -> Datagram:
         """Return the fields of the next datagram."""
-        return dict(line.split("=", 1) for line in self._socket.recv(65_536).decode().split("\n"))
+        return dict(line.split("=", 1) for line in self.socket.recv(65_536).decode().split("\n"))
 
     def receive_until(self, wanted: Callable[[Datagram], object]) -> list[Datagram]:
         """Return all datagrams up to one that is wanted."""
@@ -46,16 +50,13 @@ class Systemd:
             received.append(self.receive())
         return received
 
-    def close(self) -> None:
-        self._socket.close()
-
 
 @pytest.fixture
 def systemd(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Systemd]:
     """Listen at a path, or at an abstract address."""
     systemd = Systemd(getattr(request, "param", str(tmp_path / "notify")))
-    yield systemd
-    systemd.close()
+    with systemd.socket:
+        yield systemd
 
 
 def is_ready(datagram: Datagram) -> bool:
@@ -63,39 +64,45 @@ def is_ready(datagram: Datagram) -> bool:
 
 
 @contextmanager
-def running(daemon: Daemon) -> Iterator[None]:
-    """Run a daemon in a thread."""
+def notified(
+    systemd: Systemd, *sources: str, connect: str | None = None, watchdog: str | None = None, patience: float = DEADLINE
+) -> Iterator[tuple[Daemon, Notifier]]:
+    """Run a daemon in a thread, and tell systemd of it: a router, unless it is to connect."""
+    listen, routers = (None, (connect,)) if connect else ((free_endpoint(),), None)
+    daemon = Daemon(load_settings(source=sources or ("sim:",), listen=listen, connect=routers), version="0")
+    environment = {"NOTIFY_SOCKET": systemd.address} | ({"WATCHDOG_USEC": watchdog} if watchdog else {})
     thread = threading.Thread(target=daemon.run)
     thread.start()
     try:
-        yield
+        with Notifier(daemon, environment=environment, patience=patience) as notifier:
+            yield daemon, notifier
     finally:
         daemon.stop()
         thread.join(DEADLINE)
 
 
-def simulation(*, listen: str | None = None, connect: str | None = None) -> Daemon:
-    """Return a daemon that simulates a vehicle."""
-    return publishing("sim:", listen=listen, connect=connect)
-
-
-def publishing(source: str, *, listen: str | None = None, connect: str | None = None) -> Daemon:
-    """Return a daemon with one source."""
-    settings = load_settings(source=(source,), listen=listen and (listen,), connect=connect and (connect,))
-    return Daemon(settings, version="0")
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the text of the status be sent five times a second, in this process."""
+    monkeypatch.setattr("nedbus.cli.systemd._STATUS_INTERVAL", 0.2)
 
 
 @pytest.mark.parametrize("systemd", [f"@nedbus-test-{os.getpid()}"], indirect=True, ids=["abstract"])
 def test_ready_when_router_listens(run_nedbus: Start, systemd: Systemd) -> None:
-    """READY comes once, when the router accepts connections, with a status; after SIGTERM comes STOPPING."""
+    """READY comes once, when the router accepts connections, with a status; after SIGTERM comes STOPPING.
+
+    In between a process that works says so, again and again.
+    """
     endpoint = free_endpoint()
-    process = run_nedbus("serve", "--source", "sim:", "--listen", endpoint, NOTIFY_SOCKET=systemd.address)
+    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "200000"}
+    process = run_nedbus("serve", "--source", "sim:", "--listen", endpoint, **environment)
     before = systemd.receive_until(is_ready)
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
     socket.create_connection((host, int(port))).close()
     assert "1 source, " in before[-1]["STATUS"]
+    after = [each for _ in range(3) for each in systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)]
     process.signal(signal.SIGTERM)
-    after = systemd.receive_until(lambda datagram: "STOPPING" in datagram)
+    after += systemd.receive_until(lambda datagram: "STOPPING" in datagram)
     assert not any(map(is_ready, after))
     assert process.wait() == 0, process.err
 
@@ -108,12 +115,12 @@ def test_end_by_itself_is_said(run_nedbus: Start, systemd: Systemd) -> None:
     assert process.wait() == 0, process.err
 
 
-def test_status_of_silent_source(run_nedbus: Start, systemd: Systemd) -> None:
+@pytest.mark.usefixtures("often")
+def test_status_of_silent_source(systemd: Systemd) -> None:
     """A source that nobody speaks to does not delay READY; the status names it, and what the others publish."""
-    link = f"mavlink:udpin:{free_endpoint().removeprefix('tcp/')}"
-    arguments = ("--source", "sim:", "--source", link, "--listen", free_endpoint())
-    run_nedbus("serve", *arguments, NOTIFY_SOCKET=systemd.address)
-    received = systemd.receive_until(lambda datagram: "nothing arrives" in datagram.get("STATUS", ""))
+    link = f"mavlink:udpin:127.0.0.1:{free_port()}"
+    with notified(systemd, "sim:", link):
+        received = systemd.receive_until(lambda datagram: "nothing arrives" in datagram.get("STATUS", ""))
     assert any(map(is_ready, received))
     status = received[-1]["STATUS"]
     assert status.startswith("2 sources, ")
@@ -122,80 +129,59 @@ def test_status_of_silent_source(run_nedbus: Start, systemd: Systemd) -> None:
     assert " messages/s, 0 sessions" in status
 
 
-def test_reload_is_answered(run_nedbus: Start, systemd: Systemd, tmp_path: Path) -> None:
-    """SIGHUP is answered with RELOADING and the time, then READY; what is wrong with the new file is in the status."""
+def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
+    """Return whether this is a status with what is published, and with what is wrong, or without."""
+    return "messages/s" in datagram["STATUS"] and ("is rejected" in datagram["STATUS"]) == is_wrong
+
+
+def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> None:
+    """SIGHUP is answered with RELOADING and the time, then READY.
+
+    What is wrong with the new file stays in the status until another one works.
+    """
     file = tmp_path / "nedbus.toml"
     text = f'listen = "{free_endpoint()}"\nsource = ["sim:"]\n'
     file.write_text(text)
-    process = run_nedbus("serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
+    often = "import nedbus.cli.systemd; nedbus.cli.systemd._STATUS_INTERVAL = 0.2; nedbus.cli.main()"
+    process = start("-c", often, "serve", "--config", str(file), NOTIFY_SOCKET=systemd.address)
     systemd.receive_until(is_ready)
-    for content, words in ((text, ""), ("source = [", "is rejected"), (text, "")):
+    for content, is_wrong in ((text, False), ("source = [", True), (text, False)):
         file.write_text(content)
         asked = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
         process.signal(signal.SIGHUP)
         reloading = systemd.receive_until(lambda datagram: datagram.get("RELOADING") == "1")[-1]
         assert int(reloading["MONOTONIC_USEC"]) >= asked
-        ready = systemd.receive_until(is_ready)[-1]
-        assert words in ready["STATUS"]
+        ready = systemd.receive_until(is_ready)[-1]["STATUS"]
+        assert ("is rejected" in ready) == is_wrong
+        systemd.receive_until(partial(has_counts, is_wrong=is_wrong))
+    assert process.err.count("the settings are rejected, and nothing changes: ") == 1
     process.signal(signal.SIGTERM)
     assert process.wait() == 0, process.err
 
 
-def test_rejected_reload_stays_in_status(systemd: Systemd) -> None:
-    """The error of a reload is passed on, and stays in the status until another one works."""
-    daemon = simulation(listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment={"NOTIFY_SOCKET": systemd.address}) as notifier:
-        systemd.receive_until(is_ready)
-        with pytest.raises(ValueError, match="on purpose"), notifier.reloading():
-            raise ValueError("on purpose")
-        systemd.receive_until(is_ready)
-        systemd.receive_until(lambda datagram: "messages/s" in (text := datagram["STATUS"]) and "on purpose" in text)
-        with notifier.reloading():
-            pass
-        systemd.receive_until(is_ready)
-        systemd.receive_until(lambda datagram: "messages/s" in (text := datagram["STATUS"]) and "purpose" not in text)
-
-
-def test_watchdog_of_working_process(run_nedbus: Start, systemd: Systemd) -> None:
-    """A process that works says so, again and again."""
-    arguments = ("serve", "--source", "sim:", "--listen", free_endpoint())
-    run_nedbus(*arguments, NOTIFY_SOCKET=systemd.address, WATCHDOG_USEC="200000")
-    for _ in range(3):
-        systemd.receive_until(lambda datagram: datagram.get("WATCHDOG") == "1")
-
-
+@pytest.mark.usefixtures("often")
 def test_no_watchdog_without_ticks(systemd: Systemd) -> None:
     """While the main thread does not work, nobody says that it does; the status goes on."""
-    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
-    daemon = simulation(listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment=environment) as notifier:
+    with notified(systemd, watchdog="20000") as (_, notifier):
         stuck = systemd.receive_until(is_ready)
-        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # a second later, 50 times the limit
+        stuck += systemd.receive_until(lambda datagram: "STATUS" in datagram)  # later by ten times the limit
         assert not any("WATCHDOG" in datagram for datagram in stuck)
         notifier.tick()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
-@dataclass
-class Gate:
-    """Where sources block: `entered` is set as soon as one does, and all go on once `opened` is."""
-
-    entered: threading.Event = field(default_factory=threading.Event)
-    opened: threading.Event = field(default_factory=threading.Event)
-
-
-def block(monkeypatch: pytest.MonkeyPatch, method: str) -> Gate:
-    """Let the sources that are started after this block in a method of their output."""
-    gate = Gate()
+def block(monkeypatch: pytest.MonkeyPatch, method: str) -> tuple[threading.Event, threading.Event]:
+    """Let sources block in a method of their output; return what is set once one does, and what lets all go on."""
+    entered, opened = threading.Event(), threading.Event()
     original = getattr(SourceOutput, method)
 
     def wait(output: SourceOutput, *arguments: object) -> object:
-        gate.entered.set()
-        gate.opened.wait(DEADLINE)
+        entered.set()
+        opened.wait(DEADLINE)
         return original(output, *arguments)
 
     monkeypatch.setattr(SourceOutput, method, wait)
-    return gate
+    return entered, opened
 
 
 @pytest.mark.parametrize(
@@ -207,37 +193,37 @@ def test_no_watchdog_while_a_source_is_stuck(
     systemd: Systemd, monkeypatch: pytest.MonkeyPatch, source: str, method: str
 ) -> None:
     """While the loop of a source does not go round there is no ping, though all other threads work; then there is."""
-    limit = 0.3  # s; a live source goes round every 0.25 s
-    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": str(round(2e6 * limit))}
-    daemon = publishing(source, listen=free_endpoint())
-    gate = block(monkeypatch, method)
-    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):
+    limit = 0.1  # s
+    monkeypatch.setattr("nedbus.sources.mavlink._TICK", limit / 2)  # how often that one goes round
+    entered, opened = block(monkeypatch, method)
+    with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
         systemd.receive_until(is_ready)
-        wait_for(gate.entered.is_set, what="the source to block")
+        wait_for(entered.is_set, what="the source to block")
         wait_for(lambda: daemon.busy > limit, what="the limit")
         with notifier.reloading():
             systemd.receive_until(lambda datagram: "RELOADING" in datagram)
-        wait_for(lambda: daemon.busy > 7 * limit, what="several limits")
+        wait_for(lambda: daemon.busy > 5 * limit, what="several limits")
         with notifier.reloading():
             stuck = systemd.receive_until(lambda datagram: "RELOADING" in datagram)
         # One may have been on its way at the first reload.
         assert sum("WATCHDOG" in datagram for datagram in stuck) <= 1
-        gate.opened.set()
+        opened.set()
         systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
 
 
 def test_watchdog_of_a_source_that_may_take_any_time(systemd: Systemd, monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay as fast as its readers take it waits for them, for as long as it takes: that is not stuck."""
-    environment = {"NOTIFY_SOCKET": systemd.address, "WATCHDOG_USEC": "20000"}
-    daemon = publishing("sim:?speed=max&duration=3600", listen=free_endpoint())
-    gate = block(monkeypatch, "publish")
-    with running(daemon), Notifier(daemon, environment=environment) as notifier, repeating(notifier.tick):
-        wait_for(gate.entered.is_set, what="the source to wait")
+    entered, opened = block(monkeypatch, "publish")
+    with (
+        notified(systemd, "sim:?speed=max&duration=3600", watchdog="20000") as (daemon, notifier),
+        repeating(notifier.tick),
+    ):
+        wait_for(entered.is_set, what="the source to wait")
         systemd.receive_until(is_ready)
         for _ in range(10):
             systemd.receive_until(lambda datagram: "WATCHDOG" in datagram)
         assert daemon.busy == 0
-        gate.opened.set()
+        opened.set()
 
 
 @pytest.mark.parametrize(
@@ -257,11 +243,11 @@ def test_watchdog_interval(limit: str, process: str | None, interval: float | No
     assert watchdog_interval(environment) == interval
 
 
+@pytest.mark.usefixtures("often")
 def test_client_waits_for_its_router(systemd: Systemd) -> None:
     """A client is not ready before its router is there, and says for whom it waits."""
     endpoint = free_endpoint()
-    daemon = simulation(connect=endpoint)
-    with running(daemon), Notifier(daemon, environment={"NOTIFY_SOCKET": systemd.address}):
+    with notified(systemd, connect=endpoint):
         assert systemd.receive() == {"STATUS": f"waits for a router at {endpoint}"}
         router = open_router(listen=(endpoint,))
         assert "1 session" in systemd.receive_until(is_ready)[-1]["STATUS"]
@@ -271,33 +257,26 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
 
 def test_client_is_started_without_its_router(systemd: Systemd) -> None:
     """A client whose router does not answer for long counts as started: neither it nor the boot is held up."""
-    daemon = simulation(connect=free_endpoint())
-    with running(daemon), Notifier(daemon, environment={"NOTIFY_SOCKET": systemd.address}, patience=0.1):
+    with notified(systemd, connect=free_endpoint(), patience=0.1):
         assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waits for a router at tcp/")
 
 
-def test_nothing_without_notify_socket(endpoint: str) -> None:
-    """Where systemd does not ask, there is no thread, and nothing to do."""
-    notifier = Notifier(simulation(connect=endpoint), environment={"WATCHDOG_USEC": "1"})
-    with notifier:
+def test_nothing_without_notify_socket(caplog: pytest.LogCaptureFixture) -> None:
+    """Where systemd does not ask, there is no thread, and nothing to do; an address of another kind is warned of."""
+    assert not NotifySocket("vsock:2:1234").active
+    assert "neither a path nor @NAME" in caplog.text
+    daemon = Daemon(load_settings(source=("sim:",)), version="0")
+    with Notifier(daemon, environment={"WATCHDOG_USEC": "1"}) as notifier:
         notifier.tick()
         with notifier.reloading():
             assert "nedbus-systemd" not in [thread.name for thread in threading.enumerate()]
         notifier.stopping()
 
 
-def test_address_that_cannot_be_used(caplog: pytest.LogCaptureFixture) -> None:
-    """An address of another kind is warned of."""
-    assert not NotifySocket("vsock:2:1234").active
-    assert "neither a path nor @NAME" in caplog.text
-
-
 def test_systemd_that_does_not_listen(systemd: Systemd) -> None:
     """What cannot be told now, is told later; nothing waits for it."""
     notify = NotifySocket(systemd.address)
-    taken = 0
-    while notify.send(READY=1):  # until the queue of the socket is full
-        taken += 1
+    taken = sum(1 for _ in iter(lambda: notify.send(READY=1), False))  # until the queue of the socket is full
     for _ in range(taken):
         systemd.receive()
     assert notify.send(READY=1)
@@ -310,12 +289,51 @@ def test_systemd_that_does_not_listen(systemd: Systemd) -> None:
 def test_ready_is_repeated_until_it_is_taken(systemd: Systemd) -> None:
     """A READY that finds no room is sent again: systemd would wait for it in vain."""
     full = NotifySocket(systemd.address)
-    filled = 0
-    while full.send(FILLED=1):
-        filled += 1
-    daemon = simulation(listen=free_endpoint())
-    with running(daemon), Notifier(daemon, environment={"NOTIFY_SOCKET": systemd.address}):
+    filled = sum(1 for _ in iter(lambda: full.send(FILLED=1), False))
+    with notified(systemd) as (daemon, _):
         wait_for(daemon.ready.is_set, what="the router")
         assert [systemd.receive() for _ in range(filled)] == [{"FILLED": "1"}] * filled
         systemd.receive_until(is_ready)
     full.close()
+
+
+# The units as shipped, judged by systemd's own tools; tests/compose/test_systemd.py starts them
+
+UNITS = Path(__file__).parents[2] / "packaging" / "systemd"
+EXECUTABLE = "/opt/nedbus/bin/nedbus"
+EXPOSURE = 2.0  # of 10: what systemd calls OK
+with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing")
+
+
+@pytest.fixture(params=["nedbus.service", "nedbus@.service"])
+def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Copy a unit, with a program that is here in place of the one that gets installed."""
+    copy = tmp_path / str(request.param)
+    text = (UNITS / copy.name).read_text()
+    assert f"ExecStart={EXECUTABLE} serve" in text
+    copy.write_text(text.replace(EXECUTABLE, "/bin/true"))
+    return copy
+
+
+def analyze(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run systemd-analyze."""
+    return subprocess.run(["systemd-analyze", *arguments], capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.process
+@with_systemd
+def test_unit_is_valid_and_hardened(unit: Path) -> None:
+    """Nothing in it is unknown to systemd, or ignored; its exposure is below what the documentation says."""
+    done = analyze("verify", unit)
+    about_it = [line for line in done.stderr.splitlines() if "nedbus" in line]
+    assert (done.returncode, about_it) == (0, []), done.stderr
+    done = analyze("security", "--offline=true", f"--threshold={EXPOSURE * 10:.0f}", unit)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert float(done.stdout.split("Overall exposure level for")[1].split(":")[1].split()[0]) < EXPOSURE
+
+
+def test_units_differ_in_their_file_only() -> None:
+    """The template is the unit, for another file."""
+    plain, template = ((UNITS / name).read_text().split("\n", 1)[1] for name in ("nedbus.service", "nedbus@.service"))
+    description = "Description=PX4 local position over Zenoh"
+    assert template == plain.replace("/nedbus.toml", "/%i.toml").replace(description, f"{description} (%i)")

@@ -12,9 +12,10 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import pytest
 from rich.console import Console
@@ -25,20 +26,21 @@ from nedbus.cli.lines import Lines
 from nedbus.cli.live_table import LiveTable
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
-from nedbus_msgs import DEFAULT_TOPIC, TOPICS
-from tests.conftest import DEADLINE, Start, free_endpoint, free_port, message, unmeasured, wait_for
+from nedbus_msgs import TOPICS
+from tests.command_line import fork_command, run_command
+from tests.hasty import start_hasty
+from tests.messages import VALID, VLP, message
+from tests.ports import free_endpoint, free_port
+from tests.processes import Start, Zygote, unmeasured
+from tests.waits import DEADLINE, repeating, wait_for
 
 ROOT = Path(__file__).parents[2]
-VLP = DEFAULT_TOPIC
 EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
 
 
 def has_control(text: str) -> bool:
     """Return whether anything in a text would act on a terminal."""
     return any(not (char.isprintable() or char == "\n") for char in text)
-
-
-# Text
 
 
 def test_text_of_a_peer_is_one_short_printable_line() -> None:
@@ -50,52 +52,39 @@ def test_text_of_a_peer_is_one_short_printable_line() -> None:
     assert printable("name-\udcff") == r"name-\udcff"
 
 
-# Tables
-
 HEAD = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
+OPTIONAL = ("JITTER", "MAX", "LATENCY", "LOST")
 ROWS = [
     ("1/vehicle_local_position_groundtruth", "100.0", "12.3 ms", "999 ms", "119.9 s", "12345", "ok"),
     ("1/vehicle_local_position", "-", "-", "-", "-", "0", "stale: nothing for 4.2 s, xy z invalid, dead reckoning"),
 ]
 
 
-@pytest.mark.parametrize("width", [30, 40, 80, 110])
+@pytest.mark.parametrize("width", [30, 40, 64, 80, 110])
 def test_table_fits(width: int) -> None:
-    """No line is longer than the terminal, the name and the state are complete, and wide ones show more columns."""
-    optional = ("JITTER", "MAX", "LATENCY", "LOST")
-    lines = to_table(HEAD, ROWS, width=width, optional=optional).splitlines()
+    """Lines fit, wide ones show more columns; a name is whole while columns can be left out, and then folded."""
+    lines = to_table(HEAD, ROWS, width=width, optional=OPTIONAL).splitlines()
     assert all(len(line) <= width for line in lines)
     shown = "".join("".join(lines).split())
     assert shown.count("vehicle") == 2
     assert {word in shown for word in ("stale:", "nothing", "invalid", "reckoning")} == {True}
     assert ("JITTER" in lines[0]) == (width >= 110)
-
-
-@pytest.mark.parametrize("width", [30, 40, 64, 80])
-def test_names_are_not_broken_inside_words(width: int) -> None:
-    """A name is whole while there are columns to leave out; then it is folded after slashes, then after underscores."""
-    optional = ("JITTER", "MAX", "LATENCY", "LOST")
-    lines = to_table(HEAD, ROWS, width=width, optional=optional).splitlines()
     names = [line.split()[0] for line in lines if not line.startswith(" ")]
     assert (ROWS[0][0] in names) == (width >= 60)
     assert all(re.search(r"[/_]$|groundtruth$|position$|^VEHICLE|^TOPIC$", name) for name in names)
+
+
+def test_text_is_folded_at_words() -> None:
+    """A path is folded after slashes and words; a long name after its vehicle; and nothing without a terminal."""
+    assert len(to_table(HEAD, ROWS).splitlines()) == 1 + len(ROWS)
     remark = "/a/rather/long/path/to/some/flight_of_today.ulg: no such file or directory"
     folded = to_table(("SOURCE", "REMARK"), [("sim:", remark)], width=24)
-    assert [line[8:] for line in folded.splitlines()[1:]] == [
-        "/a/rather/long/",
-        "path/to/some/",
-        "flight_of_today.",
-        "ulg: no such",
-        "file or",
-        "directory",
-    ]
+    parts = "/a/rather/long/|path/to/some/|flight_of_today.|ulg: no such|file or|directory"
+    assert "|".join(line[8:] for line in folded.splitlines()[1:]) == parts
     long = f"{'v' * 64}/vehicle_local_position"
-    lines = to_table(HEAD, [(long, *ROWS[0][1:])], width=80, optional=optional).splitlines()
+    lines = to_table(HEAD, [(long, *ROWS[0][1:])], width=80, optional=OPTIONAL).splitlines()
     assert [line.split()[0] for line in lines[1:]] == ["v" * 64 + "/", "vehicle_local_position"]
     assert all(len(line) <= 80 for line in lines)
-
-
-# Lines
 
 
 def sample(address: nedbus.Address) -> nedbus.Sample:
@@ -139,11 +128,9 @@ def test_addresses_are_cut_only_where_nothing_is_free(lines: Callable[[int], Lin
     for width in range(74, 110):
         line = lines(width)(sample(nedbus.Address("1", "vehicle_local_position_groundtruth"))).splitlines()[1]
         assert len(line) == width or "1/vehicle_local_position_groundtruth " in line
-    flags = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
-    fine = message(1, **flags, **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.0))
     to_line = lines(80)
     for address in ALL_TOPICS:
-        assert f"{address} " in to_line(nedbus.Sample(fine, address, 0))
+        assert f"{address} " in to_line(nedbus.Sample(message(1, **VALID), address, 0))
 
 
 def test_short_addresses_remain_different(lines: Callable[[int], Lines]) -> None:
@@ -169,80 +156,35 @@ def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
     assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]
 
 
-@pytest.mark.process
-def test_echo_fits_a_terminal(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """At 80 columns a line is a line, below a heading; the addresses of two vehicles are a column, and whole."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:", "-s", "sim:?vehicle=wing")
-    wait_for(lambda: len(bus.latest()) == 2, what="two vehicles")
-    with on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
-        assert terminal.popen.wait(DEADLINE) == 0
-    shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
-    lines = [line for line in shown if VLP in line]
-    assert len(lines) == 40
-    assert max(map(len, shown)) <= 80
-    state = -1
-    for line in shown:
-        if VLP not in line:
-            state = line.index("STATE")
-        elif "  ok" in line:
-            assert line.index("  ok") + 2 == state
-
-
-def test_info_names_what_is_gone(run_nedbus: Start, endpoint: str, raw: Session) -> None:
-    """The number stands in the table, the addresses below it; on a terminal no address is broken."""
-    gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
-    sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
-    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
-    info = run_nedbus("info", "-c", endpoint)
-    assert info.wait() == 0, info.err
-    assert "  5 gone\n" in info.out
-    assert f"\ngone: {', '.join(gone)}\n" in info.out
-    with on_terminal("info", "-c", endpoint) as terminal:
-        assert terminal.popen.wait(DEADLINE) == 0
-    lines = terminal.shown.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert all(any(address in line for line in lines) for address in gone)
-    del service
-
-
-def test_table_without_a_terminal_is_complete() -> None:
-    """A row is a line."""
-    assert len(to_table(HEAD, ROWS).splitlines()) == 3
-
-
-# On a terminal
-
-
 class Terminal:
     """A command on a terminal of its own, and what it shows."""
 
-    def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
+    def __init__(self, zygote: Zygote, *arguments: str, **environment: str) -> None:
         self._main, terminal = pty.openpty()
         self._output = bytearray()
         self._stopping = threading.Event()
-        environment = {**unmeasured(), "COLUMNS": str(columns), "LINES": str(lines), "TERM": "xterm"}
-        self.popen = subprocess.Popen(
-            [sys.executable, "-m", "nedbus", *arguments],
-            stdout=terminal,
-            stderr=terminal,
-            stdin=subprocess.DEVNULL,
-            env=environment,
-        )
+        environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
+        self.popen = fork_command(zygote, *arguments, out=terminal, err=terminal, **environment)
         os.close(terminal)
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.popen.kill()
+        self.wait()
 
     @property
     def shown(self) -> str:
         return self._output.decode(errors="replace")
 
-    def has_shown(self, text: str) -> bool:
-        return text in self.shown
-
-    def close(self) -> None:
-        self.popen.kill()
-        self.popen.wait(DEADLINE)
+    def wait(self) -> int:
+        """Wait for its end, and for all that it shows."""
+        exit_code = self.popen.wait(DEADLINE)
         self._reader.join(DEADLINE)
+        return exit_code
 
     def hang_up(self) -> None:
         """Close the terminal, as `sshd` does when a connection breaks."""
@@ -258,40 +200,81 @@ class Terminal:
         os.close(self._main)
 
 
+OnTerminal = Callable[..., Terminal]
+
+
+@pytest.fixture
+def on_terminal(zygote: Zygote) -> OnTerminal:
+    """Return what runs a command on a terminal of 80 columns."""
+    return partial(Terminal, zygote)
+
+
 @contextmanager
-def on_terminal(*arguments: str, columns: int = 80, lines: int = 24) -> Iterator[Terminal]:
-    terminal = Terminal(*arguments, columns=columns, lines=lines)
-    try:
-        yield terminal
-    finally:
-        terminal.close()
+def flying(bus: nedbus.Bus, *vehicles: str, topics: tuple[str, ...] = (VLP,)) -> Iterator[None]:
+    """Publish topics of vehicles that stand still."""
+    publishers = [bus.publisher(topic, vehicle=vehicle) for vehicle in vehicles for topic in topics]
+
+    def publish() -> None:
+        for publisher in publishers:
+            publisher.publish(message(1, **VALID))
+
+    with repeating(publish):
+        yield
 
 
 @pytest.mark.process
-def test_hz_redraws_in_place(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """On a terminal the table is drawn over the last one, as high as the terminal at most, and stays at the end."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:", *(f"-ssim:?vehicle={number}" for number in range(2, 5)))
-    wait_for(lambda: len(bus.latest("*")) == 20, what="four vehicles")
-    with on_terminal("hz", "-c", endpoint, "-d", "4", lines=10) as terminal:
-        assert terminal.popen.wait(DEADLINE) == 0
+def test_echo_fits_a_terminal(on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus) -> None:
+    """At 80 columns a line is a line, below a heading; the addresses of two vehicles are a column, and whole."""
+    with flying(bus, "1", "wing"), on_terminal("echo", "-c", endpoint, "-n", "40") as terminal:
+        assert terminal.wait() == 0
+    shown = [line for line in terminal.shown.splitlines() if line.startswith("VEHICLE/TOPIC  ") or VLP in line]
+    assert len([line for line in shown if VLP in line]) == 40
+    assert max(map(len, shown)) <= 80
+    state = -1
+    for line in shown:
+        if VLP not in line:
+            state = line.index("STATE")
+        elif "  ok" in line:
+            assert line.index("  ok") + 2 == state
+
+
+@pytest.mark.process
+def test_info_names_what_is_gone(on_terminal: OnTerminal, endpoint: str, raw: Session) -> None:
+    """The number stands in the table, the addresses below it; on a terminal no address is broken."""
+    gone = [f"wing-{number}/vehicle_local_position" for number in range(5)]
+    sources = [{"source": "px4-zenoh:", "state": "waiting", "stale": gone}]
+    service = answer(raw, "nedbus/@service/s/status", {"service": "s", "sources": sources})
+    info = run_command("info", "-c", endpoint)
+    assert info.exit_code == 0, info.err
+    assert "  5 gone\n" in info.out
+    assert f"\ngone: {', '.join(gone)}\n" in info.out
+    with on_terminal("info", "-c", endpoint) as terminal:
+        assert terminal.wait() == 0
+    lines = terminal.shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert all(any(address in line for line in lines) for address in gone)
+    del service
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_hz_redraws_in_place(
+    on_terminal: OnTerminal, endpoint: str, bus: nedbus.Bus, number: signal.Signals, exit_code: int
+) -> None:
+    """On a terminal the table is drawn over the last one, as high as the terminal at most, and stays at the end.
+
+    Ctrl-C and SIGTERM, as of `timeout`, end the redrawing and show the cursor again.
+    """
+    vehicles = [str(vehicle) for vehicle in range(12)]
+    with flying(bus, *vehicles), on_terminal("hz", "-c", endpoint, LINES="10") as terminal:
+        wait_for(lambda: terminal.shown.count("VEHICLE/TOPIC") >= 2, what="a second table")
+        terminal.popen.send_signal(number)
+        assert terminal.wait() == exit_code
     assert "\x1b[1A\x1b[2K" in terminal.shown
     assert " more" in terminal.shown
-    drawings = terminal.shown.split("VEHICLE/TOPIC")[1:]
-    assert len(drawings) >= 3
-    assert all(drawing.count("\n") <= 10 for drawing in drawings)
-
-
-@pytest.mark.process
-def test_hz_leaves_the_cursor_as_it_was(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Ctrl-C and SIGTERM, as of `timeout`, end the redrawing and show the cursor again."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:")
-    for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 143)):
-        with on_terminal("hz", "-c", endpoint) as terminal:
-            wait_for(partial(terminal.has_shown, "\x1b[?25l"), what="the table")
-            terminal.popen.send_signal(number)
-            assert terminal.popen.wait(DEADLINE) == code
-        assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
-        assert "Traceback" not in terminal.shown
+    assert all(drawing.count("\n") <= 10 for drawing in terminal.shown.split("VEHICLE/TOPIC")[1:])
+    assert terminal.shown.rindex("\x1b[?25h") > terminal.shown.rindex("\x1b[?25l")
+    assert "Traceback" not in terminal.shown
 
 
 @pytest.mark.parametrize(("number", "raised"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
@@ -320,40 +303,22 @@ def test_signal_while_a_table_starts(
     assert shown == [False, True]
 
 
-# Links and states
-
-
-@pytest.fixture
-def restarted_router() -> Iterator[tuple[str, Callable[[], None], Callable[[], None]]]:
-    """Run a router that a test can end and start again."""
-    where = free_endpoint()
-    sessions = [open_router(listen=(where,))]
-
-    def begin() -> None:
-        sessions.append(open_router(listen=(where,)))
-
-    yield where, lambda: sessions.pop().close(), begin
-    for session in sessions:
-        session.close()
-
-
 @pytest.mark.parametrize("command", ["echo", "hz"])
-def test_link_that_breaks_is_reported(
-    run_nedbus: Start, restarted_router: tuple[str, Callable[[], None], Callable[[], None]], command: str
-) -> None:
+def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
     """`echo` and `hz` say when the link to the router breaks, and when it is back; `hz` says so of each stream."""
-    where, end, begin = restarted_router
+    where = free_endpoint()
+    router = open_router(listen=(where,))
     run_nedbus("serve", "-c", where, "-s", "sim:")
     follower = run_nedbus(command, "-c", where, "--json")
     wait_for(lambda: follower.out, what="data")
-    end()
+    router.close()
     wait_for(lambda: f"the link to {where} is broken: waiting for it" in follower.err, what="the break")
     if command == "hz":
         wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
-    begin()
-    wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
-    lines = follower.out.count("\n")
-    wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
+    with closing(open_router(listen=(where,))):
+        wait_for(lambda: f"the link to {where} is back" in follower.err, what="the link")
+        lines = follower.out.count("\n")
+        wait_for(lambda: follower.out.count("\n") > lines + 3, what="more data")
 
 
 def states(lines: str) -> list[str]:
@@ -379,20 +344,15 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
     assert states(hz.out).count("gone") == 1
 
 
-def test_finished_replay_is_stale(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
+def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=4&wait=1")
-    hz = run_nedbus("hz", "-c", endpoint, "--json", "-t", VLP)
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1")
+    hz = start_hasty(start, {"nedbus.client.health._STALE": 0.5}, "hz", "-c", endpoint, "--json", "-t", VLP)
     wait_for(lambda: "stale" in states(hz.out), what="hz to see the end")
-    listed = run_nedbus("list", "-c", endpoint)
-    assert listed.wait() == 0
+    monkeypatch.setattr("nedbus.client.health._STALE", 0.5)
+    listed = run_command("list", "-c", endpoint)
     assert [line.split()[3] for line in listed.out.splitlines()[1:]] == ["stale:"] * 5
-    info = run_nedbus("info", "-c", endpoint)
-    assert info.wait() == 0
-    assert info.out.count("stale: nothing for ") == 5
-
-
-# What peers send
+    assert run_command("info", "-c", endpoint).out.count("stale: nothing for ") == 5
 
 
 def answer(raw: Session, key: str, status: object) -> object:
@@ -400,7 +360,7 @@ def answer(raw: Session, key: str, status: object) -> object:
     return raw.declare_queryable(key, lambda query: query.reply(key, json.dumps(status)))
 
 
-def test_hostile_status_is_shown_harmless(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
     """Escape sequences, forged lines and endless texts of a service are shown as short text, or left out."""
     flood = [{"source": EVIL * 1000, "state": "retrying", "error": EVIL * 1000, "published": [EVIL] * 1000}]
     stream = {"address": EVIL, "health": {"rate": "\x1b[2J"}}
@@ -408,141 +368,155 @@ def test_hostile_status_is_shown_harmless(run_nedbus: Start, endpoint: str, raw:
     status = {"service": EVIL, "host": EVIL, "version": EVIL, "role": EVIL, "sources": [source, "\x1b[2J", None]}
     hostile = answer(raw, "nedbus/@service/hostile/status", status)
     for arguments in (["info"], ["health", "--services", "1"], ["health", "--services", "1", "--json"]):
-        shown = run_nedbus(*arguments, "-c", endpoint)
-        assert shown.wait() == (arguments[0] == "health"), shown.err
+        shown = run_command(*arguments, "-c", endpoint)
+        assert shown.exit_code == (arguments[0] == "health"), shown.err
         assert not has_control(shown.out + shown.err)
         assert "\nforged line" not in shown.out + shown.err
         assert len(shown.out + shown.err) < 5000
     del hostile
 
 
-def test_hostile_keys_are_shown_harmless(run_nedbus: Start, endpoint: str, raw: Session) -> None:
+def test_hostile_keys_are_shown_harmless(endpoint: str, raw: Session) -> None:
     """Keys and tokens with escape sequences reach neither the output nor the log."""
     tokens = [raw.liveliness().declare_token(f"nedbus/{name}/@alive/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)]
-    listed = run_nedbus("list", "-c", endpoint)
-    assert listed.wait() == 0, listed.err
-    echo = run_nedbus("echo", "-c", endpoint, "*", "-d", "2")
-    hz = run_nedbus("hz", "-c", endpoint, "-d", "2")
-    while echo.popen.poll() is None or hz.popen.poll() is None:
+
+    def put() -> None:
         raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")
         raw.put("nedbus/1/vehicle_local_position", b"\x1b[2J" * 1000)
-    for process in (listed, echo, hz):
-        assert not has_control(process.out + process.err)
-        assert len(process.out + process.err) < 5000
+
+    with repeating(put):
+        for arguments, exit_code in ((["list"], 0), (["echo", "*", "-d", "0.5"], 1), (["hz", "-d", "0.5"], 1)):
+            shown = run_command(*arguments, "-c", endpoint)
+            assert shown.exit_code == exit_code, shown.err
+            assert not has_control(shown.out + shown.err)
+            assert len(shown.out + shown.err) < 5000
+            assert exit_code == 0 or "not a VehicleLocalPosition" in shown.err
     assert len(tokens) == 3
 
 
-def test_flood_of_keys_leaves_hz_small(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Of 1000 vehicles there are 50 rows a second and a number, not 1000."""
-    hz = run_nedbus("hz", "-c", endpoint, measured=False)
-    publishers = [bus.publisher(VLP, vehicle=f"flood-{number}") for number in range(1000)]
-
-    def is_shown() -> bool:
-        for each in publishers:
-            each.publish(message(1))
-        return " more\n" in hz.out
-
-    wait_for(is_shown, what="more than 50 rows")
-    hz.signal(signal.SIGINT)
-    assert hz.wait() == 130
+def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
+    """Of 100 vehicles there are 50 rows a second and a number, not 100."""
+    with flying(bus, *(f"flood-{number}" for number in range(100))):
+        hz = run_command("hz", "-c", endpoint, "-d", "1.1")
+    assert hz.exit_code == 0
+    assert "\n50 more\n" in hz.out
     assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
 
 
-# Streams and signals
+LIMITS = {
+    "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
+    "exec 2>&-": "os.close(2); sys.stderr = None",
+    "ulimit -n 12": "resource.setrlimit(resource.RLIMIT_NOFILE, (12, 12))",
+}
+CLOSED = "nedbus: cannot write: standard output is closed\n"
+TOO_FEW = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
 
 
-@pytest.mark.process
-@pytest.mark.parametrize("command", ["list", "schema", "get", "--version", "pki ca ."])
-def test_closed_stdout_is_one_line(endpoint: str, bus: nedbus.Bus, command: str) -> None:
-    """`nedbus list >&-` says that nothing can be written, and exits with 1."""
-    bus.publisher(VLP, vehicle="1").publish(message(1))
-    wait_for(bus.latest, what="the message")
-    connect = f"-c {endpoint}" if command in {"list", "get"} else ""
-    line = f"{sys.executable} -m nedbus {command} {connect} >&-"
-    ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
-    assert (ended.returncode, ended.stderr) == (1, "nedbus: cannot write: standard output is closed\n")
-
-
-@pytest.mark.process
-def test_closed_stderr_changes_nothing(endpoint: str, bus: nedbus.Bus) -> None:
-    """Without stderr there is nowhere to complain, and output and exit codes are as ever."""
-    bus.publisher(VLP, vehicle="1").publish(message(1))
-    wait_for(bus.latest, what="the message")
-    for command, code, lines in (("list", 0, 2), ("get -v 9", 1, 0)):
-        line = f"{sys.executable} -m nedbus {command} -c {endpoint} 2>&-"
-        ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
-        assert (ended.returncode, len(ended.stdout.splitlines())) == (code, lines)
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("command", [["list"], ["serve", "-s", "sim:"], ["schema"]])
-def test_too_few_files_are_no_traceback(command: list[str]) -> None:
-    """`ulimit -n 12` ends in a sentence: Zenoh would abort the process with a page of Rust."""
-    ended = subprocess.run(
-        ["bash", "-c", f"ulimit -n 12; {sys.executable} -m nedbus {' '.join(command)}"],
-        capture_output=True,
-        timeout=DEADLINE,
-        check=False,
-        text=True,
-    )
-    expected = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
-    assert (ended.returncode, ended.stderr) == (1, expected)
-
-
-@pytest.mark.process
-@pytest.mark.parametrize("command", [["echo"], ["hz"], ["list"], ["serve", "-s", "sim:"], ["router"]])
-def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: list[str]) -> None:
-    """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
-    where = ["-l", free_endpoint()] if command[0] in {"serve", "router"} else ["-c", endpoint]
-    for imports in (1, 50, 150, 300, 10_000):
-        arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command, *where]
-        with subprocess.Popen(
-            arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=unmeasured()
-        ) as process:
-            assert process.stderr is not None
-            started, seen = False, 0
-            for line in process.stderr:  # the moment is one of the program, not of a clock
-                seen += started
-                started = started or line.rstrip().endswith(" nedbus.cli")
-                if seen == imports or line.rstrip().endswith(" nedbus.cli.app"):
-                    break
-            process.send_signal(signal.SIGINT)
-            rest = process.stderr.read()
-            assert process.wait(DEADLINE) in {-signal.SIGINT, 130, 0}
-        assert "Traceback" not in rest
-
-
+@pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
 @pytest.mark.parametrize(
-    ("command", "answer"),
-    [(["serve", "-s", "sim:"], "0 started, 0 stopped, 1 unchanged"), (["router"], "SIGHUP is ignored")],
+    ("limit", "command", "expected"),  # exit code, number of lines on stdout, stderr
+    [
+        *(("exec >&-", command, (1, 0, CLOSED)) for command in ("list", "schema", "get", "--version", "pki ca .")),
+        ("exec 2>&-", "list", (0, 2, "")),
+        ("exec 2>&-", "get -v 9", (1, 0, "")),
+        *(("ulimit -n 12", command, (1, 0, TOO_FEW)) for command in ("list", "serve -s sim:", "schema")),
+    ],
 )
-def test_hangup_ends_no_service(run_nedbus: Start, command: list[str], answer: str) -> None:
+def test_closed_stream_or_too_few_files_are_one_line(
+    start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
+) -> None:
+    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain.
+
+    With few files Zenoh would abort the process with a page of Rust.
+    """
+    bus.publisher(VLP, vehicle="1").publish(message(1))
+    script = f"import os, resource, sys\n{LIMITS[limit]}\nfrom nedbus.cli import main\nmain()"
+    if shell:
+        line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
+        ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
+        said = ended.returncode, len(ended.stdout.splitlines()), ended.stderr
+    else:
+        process = start("-c", script, *command.split(), NEDBUS_CONNECT=endpoint)
+        said = process.wait(), len(process.out.splitlines()), process.err
+    assert said == expected
+
+
+MOMENTS = [pytest.param("echo", imports) for imports in (1, 50, 150, 300, 10_000)]
+MOMENTS += [pytest.param(each, 10_000, marks=pytest.mark.slow) for each in ("hz", "list", "serve -s sim:", "router")]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("command", "imports"), MOMENTS)  # imports after that of nedbus.cli; 10,000 are all
+def test_interrupt_in_the_first_second_is_quiet(endpoint: str, command: str, imports: int) -> None:
+    """Ctrl-C at any moment from the start of `main` on ends without a traceback, as 130 in a shell."""
+    environment = unmeasured() | {"NEDBUS_CONNECT": endpoint, "NEDBUS_LISTEN": free_endpoint()}
+    arguments = [sys.executable, "-X", "importtime", "-m", "nedbus", *command.split()]
+    null, pipe = subprocess.DEVNULL, subprocess.PIPE
+    with subprocess.Popen(arguments, stdout=null, stderr=pipe, text=True, env=environment) as process:
+        assert process.stderr is not None
+        started, seen = False, 0
+        for line in process.stderr:  # the moment is one of the program, not of a clock
+            seen += started
+            started = started or line.rstrip().endswith(" nedbus.cli")
+            if seen == imports or line.rstrip().endswith(" nedbus.cli.app"):
+                break
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+        assert process.wait(DEADLINE) in {-signal.SIGINT, 130, 0}
+    assert "Traceback" not in rest
+
+
+STUCK = """
+import time
+from nedbus.cli import run
+
+def stand_still():
+    print("started", flush=True)
+    time.sleep(100)
+
+run._LIMIT = 100.0
+run.run_until_signal(stand_still, lambda: print("stopping", flush=True))
+"""
+
+
+@pytest.mark.parametrize(("number", "exit_code"), [(signal.SIGINT, 130), (signal.SIGTERM, 1)])
+def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_code: int) -> None:
+    """A command that is stuck, and would have some time to end, has none after a second signal."""
+    stuck = start("-c", STUCK, measured=False)
+    for text in ("started", "stopping"):
+        wait_for(lambda text=text: text in stuck.out, what=text)  # type: ignore[misc]
+        stuck.signal(number)
+    assert stuck.wait() == exit_code
+
+
+def test_hangup_ends_no_router(run_nedbus: Start) -> None:
     """SIGHUP, which a closed terminal sends, ends nothing; what ends a service is logged, with the date."""
     where = free_endpoint()
-    service = run_nedbus(*command, "-l", where)
-    wait_for(lambda: f"router on {where}" in service.err, what="the service")
-    service.signal(signal.SIGHUP)
-    wait_for(lambda: answer in service.err, what="the hang-up")
-    service.signal(signal.SIGTERM)
-    assert service.wait() == 0
-    last = service.err.splitlines()[-1]
+    router = run_nedbus("router", "-l", where)
+    wait_for(lambda: f"router on {where}" in router.err, what="the router")
+    router.signal(signal.SIGHUP)
+    wait_for(lambda: "SIGHUP is ignored" in router.err, what="the hang-up")
+    router.signal(signal.SIGTERM)
+    assert router.wait() == 0
+    last = router.err.splitlines()[-1]
     assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    ending: SIGTERM", last)
 
 
 @pytest.mark.process
-def test_closed_terminal_ends_no_service(bus: nedbus.Bus, endpoint: str) -> None:
-    """A service whose terminal is gone publishes on."""
+def test_closed_terminal_ends_no_service(on_terminal: OnTerminal, bus: nedbus.Bus, endpoint: str) -> None:
+    """A service whose terminal is gone publishes on, and ends as any other."""
     with on_terminal("serve", "-c", endpoint, "-s", "sim:") as terminal:
         wait_for(bus.latest, what="data")
         terminal.hang_up()
         with bus.subscribe(mode="every") as subscription:
-            for _ in range(100):
+            for _ in range(50):
                 subscription.receive(DEADLINE)
         assert terminal.popen.poll() is None
         terminal.popen.send_signal(signal.SIGTERM)
-        assert terminal.popen.wait(DEADLINE) == 0
+        assert terminal.wait() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.process
 def test_make_run(tmp_path: Path) -> None:
     """A second one says that a nedbus runs already, and how to choose; Ctrl-C ends the first without make's error."""
@@ -558,9 +532,7 @@ def test_make_run(tmp_path: Path) -> None:
         first = subprocess.Popen(command, stdout=written, stderr=written, env=unmeasured(), start_new_session=True)
     try:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
-        second = subprocess.run(
-            command, capture_output=True, check=False, text=True, timeout=DEADLINE, env=unmeasured()
-        )
+        second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)
         assert second.returncode == 2
         assert "(a nedbus runs there already): end it, or choose another address with --http\n" in second.stderr
         assert 'make run ARGS="' in second.stderr

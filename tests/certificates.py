@@ -1,0 +1,65 @@
+"""The certificates of a small fleet, made once in each process of pytest, and secure routers that show them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import nedbus
+from nedbus.transport import make_authority, make_certificate
+from tests.ports import free_endpoint
+
+CONFIG: Final = Path(__file__).parents[1] / "config"
+"""The shipped configurations of routers."""
+
+
+@pytest.fixture(scope="session")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of keys and certificates, good and bad ones, for tests that change nothing in it."""
+    folder = tmp_path_factory.getbasetemp() / "pki"
+    if folder.is_dir():  # made for another file of tests
+        return folder
+    make_authority(folder)
+    for name in ("router", "router-2"):
+        make_certificate(folder, name, hosts=["127.0.0.1", "localhost"])
+    make_certificate(folder, "router-elsewhere", hosts=["gcs.local", "10.0.0.7"])
+    for name, days in (("router-expired", -1), ("router-soon", 10)):
+        make_certificate(folder, name, hosts=["127.0.0.1"], days=days)
+    for name in ("vehicle-1", "vehicle-2", "vehicle-99", "vehicle-200", "reader", "operator", "stranger"):
+        make_certificate(folder, name)
+    make_certificate(folder, "expired", days=-1)
+    make_authority(folder / "foreign")
+    make_certificate(folder / "foreign", "reader")
+    return folder
+
+
+def secure_endpoint() -> str:
+    return free_endpoint().replace("tcp/", "tls/")
+
+
+def write_config(pki: Path, file: Path, endpoint: str, **replaced: str) -> Path:
+    """Copy the shipped configuration of this name, open or secure, with an endpoint of the test's and other text."""
+    text = (CONFIG / file.name).read_text()
+    changes = {"/etc/nedbus/pki": str(pki), "tcp/0.0.0.0:7447": endpoint, "tls/0.0.0.0:7447": endpoint} | replaced
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    file.write_text(text)
+    return file
+
+
+def files_of(pki: Path, name: str | None, ca: str = "ca.crt") -> dict[str, Path]:
+    """Return the settings of whoever shows a certificate, or none."""
+    own = {} if name is None else {"tls_certificate": pki / f"{name}.crt", "tls_key": pki / f"{name}.key"}
+    return {"tls_ca": pki / ca, **own}
+
+
+def tls_of(pki: Path, name: str | None, ca: str = "ca.crt") -> nedbus.Tls:
+    """Return the same for a script."""
+    return nedbus.Tls(*files_of(pki, name, ca).values())
+
+
+def flags_of(pki: Path, name: str | None) -> list[str]:
+    """Return the same for a command."""
+    return [f"--{setting.replace('_', '-')}={path}" for setting, path in files_of(pki, name).items()]

@@ -1,0 +1,92 @@
+"""Commands that end by themselves, in this process: what they print and their exit codes, without a start of Python.
+
+What ends by a signal, or needs a stream of its own or something beside it, is a process: `run_nedbus`, `fork_command`.
+"""
+
+from __future__ import annotations
+
+import atexit
+import io
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+from unittest.mock import patch
+
+import typer
+
+from nedbus.cli.app import app
+from nedbus.cli.log_limit import RateLimit
+
+from .processes import Forked, Zygote, unmeasured
+
+_SIZE: Final = {"COLUMNS": "80", "LINES": "24"}  # where a test does not say another, also if pytest has a terminal
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A command that has ended: its exit code and its output."""
+
+    exit_code: int
+    out: str
+    err: str
+
+
+def run_command(*arguments: str, **environment: str) -> Ended:
+    """Run `nedbus` with these arguments, in the main thread, and return when it has ended."""
+    exit_code, out, err = 0, io.BytesIO(), io.BytesIO()
+    stdout = io.TextIOWrapper(out, "utf-8", write_through=True)
+    stderr = io.TextIOWrapper(err, "utf-8", errors="backslashreplace", write_through=True)
+    with patch.dict(os.environ, _SIZE | environment), redirect_stdout(stdout), redirect_stderr(stderr), _as_process():
+        try:
+            _commands().main(arguments, prog_name="nedbus")
+        except SystemExit as exc:
+            exit_code = int(exc.code or 0)
+        except Exception:  # noqa: BLE001 - what a process would show
+            exit_code = 1
+            traceback.print_exc()
+    return Ended(exit_code, out.getvalue().decode(), err.getvalue().decode())
+
+
+def fork_command(zygote: Zygote, *arguments: str, out: int, err: int | None = None, **environment: str) -> Forked:
+    """Start `nedbus` with these arguments and streams, and without coverage; it is the test that ends it."""
+    with Path(os.devnull).open("r+b") as null:
+        streams = null.fileno(), out, null.fileno() if err is None else err
+        started = unmeasured() | environment
+        return zygote.start(("-m", "nedbus", *arguments), cwd=Path.cwd(), environment=started, streams=streams)
+
+
+@cache
+def _commands() -> Any:
+    """Return the commands as `app()` makes them, each time in a tenth of a second."""
+    return typer.main.get_command(app)
+
+
+@contextmanager
+def _as_process() -> Iterator[None]:
+    """Lend what a process has once, and give it back: the log, handlers of signals, and hooks for uncaught errors."""
+    signals = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    root = logging.getLogger()
+    levels = {logger: logger.level for logger in (root, logging.getLogger("nedbus"))}
+    handlers, root.handlers = root.handlers, []  # else logging would be set up already, by pytest
+    hooks = sys.excepthook, threading.excepthook
+    try:
+        yield
+    finally:
+        for limit in [each for handler in root.handlers for each in handler.filters if isinstance(each, RateLimit)]:
+            limit.flush()
+            atexit.unregister(limit.flush)
+        root.handlers = handlers
+        for logger, level in levels.items():
+            logger.setLevel(level)
+        sys.excepthook, threading.excepthook = hooks
+        for number, handler in signals.items():
+            signal.signal(number, handler)

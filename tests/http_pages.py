@@ -1,0 +1,44 @@
+"""What nedbus serves over HTTP, as a client reads it."""
+
+from __future__ import annotations
+
+import http.client
+from contextlib import closing
+
+from prometheus_client.core import Metric
+from prometheus_client.parser import text_string_to_metric_families
+
+from tests.waits import DEADLINE
+
+
+def read_families(text: str) -> dict[str, Metric]:
+    """Return the metrics of a page by name, as Prometheus's own client reads them."""
+    return {each.name: each for each in text_string_to_metric_families(text)}
+
+
+class Pages:
+    """What answers on a port of loopback."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.where = f"127.0.0.1:{port}"
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+        """Return the status and the content of an answer; (0, "") if there is none."""
+        with closing(http.client.HTTPConnection(self.where, timeout=DEADLINE)) as connection:
+            try:
+                connection.request(method, path, headers=headers)
+                answer = connection.getresponse()
+                return answer.status, answer.read().decode()
+            except (ConnectionError, http.client.HTTPException):
+                return 0, ""
+
+    def families(self) -> dict[str, Metric]:
+        """Return the metrics by name; {} before there are any."""
+        status, text = self.ask("/metrics")
+        return read_families(text) if status == 200 else {}
+
+    def values(self, name: str, **labels: str) -> list[float]:
+        """Return the values of the series of a metric that have these labels."""
+        samples = [each for family in self.families().values() for each in family.samples if each.name == name]
+        return [each.value for each in samples if labels.items() <= each.labels.items()]

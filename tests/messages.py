@@ -1,0 +1,19 @@
+"""The message that most tests send, and the names that they send it under."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from nedbus_msgs import VehicleLocalPosition
+
+VLP: Final = "vehicle_local_position"
+VALID: Final[dict[str, object]] = {
+    **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True),
+    **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "heading"), 0.0),
+}
+"""Fields of a vehicle that knows where it is, and stands there."""
+
+
+def message(timestamp: int = 1, **fields: object) -> VehicleLocalPosition:
+    """Return a message with these fields; what is not given is invalid or zero."""
+    return VehicleLocalPosition.model_validate({"timestamp": timestamp, **fields})

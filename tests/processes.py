@@ -1,0 +1,137 @@
+"""Processes that tests start: their output in files, a deadline for each wait, gone at the end of the test."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from .waits import DEADLINE
+
+_SAID = 10_000  # characters of a process's output that a failure shows
+
+
+class Forked:
+    """A process forked by a zygote, with the methods of subprocess.Popen."""
+
+    def __init__(self, command: Sequence[str], status: int) -> None:
+        self.args = command
+        self.returncode: int | None = None
+        self._status = status
+        self._close = weakref.finalize(self, os.close, status)
+        self.pid = int(os.read(status, 10))
+
+    def poll(self) -> int | None:
+        return self._look(0)
+
+    def wait(self, timeout: float | None = None) -> int:
+        code = self._look(timeout)
+        if code is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def _look(self, timeout: float | None) -> int | None:
+        if self.returncode is None and select.select([self._status], [], [], timeout)[0]:
+            self.returncode = int(os.read(self._status, 10))
+            self._close()
+        return self.returncode
+
+
+class Zygote:
+    """A process of `tests/zygote.py`; one for each worker of pytest, from its first test that starts a process."""
+
+    def __init__(self) -> None:
+        self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.zygote", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                cwd=Path(__file__).parents[1],
+                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # what has threads cannot be forked
+            )
+
+    def start(
+        self, arguments: Sequence[str], *, cwd: Path, environment: dict[str, str], streams: tuple[int, int, int]
+    ) -> Forked:
+        """Fork what Python would start with these arguments, with these three standard streams."""
+        request = {"arguments": arguments, "cwd": str(cwd), "environment": environment}
+        ours, theirs = os.pipe()
+        socket.send_fds(self._requests, [json.dumps(request).encode()], [*streams, theirs])
+        os.close(theirs)
+        return Forked([sys.executable, *arguments], ours)
+
+    def close(self) -> None:
+        self._requests.close()
+        self._process.wait(DEADLINE)
+
+
+class Process:
+    """A process that a test starts: its output in files, gone at the end of the test at the latest."""
+
+    def __init__(
+        self, command: Sequence[str], where: Path, environment: dict[str, str], zygote: Zygote | None = None
+    ) -> None:
+        self._measured = any(name.startswith("COVERAGE_") for name in environment)
+        self._out = where / "stdout"
+        self._err = where / "stderr"
+        self.popen: Forked | subprocess.Popen[bytes]
+        with self._out.open("wb") as out, self._err.open("wb") as err, Path(os.devnull).open("rb") as null:
+            if zygote is not None:
+                streams = null.fileno(), out.fileno(), err.fileno()
+                self.popen = zygote.start(command[1:], cwd=where, environment=environment, streams=streams)
+            else:
+                self.popen = subprocess.Popen(command, stdin=null, stdout=out, stderr=err, cwd=where, env=environment)
+
+    @property
+    def out(self) -> str:
+        return self._out.read_text()
+
+    @property
+    def err(self) -> str:
+        return self._err.read_text()
+
+    def wait(self, seconds: float = DEADLINE) -> int:
+        """Wait for its end and return its exit code; fail with what it said, and where it was, when it does not end."""
+        try:
+            return self.popen.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.popen.send_signal(signal.SIGABRT)  # Python writes the stacks of all threads
+            with suppress(subprocess.TimeoutExpired):
+                self.popen.wait(DEADLINE)
+            said = f"{self.out[-_SAID:]}{self.err[-_SAID:]}"
+            pytest.fail(f"{self.popen.args!r} did not end within {seconds} s; it said:\n{said}")
+
+    def signal(self, number: signal.Signals) -> None:
+        if self._measured and number == signal.SIGINT:
+            pytest.fail("start what SIGINT is to end with measured=False")
+        self.popen.send_signal(number)
+
+    def kill(self) -> None:
+        self.popen.kill()
+        self.popen.wait(DEADLINE)
+
+
+def unmeasured() -> dict[str, str]:
+    """Return an environment without coverage, for what SIGINT ends: KeyboardInterrupt can be raised in its lock."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
+
+
+Start = Callable[..., Process]

@@ -1,0 +1,69 @@
+"""Subscriptions to which messages do not come, and the questions they ask: nothing is lost on loopback."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import partial
+from types import SimpleNamespace
+
+import nedbus
+from nedbus.client.decoder import Decoder
+from nedbus.client.layout_lookup import LayoutLookup
+from nedbus.client.receive_queue import ReceiveQueue
+from nedbus.client.zenoh_subscriber import ZenohSubscriber
+from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept
+
+from .publishing import publish, take
+
+
+class LossyQueue(ReceiveQueue):
+    """A queue to which the messages `missing`, by sequence number, do not come."""
+
+    def __init__(self) -> None:
+        super().__init__("every", Decoder(LayoutLookup(dict), prefix="nedbus"))
+        self.missing: Collection[int] = ()
+
+    def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
+        left = [raw for raw in batch if raw.source_info is None or raw.source_info.source_sn not in self.missing]
+        super().put(left, overflowed=overflowed)
+
+
+class Lossy:
+    """A subscription with a lossy queue, and its questions: so many `unanswered`, as those that a router drops."""
+
+    def __init__(
+        self, session: Session, queue: LossyQueue, subscriber: ZenohSubscriber, publisher: nedbus.Publisher
+    ) -> None:
+        self.session = session
+        self.publish = partial(publish, publisher)
+        self.queue = queue
+        self.subscription = nedbus.Subscription(subscriber, queue, name="lossy", owner=None)
+        self.receive = partial(take, self.subscription)
+        self.asked: list[tuple[str, int, int]] = []
+        self.unanswered = 0
+        self.open = self.most = 0
+
+    def ask(self, session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> object:
+        self.asked.append((key, numbers.start, numbers.stop))
+        if len(self.asked) <= self.unanswered:
+            return SimpleNamespace(ended=True, take=dict)
+        self.open += 1
+        self.most = max(self.most, self.open)
+        return Counted(ask_kept(session, key, publisher, numbers, timeout=timeout), self)
+
+
+class Counted:
+    """Answers of a question that counts as open until they have ended."""
+
+    def __init__(self, answers: KeptAnswers, lossy: Lossy) -> None:
+        self._answers = answers
+        self._lossy = lossy
+
+    def take(self) -> dict[int, RawSample]:
+        was, taken = self._answers.ended, self._answers.take()
+        self._lossy.open -= self._answers.ended and not was
+        return taken
+
+    @property
+    def ended(self) -> bool:
+        return self._answers.ended

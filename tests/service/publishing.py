@@ -1,0 +1,45 @@
+"""What tests publish in numbers, once somebody reads it."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import cast
+
+import numpy as np
+import zenoh
+
+import nedbus
+from nedbus_msgs.arrays import MessageArray, to_array
+from tests.messages import message
+from tests.waits import DEADLINE, wait_for
+
+
+def numbered(count: int, *, first: int = 1) -> MessageArray:
+    """Return so many messages, with the timestamps `first`, `first + 1`, ..."""
+    messages: MessageArray = np.repeat(to_array([message()]), count)
+    messages["timestamp"] = np.arange(first, first + count)
+    return messages
+
+
+def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
+    """Publish a message with each of these timestamps."""
+    for timestamp in timestamps:
+        publisher.publish(message(timestamp))
+
+
+def is_read(publisher: nedbus.Publisher) -> bool:
+    """Return whether a publisher knows of a subscriber."""
+    probe = publisher._session.declare_publisher(publisher.key)  # no other session knows what this one does
+    status = cast("zenoh.MatchingStatus", probe.matching_status)
+    probe.undeclare()
+    return status.matching
+
+
+def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
+    """Wait until a publisher knows of a subscriber: what it publishes before goes nowhere."""
+    wait_for(partial(is_read, publisher), what=f"a subscriber of {publisher.key}")
+
+
+def take(subscription: nedbus.Subscription, count: int) -> list[int]:
+    """Wait for so many messages, and return their timestamps."""
+    return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]

@@ -1,0 +1,224 @@
+"""How a bus begins and ends: routers that are not there, closing, cancelling, forks and garbage, of either client."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import signal
+import threading
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import cast
+
+import pytest
+import zenoh
+
+import nedbus
+from nedbus import Mode
+from nedbus.client.decoder import Decoder
+from nedbus.client.layout_lookup import LayoutLookup
+from nedbus.client.receive_queue import ReceiveQueue
+from nedbus.client.zenoh_subscriber import ZenohSubscriber
+from nedbus.transport import Session, open_router
+from tests.messages import VLP, message
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
+
+from .answering import answering
+from .publishing import publish
+from .test_bus import BOTH
+
+
+def test_nothing_listening_is_a_clear_error() -> None:
+    """The error is a ConnectionError, and says where, for how long, and what to do."""
+    where = free_endpoint()
+    assert issubclass(nedbus.ConnectError, ConnectionError)
+    with pytest.raises(nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"):
+        nedbus.connect(where, timeout=0.1)
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
+    """`timeout=None` waits for a router, for as long as it takes."""
+    where = free_endpoint()
+
+    async def connect_async() -> bool:
+        async with nedbus.connect_async(where, timeout=None) as bus:
+            return bus.connected
+
+    def connect() -> bool:
+        with nedbus.connect(where, timeout=None) as bus:
+            return bus.connected
+
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit((lambda: asyncio.run(connect_async())) if is_async else connect)
+        with pytest.raises(TimeoutError):
+            waiting.result(0.2)
+        router = open_router(listen=(where,))
+        assert waiting.result(DEADLINE)
+    router.close()
+
+
+def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Several endpoints are several chances; NEDBUS_CONNECT is for scripts that should not name a router."""
+    with nedbus.connect([free_endpoint(), endpoint]) as bus:
+        assert bus.connected
+    monkeypatch.setenv("NEDBUS_CONNECT", endpoint)
+    with nedbus.connect() as bus:
+        assert bus.connected
+
+
+def test_timeout_includes_the_opening() -> None:
+    """A receive with a timeout does not wait longer for the router, which is away, than for a message."""
+    where = free_endpoint()
+    router = open_router(listen=(where,))
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(where) as bus:
+            subscription = bus.subscribe(mode="every")
+            await asyncio.to_thread(router.close)
+            with pytest.raises(nedbus.NoDataError):  # and not ConnectError, after 3 s
+                await subscription.receive(0.01)
+
+    asyncio.run(scenario())
+
+
+def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
+    """Receives that are cancelled while the subscription opens leave one subscriber, and no message comes twice."""
+    publisher = bus.publisher(VLP, vehicle="1")
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as other:
+            subscription = other.subscribe(mode="every")
+            for _ in range(3):
+                task = asyncio.create_task(subscription.receive())
+                await asyncio.sleep(0)
+                await asyncio.sleep(0)
+                task.cancel()
+            for timestamp in (1, 2):
+                publish(publisher, timestamp)
+                assert (await subscription.receive(DEADLINE)).message.timestamp == timestamp
+            assert subscription.counts == nedbus.Counts(received=2)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("mode", BOTH)
+def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, mode: Mode) -> None:
+    """Iteration ends without an error, also that of a thread that waits; receive says it; closing twice is fine."""
+    with nedbus.connect(endpoint) as bus:
+        waiting = bus.subscribe(VLP, mode=mode)
+        reader = threading.Thread(target=list, args=(waiting,), daemon=True)
+        reader.start()
+        waiting.close()
+        reader.join(DEADLINE)
+        assert not reader.is_alive()
+    subscription = client.subscribe(VLP, mode=mode)
+    subscription.close()
+    subscription.close()
+    assert list(islice(subscription, 1)) == []
+    with pytest.raises(nedbus.ClosedError):
+        subscription.receive(1.0)
+
+
+def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A publisher that was closed is not listed, answers no more, refuses to publish, and makes room for another."""
+    publisher = client.publisher(VLP, vehicle="1")
+    publish(publisher, 1)
+    wait_for(bus.latest, what="the message")
+    publisher.close()
+    publisher.close()
+    assert client.latest("*") == []
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+    with pytest.raises(nedbus.ClosedError):
+        publish(publisher, 2)
+    with client.publisher(VLP, vehicle="1") as again:
+        publish(again, 3)
+
+
+def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
+    """Everything that is asked of a closed bus raises ClosedError, and its subscriptions end."""
+    subscription = client.subscribe(VLP)
+    publisher = client.publisher(VLP, vehicle="1")
+    client.close()
+    client.close()
+    assert list(islice(subscription, 1)) == []
+    with pytest.raises(nedbus.ClosedError):
+        publisher.publish(message())
+    for ask in (client.latest, client.vehicles, client.services, lambda: client.connected, client.subscribe):
+        with pytest.raises(nedbus.ClosedError):
+            ask()
+
+
+def test_forgotten_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
+    """A bus lives as long as something of it, be it a publisher alone; then it is closed, before the process ends."""
+    forgotten = nedbus.connect(endpoint)
+    gone = weakref.ref(forgotten)
+    publisher, subscription = forgotten.publisher(VLP, vehicle="1"), forgotten.subscribe(mode="every")
+    publish(publisher, 1)
+    assert subscription.receive(DEADLINE).message.timestamp == 1
+    del forgotten, subscription
+    gc.collect()
+    publish(publisher, 2)
+    wait_for(lambda: [sample.message.timestamp for sample in bus.latest()] == [2], what="the message")
+    del publisher
+    gc.collect()
+    assert gone() is None
+    wait_for(lambda: not bus.vehicles(), what="the vehicle to go")
+
+
+def test_collecting_garbage_never_closes() -> None:
+    """Garbage is collected in any thread, with any lock held: the closing, which waits, is done by another."""
+    lock = threading.Lock()
+    closed: list[threading.Thread] = []
+
+    class Subscriber:
+        def close(self) -> None:
+            with lock:
+                closed.append(threading.current_thread())
+
+    queue = ReceiveQueue("latest", Decoder(LayoutLookup(dict), prefix="nedbus"))
+    subscription = nedbus.Subscription(cast("ZenohSubscriber", Subscriber()), queue, name="", owner=None)
+    with lock:  # as a thread holds it that is in the midst of something
+        del subscription
+        gc.collect()  # a closing in this thread would wait for the lock for ever
+    wait_for(lambda: closed, what="the end of the subscription")
+    assert closed != [threading.current_thread()]
+
+
+def test_question_that_nobody_answers_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+    """A queryable that keeps its queries does not hold a script that asks: Ctrl-C ends the wait."""
+    kept: list[zenoh.Query] = []
+    code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
+    with answering(raw, "nedbus/**", kept.append):
+        process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False)
+        wait_for(lambda: kept, what="the question")
+        process.signal(signal.SIGINT)
+        assert process.wait() == -signal.SIGINT, process.err
+
+
+def test_forked_process_is_told_at_once(start: Start, endpoint: str) -> None:
+    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child still ends."""
+    code = """
+import os, sys
+import nedbus
+bus = nedbus.connect()
+subscription = bus.subscribe()
+publisher = bus.publisher("vehicle_local_position", vehicle="1")
+publisher.publish({"timestamp": 1})
+if child := os.fork():
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+publish, receive = lambda: publisher.publish({"timestamp": 2}), lambda: next(subscription)
+for ask in (bus.latest, bus.subscribe, publish, receive, nedbus.connect):
+    try:
+        ask()
+    except nedbus.ForkError as exc:
+        print(exc)
+sys.exit(7)
+"""
+    process = start("-c", code, NEDBUS_CONNECT=endpoint, measured=False, fresh=True)
+    assert process.wait() == 7, process.err
+    assert process.out.count("start processes with multiprocessing.get_context('spawn')") == 5
+    assert "Traceback" not in process.err

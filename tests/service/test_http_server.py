@@ -1,0 +1,166 @@
+"""The HTTP server of metrics and health: whatever is asked, by whomever, it answers, and nothing can be changed."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
+
+import pytest
+
+from nedbus.monitoring import HttpServer, Page, http_server
+from tests.http_pages import Pages
+from tests.waits import DEADLINE, wait_for
+
+GO = threading.Event()
+PATHS = ("/metrics", "/healthz", "/readyz", "/status")
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Pages]:
+    """Serve a page, one that fails, and one that waits until it is told to go."""
+
+    def fail() -> Page:
+        raise RuntimeError("a page that fails")
+
+    def wait() -> Page:
+        return Page.text(str(GO.wait(DEADLINE)))
+
+    pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/waits": wait}
+    with closing(HttpServer("127.0.0.1:0", pages)) as server:
+        yield Pages(server.port)
+
+
+@pytest.fixture(scope="module")
+def others() -> Iterator[tuple[Pages, Pages]]:
+    """Serve the pages of a service, for this host and for others."""
+    content = {path: lambda: Page.text("content") for path in PATHS}
+    with closing(HttpServer("127.0.0.1:0", content)) as local, closing(HttpServer("0.0.0.0:0", content)) as public:
+        yield Pages(local.port), Pages(public.port)
+
+
+def test_unknown_path_is_not_found(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
+    """404 says which pages there are, as / does; a page that fails is 500, goes to the log, and ends nothing."""
+    assert server.ask("/other") == (404, "there is /page, /fails, /waits\n")
+    assert server.ask("/")[0] == 200
+    assert server.ask("/fails") == (500, "an unexpected error: the log has it\n")
+    assert "a page that fails" in caplog.text
+    assert server.ask("/page") == (200, "a page\n")
+
+
+def test_nothing_can_be_changed(server: Pages) -> None:
+    """Whatever is not GET or HEAD is refused; HEAD has the headers of GET, and no content."""
+    for method in ("POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"):
+        assert server.ask("/page", method)[0] == 501, method
+    assert server.ask("/page", "HEAD") == (200, "")
+    with closing(http.client.HTTPConnection(server.where, timeout=DEADLINE)) as connection:
+        connection.request("HEAD", "/page")
+        headers = connection.getresponse().headers
+    assert (headers["Content-Length"], headers["X-Content-Type-Options"]) == ("7", "nosniff")
+
+
+@pytest.mark.parametrize(
+    ("host", "status", "elsewhere"),
+    [
+        ("127.0.0.1:9464", 200, 200),
+        ("192.0.2.1", 200, 200),  # of a forwarded port
+        ("[::1]:9464", 200, 200),
+        ("[fe80::1]", 200, 200),
+        ("localhost:1234", 200, 200),
+        ("LocalHost.", 200, 200),
+        (f"{socket.gethostname()}:9464", 200, 200),
+        (f"{socket.getfqdn()}:9464", 200, 200),
+        ("vehicle-1:9464", 403, 200),  # of a container
+        ("evil.example:9464", 403, 403),
+        ("localhost.evil.example", 403, 403),
+        ("127.0.0.1.evil.example", 403, 403),
+        ("evil.example:9464@127.0.0.1", 403, 403),
+        ("[evil.example]", 403, 403),
+    ],
+)
+def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
+    """A page of somebody else whose name leads here cannot read the status, and on loopback nothing at all.
+
+    Where other hosts may ask, a Prometheus and probes get metrics, health and readiness under any name.
+    """
+    local, public = others
+    for path in PATHS:
+        assert local.ask(path, Host=host)[0] == status, path
+        assert public.ask(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
+    refused = "/status is answered under an address or a name of this host only\n"
+    assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /page HTTP/1.0\r\nHost:"], ids=["silent", "half a request"])
+def test_silent_clients_block_nobody(server: Pages, sent: bytes) -> None:
+    """With 16 clients that send nothing, or half a request, the next one is answered, and the oldest has to go."""
+    address = "127.0.0.1", server.port
+    with ExitStack() as closing:
+        silent = [closing.enter_context(socket.create_connection(address, DEADLINE)) for _ in range(16)]
+        for client in silent:
+            client.sendall(sent)
+        for _ in range(20):
+            assert server.ask("/page") == (200, "a page\n")
+        assert silent[0].recv(1) == b""
+        silent[-1].sendall(b"\r\n\r\n" if sent else b"GET /page HTTP/1.0\r\n\r\n")
+        assert b"200 OK" in silent[-1].recv(1000)
+
+
+@pytest.mark.parametrize(
+    ("sent", "answer"),
+    [
+        (b"\x16\x03\x01 a TLS handshake\r\n\r\n", b"Error code: 400"),
+        (b"GET\r\n\r\n", b"Error code: 400"),
+        (b"GET /page HTTP/9.9\r\n\r\n", b"Error code: 505"),
+        (b"GET /" + 70_000 * b"x" + b" HTTP/1.0\r\n\r\n", b"HTTP/1.0 414 "),
+        (b"GET /page HTTP/1.0\r\n" + 200 * b"a: b\r\n" + b"\r\n", b"HTTP/1.0 431 "),
+        (b"GET /page HTTP/1.0\r\na:" + 70_000 * b"x" + b"\r\n\r\n", b"HTTP/1.0 431 "),
+        (b"GET /\xff\x00<script> HTTP/1.0\r\n\r\n", b"HTTP/1.0 404 "),
+    ],
+)
+def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixture, sent: bytes, answer: bytes) -> None:
+    """Whatever is sent gets an answer, and no line in the log; the next client gets its page."""
+    with socket.create_connection(("127.0.0.1", server.port), DEADLINE) as client:
+        client.sendall(sent)
+        assert answer in client.recv(10_000)
+    assert server.ask("/page") == (200, "a page\n")
+    assert not caplog.records
+
+
+def test_clients_that_do_not_read_their_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 16 clients that read nothing of a large page, the next one is answered when their time is over."""
+    monkeypatch.setattr(http_server, "_PATIENCE", 0.1)
+    made = threading.Semaphore(0)
+    large = Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+
+    def make() -> Page:
+        made.release()
+        return large
+
+    server = HttpServer("127.0.0.1:0", {"/large": make, "/page": lambda: Page.text("a page")})
+    with closing(server), ExitStack() as clients:
+        for _ in range(16):
+            client = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
+            client.sendall(b"GET /large HTTP/1.0\r\n\r\n")
+            assert made.acquire(timeout=DEADLINE)
+        wait_for(lambda: Pages(server.port).ask("/page") == (200, "a page\n"), what="the time of one to be over")
+
+
+def test_more_clients_than_it_has_room_for(server: Pages) -> None:
+    """While 16 are being answered no further one is; they get their answers, and then there is room again."""
+
+    def wait() -> tuple[int, str]:
+        """Ask until there is room: a client that has its answer may still count for a moment."""
+        while (answer := server.ask("/waits")) == (0, ""):
+            pass
+        return answer
+
+    with ThreadPoolExecutor(16) as pool:
+        waiting = [pool.submit(wait) for _ in range(16)]
+        wait_for(lambda: server.ask("/page") == (0, ""), what="no room")
+        GO.set()
+        assert {answer.result(DEADLINE) for answer in waiting} == {(200, "True\n")}
+    wait_for(lambda: server.ask("/page") == (200, "a page\n"), what="room")

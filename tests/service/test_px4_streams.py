@@ -1,0 +1,100 @@
+"""Whose a message of rmw_zenoh is, and what was lost before it, at times that the test gives; keys and attachments."""
+
+from __future__ import annotations
+
+import pytest
+
+from nedbus.sources.options import Px4ZenohOptions
+from nedbus.sources.px4_streams import NotAcceptedError, StreamRegistry, track_sequence
+from nedbus.transport import Attachment, TopicKey
+from nedbus_msgs import ROS2_TYPE, DecodeError, dds_type, type_hash
+from tests.messages import VLP
+
+GID = bytes(range(16))
+
+
+@pytest.mark.parametrize(
+    "key", ["", "0", "0/a/b", "x/fmu/out/a/b/c", "0//a/b/c", "0/*/a/b", f"{10**12}/a/b/c", "-1/a/b/c", "0/a/b/"]
+)
+def test_other_keys_are_rejected(key: str) -> None:
+    """A key that rmw_zenoh would not write raises DecodeError."""
+    with pytest.raises(DecodeError):
+        TopicKey.parse(key)
+
+
+def test_key_and_attachment_round_trip() -> None:
+    """Parsing returns what was written."""
+    key = TopicKey(3, "px4_1/fmu/out/vehicle_local_position", dds_type(ROS2_TYPE), type_hash("V0"))
+    assert TopicKey.parse(str(key)) == key
+    for attachment in (Attachment(7, 123456789, GID), Attachment(0, 0, GID)):
+        assert len(bytes(attachment)) == 33
+        assert Attachment.parse(bytes(attachment)) == attachment
+
+
+def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16") -> str:
+    """Return the key of vehicle_local_position, as PX4 writes it."""
+    topic = f"{namespace and namespace + '/'}fmu/out/{VLP}"
+    return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
+
+
+@pytest.fixture
+def streams() -> StreamRegistry:
+    """Return a registry with default options, for a service whose vehicle is 1."""
+    return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
+
+
+def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
+    """The first key owns an address until it is silent for 3 s; then another key may have it."""
+    first, second = streams.register(key()), streams.register(key(layout="V0"))
+    assert (streams.find(key()), str(second.address)) == (first, f"1/{VLP}")
+    streams.claim(first, None, 100.0)
+    track_sequence(first, None, 100.0)
+    with pytest.raises(NotAcceptedError, match="already: name one of them with vehicles="):
+        streams.claim(second, None, 102.9)
+    streams.claim(second, None, 103.0)
+    track_sequence(second, None, 103.0)
+    with pytest.raises(NotAcceptedError, match="already"):
+        streams.claim(first, None, 104.0)
+
+
+def test_key_is_free_after_3_seconds(streams: StreamRegistry) -> None:
+    """The first publisher owns a key until it is silent for 3 s; the sequence of the next one starts anywhere."""
+    stream = streams.register(key())
+    streams.claim(stream, Attachment(7, 0, GID), 100.0)
+    track_sequence(stream, Attachment(7, 0, GID), 100.0)
+    other = Attachment(500, 0, GID[::-1])
+    with pytest.raises(NotAcceptedError, match="two publishers share this key"):
+        streams.claim(stream, other, 102.9)
+    streams.claim(stream, other, 103.0)
+    assert track_sequence(stream, other, 103.0) == (0, False)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "lost", "rebooted"), [(11, 0, False), (15, 4, False), (10 + 1_000_001, 0, False), (1, 0, True)]
+)
+def test_gap_in_the_sequence_is_loss(streams: StreamRegistry, sequence: int, lost: int, rebooted: bool) -> None:
+    """A gap is that many lost messages, unless it is absurdly large; a step back is a reboot."""
+    stream = streams.register(key())
+    for each, expected in ((10, (0, False)), (sequence, (lost, rebooted)), (sequence + 1, (0, False))):
+        assert track_sequence(stream, Attachment(each, 0, GID), 100.0) == expected
+
+
+def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry) -> None:
+    """One step back is a reboot; another one within 3 s is a second vehicle with the same gid."""
+    stream = streams.register(key())
+    for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
+        track_sequence(stream, Attachment(sequence, 0, GID), now)
+    with pytest.raises(NotAcceptedError, match="goes back and forth"):
+        track_sequence(stream, Attachment(2, 0, GID), 103.0)
+    assert track_sequence(stream, Attachment(1, 0, GID), 106.1) == (0, True)
+    with pytest.raises(NotAcceptedError, match="sequence number 1 is a duplicate"):
+        track_sequence(stream, Attachment(1, 0, GID), 106.2)
+
+
+def test_number_of_keys_is_limited(streams: StreamRegistry) -> None:
+    """A thousand keys are registered, and no more."""
+    for domain in range(1000):
+        streams.register(key(domain=domain))
+    with pytest.raises(NotAcceptedError, match="more than 1000 keys"):
+        streams.register(key(domain=1000))
+    assert streams.find(key(domain=1000)) is None

@@ -1,0 +1,139 @@
+"""Who may look at the page of `nedbus web`, and what the others are told; spoken by hand, without a browser."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import product
+
+import pytest
+import websockets
+from bokeh.client import pull_session
+from bokeh.models.widgets import Div
+from websockets.sync.client import ClientConnection, connect
+
+from nedbus.monitoring import Page
+from nedbus.web.server import WebServer
+from tests.ports import free_port
+from tests.processes import Start
+from tests.waits import DEADLINE, wait_for
+from tests.web import in_thread
+
+PATHS = ("/", "/metrics", "/healthz")
+
+
+@pytest.fixture
+def url() -> Iterator[str]:
+    """Serve a page of one word, and two texts."""
+
+    def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
+        texts = {path: lambda: Page.text("a text") for path in PATHS[1:]}
+        origins = ["ground.example:8420"]
+        server = WebServer(
+            "127.0.0.1", 0, lambda document: document.add_root(Div(text="a word")), pages=texts, origins=origins
+        )
+        tell(server.url)
+        server.run(stop, lambda: None, 1000)
+
+    with in_thread(serve) as url:
+        yield url
+
+
+def status_of(url: str, method: str = "GET", **headers: str) -> int:
+    request = urllib.request.Request(url, method=method, headers=headers)  # noqa: S310 - our own address
+    try:
+        with urllib.request.urlopen(request, timeout=DEADLINE) as answer:  # noqa: S310 - our own address
+            return int(answer.status)
+    except urllib.error.HTTPError as exc:
+        with exc:
+            return exc.code
+
+
+def open_socket(url: str, origin: str) -> ClientConnection:
+    """Connect to the page's socket as a page from there, with the token of a page that it made."""
+    with urllib.request.urlopen(url, timeout=DEADLINE) as page:  # noqa: S310 - our own address
+        token = re.search(r'"token":"([^"]+)"', page.read().decode())
+    assert token
+    protocols = [websockets.Subprotocol("bokeh"), websockets.Subprotocol(token[1])]
+    return connect(f"{url.replace('http', 'ws')}/ws", origin=websockets.Origin(origin), subprotocols=protocols)
+
+
+def answers(url: str, origin: str) -> bool:
+    """Tell whether the page's socket says anything to a page from there."""
+    try:
+        with open_socket(url, origin) as connection:
+            return bool(connection.recv(timeout=DEADLINE))
+    except (websockets.InvalidHandshake, websockets.ConnectionClosed):
+        return False
+
+
+def test_foreign_pages_get_nothing(url: str) -> None:
+    """A page of somebody else, also one whose name leads here, gets neither the page nor its socket nor metrics."""
+    host = url.removeprefix("http://")
+    for path in PATHS:
+        assert status_of(url + path) == 200
+        assert status_of(url + path, Host="ground.example:8420") == 200
+        assert status_of(url + path, Host="evil.example:8420") == 403
+        assert status_of(url + path, Host=host, Origin="http://evil.example") == 403
+    for origin in ("http://evil.example", f"http://evil.example@{host}", "null", f"http://{host}.evil.example"):
+        assert not answers(url, origin)
+    assert answers(url, url)
+    assert answers(url, "http://ground.example:8420")
+    assert status_of(url + "/metrics", Host="localhost" + host.removeprefix("127.0.0.1")) == 200
+
+
+def test_nothing_can_be_sent_and_bodies_are_not_kept(url: str) -> None:
+    """Only reading is answered; who announces 100 MB is refused before it has sent them, whatever name it came by."""
+    for path, method in product(PATHS, ("POST", "PUT", "DELETE")):
+        assert status_of(url + path, method=method) in {403, 405}
+    bodies = ("Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\n5f5e100\r\n")
+    for body, host, method in product(bodies, (url.removeprefix("http://"), "evil.example"), ("POST", "PUT", "GET")):
+        with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), DEADLINE) as client:
+            client.sendall(f"{method} / HTTP/1.1\r\nHost: {host}\r\n{body}".encode())
+            assert client.recv(1000).startswith(b"HTTP/1.1 400 ")
+
+
+def test_browser_says_little_at_a_time(url: str) -> None:
+    """What comes through the socket of a page has a limit of 1 MiB, which ends it."""
+    with open_socket(url, url) as connection:
+
+        def is_closed() -> bool:
+            try:
+                with suppress(TimeoutError):
+                    connection.recv(timeout=0.1)
+            except websockets.ConnectionClosed:
+                return True
+            return False
+
+        connection.send(" " * 2**20)
+        assert not is_closed()
+        connection.send(" " * (2**20 + 1))
+        wait_for(is_closed, what="the end of the page")
+
+
+def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
+    """One page more than the limit, which is 1 here, says so instead of taking the memory of all."""
+    monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
+    for said in ("a word", "1 pages are open, which is the limit: close one"):
+        session = pull_session(url=url)
+        assert [root.text for root in session.document.roots if isinstance(root, Div)] == [said]
+
+
+def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: str) -> None:
+    """With --listen 0.0.0.0 the command says who can look, --origin adds a name, and Ctrl-C ends it."""
+    port = free_port()
+    url, listen = f"http://127.0.0.1:{port}", f"--listen=0.0.0.0:{port}"
+    process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", measured=False)
+    wait_for(lambda: "without a password" in process.err, what="the warning")
+    assert status_of(f"{url}/healthz", Host="evil.example") == 200
+    assert status_of(url, Host="ground.example:8420") == 200
+    assert status_of(url, Host="evil.example:8420") == 403
+    process.signal(signal.SIGINT)
+    assert process.wait() in {0, 130}
+    assert "Traceback" not in process.err

@@ -1,0 +1,107 @@
+"""Publishers that thin by a clock of the test, and a link that counts what it carries."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from contextlib import suppress
+from functools import partial
+
+import pytest
+
+import nedbus
+from nedbus.client import thinned_streams
+from tests.messages import message
+from tests.waits import wait_for
+
+from .publishing import take
+
+MS = 1_000_000  # ns
+
+
+class Link:
+    """A TCP link to a router; `carried` counts its bytes."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.carried = 0
+        self.broken = False
+        self._to = endpoint.removeprefix("tcp/").split(":")
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self._sockets: list[socket.socket] = []
+        self.endpoint = f"tcp/127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Break all connections, and accept no others until `broken` is false again."""
+        self.broken = True
+        for each in self._sockets:
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._sockets.append(self._listener)
+        self.cut()
+        for each in self._sockets:
+            each.close()
+
+    def _accept(self) -> None:
+        with suppress(OSError):  # closed
+            while True:
+                near, _ = self._listener.accept()
+                if self.broken:
+                    near.close()
+                    continue
+                far = socket.create_connection((self._to[0], int(self._to[1])))
+                self._sockets += [near, far]
+                for source, target in ((near, far), (far, near)):
+                    threading.Thread(target=self._carry, args=(source, target), daemon=True).start()
+
+    def _carry(self, source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):  # closed
+            while data := source.recv(4096):
+                self.carried += len(data)
+                target.sendall(data)
+
+
+class Clock:
+    """What publishers take for the time."""
+
+    def __init__(self) -> None:
+        self.now = 10**18
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Let publishers of this process thin by a clock of the test's."""
+    clock = Clock()
+    monkeypatch.setattr(thinned_streams, "time", clock)
+    return clock
+
+
+def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -> None:
+    """Publish messages with the timestamps `first`, `first + 1`, ..., 10 ms apart."""
+    for timestamp in range(first, first + count):
+        clock.now += 10 * MS
+        publisher.publish(message(timestamp))
+
+
+def is_wanted(publisher: nedbus.Publisher) -> bool:
+    """Return whether a publisher knows that somebody reads its vehicle thinned."""
+    return publisher._thinned.vehicle.is_wanted()  # what it does about that shows only once it publishes
+
+
+def wait_for_demand(publisher: nedbus.Publisher) -> None:
+    """Wait until a publisher knows that somebody reads it thinned."""
+    wait_for(partial(is_wanted, publisher), what="the demand for a thinned stream")
+
+
+def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription) -> None:
+    """Wait until a subscription has begun: with message 0, which was published before it, and a demand.
+
+    The last message is queried, and one that is published meanwhile may be overtaken by the answer.
+    """
+    assert take(subscription, 1) == [0]
+    wait_for_demand(publisher)

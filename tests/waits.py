@@ -1,0 +1,49 @@
+"""Waiting for conditions, with a deadline and words for when it passes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import cast
+
+import zenoh
+
+from nedbus.transport import Session
+
+DEADLINE = 30.0
+"""Seconds that a test waits for a condition before it fails."""
+
+
+def wait_for(condition: Callable[[], object], *, what: str, seconds: float = DEADLINE) -> None:
+    """Wait until a condition holds, and fail with words when it never does."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"waited {seconds} s in vain for {what}"
+        time.sleep(0.01)
+
+
+def wait_for_reader(raw: Session, key: str) -> None:
+    """Wait until a session knows of a subscriber of this key: what it publishes before goes nowhere."""
+    probe = raw.declare_publisher(key)
+    wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
+    probe.undeclare()
+
+
+@contextmanager
+def repeating(action: Callable[[], object]) -> Iterator[None]:
+    """Do something fifty times a second, as a vehicle does."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(0.02):
+            action()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(DEADLINE)

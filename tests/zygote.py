@@ -1,0 +1,114 @@
+"""Python processes within milliseconds: one that has imported nedbus forks for each that is asked for.
+
+What is forked is a process like any other, with an exit code, signals and streams of its own; what it saves is half a
+second of imports. No session is open here, so that Zenoh works in each. `tests/processes.py` is the asking side.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import gc
+import importlib
+import json
+import os
+import runpy
+import select
+import signal
+import socket
+import sys
+import types
+from contextlib import suppress
+from typing import Any, Final
+
+_PRELOADED: Final = ("nedbus.cli.app", "numpy", "rich.console", "rich.live", "prometheus_client", "http.server")
+_SHOW: Final = signal.SIGRTMIN
+"""Makes a process write the stacks of all its threads to the terminal of pytest."""
+_TERMINAL: Final = 100
+"""The descriptor of that terminal, above those that are closed."""
+
+
+def _watch(child: int, status: int) -> None:
+    """Say which process it is, and how it ended; show and end it when pytest is gone, as after a test's time limit."""
+    os.write(status, f"{child:10}".encode())
+    ended = os.pidfd_open(child)
+    poller = select.poll()
+    poller.register(ended, select.POLLIN)
+    poller.register(status, 0)  # told of its end in any case
+    if not any(descriptor == ended for descriptor, _ in poller.poll()):
+        os.kill(child, _SHOW)
+        poller.unregister(status)
+        poller.poll(1000)  # the stacks take a moment; what waited for pytest ends by itself
+        os.kill(child, signal.SIGKILL)
+    _, code = os.waitpid(child, 0)
+    with suppress(BrokenPipeError):
+        os.write(status, f"{os.waitstatus_to_exitcode(code):10}".encode())
+
+
+def _become(request: dict[str, Any], streams: list[int]) -> None:
+    """Take the place of a new process: its streams, directory, environment and arguments."""
+    os.dup2(2, _TERMINAL, inheritable=False)
+    faulthandler.register(_SHOW, file=_TERMINAL)
+    for number, descriptor in enumerate(streams):
+        os.dup2(descriptor, number)
+    os.closerange(3, _TERMINAL)
+    os.chdir(request["cwd"])
+    os.environ.clear()
+    os.environ.update(request["environment"])
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115 - until the end
+    lines = os.isatty(1) or "PYTHONUNBUFFERED" in os.environ
+    sys.stdout = open(1, "w", buffering=1 if lines else -1, closefd=False)  # noqa: SIM115 - until the end
+    sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115 - until the end
+    faulthandler.enable(sys.stderr)
+    if "COVERAGE_PROCESS_CONFIG" in os.environ:
+        import coverage  # noqa: PLC0415 - only where it is measured
+
+        coverage.process_startup()
+
+
+def _serve(asked: socket.socket) -> dict[str, Any] | None:
+    """Fork for each request; return it in the child, and None in the end where all were asked for."""
+    while True:
+        message, descriptors, *_ = socket.recv_fds(asked, 2**20, 4)
+        if not message:
+            return None
+        *streams, status = descriptors
+        if os.fork() == 0:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            asked.close()
+            child = os.fork()
+            if child:
+                _watch(child, status)
+                os._exit(0)
+            request: dict[str, Any] = json.loads(message)
+            _become(request, streams)
+            return request
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _run(request: dict[str, Any]) -> None:
+    kind, *arguments = request["arguments"]
+    if kind == "-m":
+        sys.argv = arguments
+        runpy.run_module(arguments[0], run_name="__main__", alter_sys=True)
+    elif kind == "-c":
+        sys.argv = ["-c", *arguments[1:]]
+        sys.modules["__main__"] = script = types.ModuleType("__main__")
+        exec(compile(arguments[0], "<string>", "exec"), script.__dict__)  # noqa: S102 - a script of a test
+    else:
+        sys.argv = [kind, *arguments]
+        sys.path[0] = os.path.dirname(kind)  # noqa: PTH120 - as Python itself does
+        runpy.run_path(kind, run_name="__main__")
+
+
+if __name__ == "__main__":
+    for _name in _PRELOADED:
+        importlib.import_module(_name)
+    gc.collect()
+    gc.freeze()  # else each process would copy all of these pages, to look for garbage as it ends
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # what ends here is waited for by nobody
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for pytest, which ends this by closing the socket
+    _asked = _serve(socket.socket(fileno=int(sys.argv[1])))
+    if _asked is not None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        _run(_asked)
