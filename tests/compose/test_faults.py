@@ -149,7 +149,7 @@ import json, resource, sys, time
 import nedbus
 bus = nedbus.connect("tcp/router:7447", timeout=60)
 publisher = bus.publisher("vehicle_local_position", vehicle="fast")
-end, count, slow = time.monotonic() + float(sys.argv[1]), 0, []
+end, count, blocked = time.monotonic() + float(sys.argv[1]), 0, 0.0
 while time.monotonic() < end:
     count += 1
     fields = {"timestamp": count}
@@ -158,9 +158,9 @@ while time.monotonic() < end:
     took = time.monotonic() - start
     # A machine that is busy with something else takes the processor away; that is no waiting of ours.
     if took > 0.05 and resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw > waited:
-        slow.append(took)
+        blocked += took
     time.sleep(0.002)
-print(json.dumps({"count": count, "slow": slow}), flush=True)
+print(json.dumps({"count": count, "blocked": blocked}), flush=True)
 time.sleep(3)
 bus.close()
 """
@@ -179,7 +179,7 @@ def test_stuck_reader_disturbs_nobody(make_stack: StartStack, record: Record) ->
         assert publisher.wait(120.0) == 0, publisher.err
         told = json.loads(publisher.out)
         assert told["count"] > 10_000
-        assert told["slow"] == []
+        assert told["blocked"] < 1.0, "of 60 s: a reader that holds it back does so for most of them"
         wait_for(lambda: len(healthy.samples) == told["count"], what="the last message")
         assert [sample.message.timestamp for sample in healthy.samples] == list(range(1, told["count"] + 1))
         assert healthy.subscription.counts == nedbus.Counts(received=told["count"])
