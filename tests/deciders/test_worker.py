@@ -295,7 +295,7 @@ def test_taken_address_leaves_the_others_free() -> None:
 
 def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixture) -> None:
     """It is counted, reported with its reason and its fields, and the first five are logged; the others go on."""
-    broken = [at(0.0, z_valid=True), *(at(0.0, eph=-1.0 - number) for number in range(7))]
+    broken = [at(0.0, z_valid=True), *(at(number, timestamp_sample=10**9) for number in range(7))]
     ran = run(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None))
     assert list(ran.status.rejections.values()) == [1, 7], "by field and rule, and not by value"
     assert (ran.status.published, ran.status.rejected) == (1, 8)

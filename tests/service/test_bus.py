@@ -118,6 +118,20 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
     assert asked == ["nedbus/*/@alive/**"]
 
 
+def test_more_vehicles_come_than_are_kept_until_somebody_asks(
+    endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Then all are asked for once more: none is missing, and none that has gone is still there."""
+    monkeypatch.setattr("nedbus.transport.queries._CHANGES", 4)
+    gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/{VLP}")
+    wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
+    gone.undeclare()
+    tokens = [raw.liveliness().declare_token(f"nedbus/{number}/@alive/{VLP}") for number in range(12)]
+    with nedbus.connect(endpoint) as other:
+        wait_for(partial(has_vehicles, other, len(tokens)), what="all to be there")
+    wait_for(partial(has_vehicles, bus, len(tokens)), what="all of them")
+
+
 def test_incomplete_list_of_vehicles_is_said(
     bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
