@@ -13,7 +13,7 @@ from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_e
 
 _log = logging.getLogger(__name__)
 
-_ASK_AGAIN: Final = 30.0  # s after an incomplete answer
+_ASK_AGAIN: Final = 10.0  # s after an incomplete answer
 
 
 class VehicleDirectory:
