@@ -115,7 +115,7 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
         wait_for(lambda: len(client.vehicles()["7"]) == 2, what="another address")
         assert client.vehicles()["7"] == [Address("7", "estimator_local_position", 2), Address("7", VLP)]
     wait_for(lambda: not client.vehicles(), what="the vehicles to go")
-    assert asked == ["nedbus/*/@alive/**"]
+    assert asked in (["nedbus/*/@alive/**"], 2 * ["nedbus/*/@alive/**"]), "and once more, 2 s later"
 
 
 def test_more_vehicles_come_than_are_kept_until_somebody_asks(

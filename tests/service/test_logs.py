@@ -162,7 +162,7 @@ def test_service_logs_json(start: Start) -> None:
     lines = [json.loads(line) for line in service.err.splitlines()]
     events = [line["event"] for line in lines]
     assert set(events) <= EVENTS.keys() - {"notice"}
-    assert (events[:3], events[-1]) == (["router", "opened", "opened"], "ending")
+    assert (events[0], events.count("opened"), events[-1]) == ("router", 2, "ending")
     assert {line["source"] for line in lines if line["event"] == "opened"} == {REPLAY, "sim:?vehicle=2"}
 
 

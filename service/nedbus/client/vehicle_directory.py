@@ -14,6 +14,7 @@ from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_e
 _log = logging.getLogger(__name__)
 
 _ASK_AGAIN: Final = 10.0  # s after an incomplete answer
+_CONFIRM: Final = 2.0  # s after the first complete one: Zenoh's can be empty on a busy host, and look complete
 
 
 class VehicleDirectory:
@@ -30,6 +31,7 @@ class VehicleDirectory:
         self._asking = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by the key of the token
         self._next_ask = float("-inf")
+        self._confirmed = False
         self._changes: AliveChanges | None = None
 
     def vehicles(self, *, timeout: float) -> dict[str, list[Address]]:
@@ -52,7 +54,8 @@ class VehicleDirectory:
         keys, complete = ask_alive_keys(self._session, key_expr, timeout=timeout)
         for key in keys:
             self._change(key, alive=True)
-        self._next_ask = float("inf") if complete else time.monotonic() + _ASK_AGAIN
+        pause = _ASK_AGAIN if not complete else float("inf") if self._confirmed else _CONFIRM
+        self._next_ask, self._confirmed = time.monotonic() + pause, complete
         if not complete:
             _log.warning(
                 "%s: not all liveliness tokens are known, after %d: some vehicles are missing",
@@ -66,7 +69,7 @@ class VehicleDirectory:
             self._change(key, alive=alive)
         if changes.missed:
             self._addresses.clear()
-            self._next_ask = float("-inf")
+            self._next_ask, self._confirmed = float("-inf"), False
 
     def _change(self, key: str, *, alive: bool) -> None:
         if not alive:
