@@ -1,0 +1,301 @@
+"""A subscription's account of messages: publishers, a bad link and a slow reader as a model, and what must hold.
+
+`Account` is what is tested; another receive path is put under the same test by an adapter of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, Protocol
+from unittest import mock
+
+from nedbus import Counts, Mode
+from nedbus.client import receive_queue, sequence_tracker
+from nedbus.client.decoder import Decoder
+from nedbus.client.layout_lookup import LayoutLookup
+from nedbus.client.publisher_sequence import Hole
+from nedbus.client.receive_queue import ReceiveQueue
+from nedbus.client.search import Search
+from nedbus.transport import RawSample
+from nedbus_msgs import decode
+
+from .raw_samples import INVALID, name_of, raw
+
+UNLIMITED: Final = 100_000
+"""More messages than any life of a publisher sends."""
+
+LATE: Final = "late messages and duplicates are read, in mode latest"
+PARTIAL: Final = "a retransmission with its last message is taken for complete"
+SHORTCUT: Final = "the number that is expected of one publisher of a key is taken for it when another sends it"
+FORGOTTEN: Final = "a heartbeat during a request is forgotten: not counted if its publisher ends"
+
+
+class Setting(NamedTuple):
+    """`keeps`: the cache of each publisher, in messages. `capacity` of the reader's queue. `begins`: see Recovery.
+
+    `settled`: messages of one publisher in a row after which shortcuts may be taken.
+    """
+
+    mode: Mode = "every"
+    keeps: tuple[int, ...] = (UNLIMITED,)
+    capacity: int = UNLIMITED
+    begins: bool = True
+    settled: int = 5
+
+
+class Request(NamedTuple):
+    """An open retransmission request."""
+
+    handle: object
+    publisher: str
+    numbers: range
+
+
+class Account(Protocol):
+    """The receive path of one subscription, without I/O. Mode `latest` has no heartbeats and no requests.
+
+    `link`: it broke, or did so long ago that a new publisher has sent nothing before. `answer`: with `final` a request
+    is given up that these do not complete. `read`: the timestamps of one message or many, and the losses told.
+    """
+
+    known_faults: frozenset[str]
+
+    def __init__(self, setting: Setting) -> None: ...
+    def put(self, batch: Sequence[RawSample], *, overflowed: bool) -> None: ...
+    def heartbeat(self, key: str, publisher: str, number: int) -> None: ...
+    def link(self, *, broken: bool) -> None: ...
+    def requests(self) -> list[Request]: ...
+    def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None: ...
+    def read(self, *, batch: bool) -> tuple[list[int], int] | None: ...
+    @property
+    def counts(self) -> Counts: ...
+    @property
+    def held(self) -> int: ...
+
+
+class QueueAccount(ReceiveQueue):
+    """The account as ReceiveQueue keeps it."""
+
+    known_faults = frozenset({LATE, PARTIAL, SHORTCUT, FORGOTTEN})
+
+    def __init__(self, setting: Setting) -> None:
+        super().__init__(setting.mode, Decoder(LayoutLookup(dict), prefix="nedbus"))
+        self._begins, self._searches = setting.begins, dict[Hole, Search]()
+        if setting.mode == "every":
+            self.recover(lambda hole: self._searches.update({hole: Search(hole, 0.0)}))
+        self._capacity = mock.patch.object(receive_queue, "CAPACITY", setting.capacity)
+        self._settled = mock.patch.object(sequence_tracker, "SETTLED", setting.settled)
+
+    def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
+        with self._capacity, self._settled:
+            super().put(batch, overflowed=overflowed)
+
+    def heartbeat(self, key: str, publisher: str, number: int) -> None:
+        self.beat(key, publisher, number, begins=self._begins)
+
+    def link(self, *, broken: bool) -> None:
+        self.unsettled_until = float("inf") if broken else 0.0
+
+    def requests(self) -> list[Request]:
+        return [Request(hole, hole.publisher, search.numbers) for hole, search in self._searches.items()]
+
+    def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
+        assert isinstance(request.handle, Hole)
+        search = self._searches[request.handle]
+        search.found |= {sample.source_info.source_sn: sample for sample in samples if sample.source_info}
+        if final or search.complete:
+            del self._searches[search.hole]
+            with self._capacity, self._settled:
+                self.fill(search.hole, list(search.found.values()))
+
+    def read(self, *, batch: bool) -> tuple[list[int], int] | None:
+        if batch:
+            found = self.pop_batch()
+            return None if found is None else (found.messages["timestamp"].tolist(), found.lost)
+        sample = self.pop(decode)
+        return None if sample is None else ([sample.message.timestamp], sample.lost)
+
+
+@dataclass(eq=False)
+class Life:
+    """One life of a publisher: its messages are numbered from 0.
+
+    `known`: the newest number that the reader knows of. `exact`: it was heard from its first message on. `whole`: it
+    was, or was asked for all that it had sent before. `given_up`: it could, or was let, answer no more.
+    """
+
+    index: int
+    slot: int
+    keeps: int
+    sent: int = 0
+    known: int = -1
+    exact: bool = False
+    whole: bool = False
+    given_up: bool = False
+    invalid: set[int] = field(default_factory=set)
+    arrived: set[int] = field(default_factory=set)
+    read: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.key, self.name = f"nedbus/{self.slot + 1}/vehicle_local_position", str(self.index)
+
+    def sample(self, number: int) -> RawSample:
+        payload = INVALID if number in self.invalid else None
+        stamp = self.index * UNLIMITED + number + 1
+        return raw(number, timestamp=stamp, key=self.key, publisher=self.name, payload=payload)
+
+
+class World:
+    """Publishers, the link to one reader, and what it got. Each public method is a step; positions are taken modulo.
+
+    Steps do not cause `spared` faults.
+    """
+
+    def __init__(self, setting: Setting, account: Account, *, spared: Collection[str] = ()) -> None:
+        self.setting, self.account, self._spared = setting, account, spared
+        self.flight: list[tuple[Life, int]] = []
+        self.open: list[Request] = []
+        self.intact = True
+        self._latest = setting.mode == "latest"
+        self._unsettled = self._overflowed = self._slow = False
+        self._told = 0
+        self._lives = [Life(slot, slot, keeps) for slot, keeps in enumerate(setting.keeps)]
+        self._running = list(self._lives)
+
+    def step(self, name: str, *arguments: int) -> None:
+        """Take a step, and check what must hold at any time."""
+        self.intact = False
+        getattr(self, name)(*arguments)
+        counts, self.open = self.account.counts, self.account.requests()
+        assert counts.received == sum(len(life.read) for life in self._lives)
+        assert self._told <= counts.lost
+        assert not counts.dropped or self._slow or self._overflowed or self._latest
+        assert self._accounted() <= sum(life.known + 1 for life in self._lives)
+        self.intact = True
+
+    def publish(self, slot: int, count: int, invalid: int = 0) -> None:
+        life = self._running[slot % len(self._running)]
+        self.flight += [(life, life.sent + number) for number in range(count)]
+        life.sent += count
+        life.invalid.update([life.sent - 1] * invalid)
+
+    def restart(self, slot: int) -> None:
+        if SHORTCUT not in self._spared or self.setting.settled == UNLIMITED:
+            life = self._running[slot % len(self._running)]
+            life.keeps, life.given_up = 0, True
+            self._running[life.slot] = Life(len(self._lives), life.slot, self.setting.keeps[life.slot])
+            self._lives.append(self._running[life.slot])
+
+    def deliver(self, count: int, dropped: int = 0) -> None:
+        """Put what comes next; `dropped`: out of a channel that was full, and dropped up to this many of the oldest."""
+        taken = self._take(0, count)
+        del taken[: min(dropped, len(taken) - 1)]
+        for life, number in taken:
+            if life.known < 0:
+                life.exact = number == 0
+                life.whole = life.exact or (self._unsettled and not dropped)
+            life.known = max(life.known, number)
+        self._overflowed |= dropped > 0
+        self._note_arrived(taken)
+        self.account.put([life.sample(number) for life, number in taken], overflowed=dropped > 0)
+
+    def drop(self, position: int, count: int) -> None:
+        self._take(position, count)
+
+    def delay(self, position: int, count: int, twice: int = 0) -> None:
+        if not (self._latest and LATE in self._spared):
+            taken = self._take(position, count)
+            self.flight[:0] = taken * twice
+            self.flight += taken
+
+    def link(self, broken: int) -> None:
+        """Break the link, or let the time pass in which a new publisher may have sent something before."""
+        self._unsettled = bool(broken)
+        self._take(0, broken * len(self.flight))
+        self.account.link(broken=self._unsettled)
+
+    def heartbeat(self, slot: int) -> None:
+        life = self._running[slot % len(self._running)]
+        if life.sent and not self._latest:
+            if life.known >= 0 or self._unsettled or self.setting.begins:
+                life.whole |= life.known < 0 and self._unsettled
+                life.known = life.sent - 1
+            self.account.heartbeat(life.key, name_of(life.name), life.sent - 1)
+
+    def answer(self, position: int, missing: int = 0, final: int = 0) -> None:
+        """Answer a request with what is kept; of that, those do not arrive whose bits are set in `missing`."""
+        requests = self.account.requests()
+        request = requests[position % len(requests)]
+        life, numbers = self._lives[int(request.publisher.partition(":")[0])], request.numbers
+        assert 0 <= numbers.start < numbers.stop <= life.sent
+        if PARTIAL in self._spared:
+            missing = -(missing & -missing)  # and all behind it
+        kept = [number for number in numbers if life.sent - life.keeps <= number]
+        found = [number for place, number in enumerate(kept) if not missing >> place & 1]
+        life.given_up |= bool(final) and found != kept
+        self._note_arrived((life, number) for number in found)
+        self.account.answer(request, [life.sample(number) for number in reversed(found)], final=bool(final))
+
+    def read(self, count: int, batch: int = 0) -> None:
+        while count > 0 and (found := self.account.read(batch=bool(batch))) is not None:
+            count -= 1
+            self._told += found[1]
+            for timestamp in found[0]:
+                index, number = divmod(timestamp - 1, UNLIMITED)
+                life = self._lives[index]
+                previous = life.read[-1] if life.read else -1
+                assert previous < number, "in order, and nothing twice"
+                if life.exact and index == life.slot and not (batch or life.invalid or self._slow or self._overflowed):
+                    assert self._latest or found[1] == number - previous - 1, "told by the message behind"
+                life.read.append(number)
+
+    def settle(self) -> None:
+        """Let all arrive, be answered and read; then publish once more, for losses that the next message tells."""
+        self._settle()
+        for life in self._running:
+            self.publish(life.slot, 1)
+        self._settle()
+        assert self._told == self.account.counts.lost, "each loss is told once"
+
+    def _settle(self) -> None:
+        for _ in range(20):
+            self.deliver(len(self.flight))
+            for life in self._running:
+                self.heartbeat(life.slot)
+            for request in self.account.requests():
+                self.answer(0)
+                if request in self.account.requests():
+                    self.answer(0, final=1)
+            self.read(UNLIMITED)
+        assert (self.account.held, self.account.requests()) == (0, []), "nothing is held for ever"
+        total, most = self._accounted(), sum(life.known + 1 for life in self._lives)
+        least = most - sum(map(self._unknown, self._lives))
+        assert least <= total <= most, f"received + lost + dropped + invalid of {least} to {most}: {total}"
+        for life in self._lives:
+            if self._latest and life.arrived and life in self._running:
+                assert max(life.arrived) in {*life.read, *life.invalid}, "the newest is read"
+            complete = life.whole and life.keeps == UNLIMITED and not life.given_up
+            if complete and not (self._latest or self._slow or self._overflowed):
+                assert life.read == [number for number in range(life.known + 1) if number not in life.invalid]
+
+    def _accounted(self) -> int:
+        counts = self.account.counts
+        return counts.received + counts.lost + counts.dropped + counts.invalid
+
+    def _unknown(self, life: Life) -> int:
+        """Return how many messages may have been sent before the reader heard of this life, or be forgotten."""
+        known = life.known if life in self._running or FORGOTTEN not in self._spared else max(life.arrived, default=-1)
+        return life.known - known + (0 if life.exact else min(life.read, default=known + 1))
+
+    def _take(self, position: int, count: int) -> list[tuple[Life, int]]:
+        start = position % max(1, len(self.flight))
+        taken = self.flight[start : start + count]
+        del self.flight[start : start + count]
+        return taken
+
+    def _note_arrived(self, arrived: Iterable[tuple[Life, int]]) -> None:
+        for life, number in arrived:
+            life.arrived.add(number)
+        waiting = (number > max(life.read, default=-1) for life in self._lives for number in life.arrived)
+        self._slow |= sum(waiting) > self.setting.capacity
