@@ -1,0 +1,77 @@
+"""What a session does beside publishing and reading: heartbeats, retransmission requests, acknowledgements."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from nedbus.log_event import about
+
+_log = logging.getLogger(__name__)
+
+_SHORTEST: Final = 0.002  # s between two turns
+_FAILED: Final = 1.0  # s until a job that failed is called again
+_JOIN: Final = 3.0  # s that a turn has to end
+
+Job = Callable[[float], float]
+"""Do what is due at this time, in monotonic seconds; return how many seconds later to be called again, at the latest.
+
+It is called earlier where others are, and must never wait.
+"""
+
+
+class Housekeeping:
+    """Call all jobs of a session in one thread, when the first of them is due; it starts with the first job."""
+
+    def __init__(self) -> None:
+        self._jobs: list[Job] = []
+        self._turn = threading.RLock()  # held while jobs are called
+        self._woken = threading.Event()
+        self._closed = False
+        self._thread: threading.Thread | None = None
+
+    def add(self, job: Job) -> Callable[[], None]:
+        """Call a job from now on; return a function that ends that, and waits until it has ended."""
+        with self._turn:
+            self._jobs = [*self._jobs, job]
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._run, name="nedbus-housekeeping", daemon=True)
+                self._thread.start()
+        self._woken.set()
+        return lambda: self._remove(job)
+
+    def wake(self) -> None:
+        """Call all jobs now."""
+        self._woken.set()
+
+    def close(self) -> None:
+        """Call no job any more; one that is inside Zenoh when the interpreter ends would abort the process."""
+        self._closed = True
+        self._woken.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(_JOIN)
+
+    def _remove(self, job: Job) -> None:
+        with self._turn:
+            self._jobs = [each for each in self._jobs if each is not job]
+
+    def _run(self) -> None:
+        failed: set[int] = set()
+        while not self._closed:
+            self._woken.clear()
+            with self._turn:
+                pauses = [self._call(job, failed) for job in self._jobs]
+            self._woken.wait(max(_SHORTEST, min(pauses, default=_FAILED)))
+
+    @staticmethod
+    def _call(job: Job, failed: set[int]) -> float:
+        try:
+            return job(time.monotonic())
+        except BaseException:  # noqa: BLE001 - Zenoh's panics are such; the others must not end with it
+            if id(job) not in failed:
+                failed.add(id(job))
+                _log.exception("an unexpected error, which is logged once", extra=about("bug"))
+            return _FAILED
