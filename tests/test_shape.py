@@ -27,7 +27,7 @@ FLOORS = [
 # Packages that only these files import, by folder; nothing else says who may use Zenoh.
 ONLY_BY_FOLDER = {
     "zenoh": {
-        "nedbus/transport": "session router queries refusals write_probe",
+        "nedbus/transport": "session router queries zenoh_ext refusals write_probe",
         "nedbus/client": "channels zenoh_subscriber follower decoder sample publisher publisher_registry "
         "acknowledgement recovery rejections query_server qos demand thinned_streams thinned_subscriber",
         "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",

@@ -11,13 +11,9 @@ from .queries import (
     MAX_ANSWERS,
     AliveChanges,
     Answers,
-    Heartbeats,
-    KeptAnswers,
     alive_keys,
     ask,
     ask_alive_keys,
-    ask_kept,
-    follow_heartbeats,
     query,
 )
 from .refusals import log_refusals
@@ -52,6 +48,14 @@ from .session import (
 from .tls import Tls, check_pem
 from .uplink import UPLINK_POLL, Uplinks
 from .write_probe import Verdict, probe_writes
+from .zenoh_ext import (
+    Heartbeats,
+    KeptAnswers,
+    ask_kept,
+    follow_heartbeats,
+    heartbeat_key,
+    heartbeat_payload,
+)
 
 if TYPE_CHECKING:
     from .pki import CA_DAYS, DAYS, make_authority, make_certificate
@@ -110,6 +114,8 @@ __all__ = [
     "entity_name",
     "follow_heartbeats",
     "gid_of_token",
+    "heartbeat_key",
+    "heartbeat_payload",
     "is_forked",
     "list_certificates",
     "log_refusals",

@@ -8,24 +8,18 @@ the session, and whatever else needs that lock stops the process.
 from __future__ import annotations
 
 import logging
-import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
-from functools import lru_cache
-from itertools import islice
 from typing import Final
 
 import zenoh
 
 from nedbus.log_event import about
 
-from .session import RawSample, Session, entity_name, while_open
+from .session import RawSample, Session, while_open
 
 _log = logging.getLogger(__name__)
-
-Heartbeats = dict[tuple[str, str], int]
-"""The number of the newest message, by the key of a stream and the name of its publisher."""
 
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
@@ -34,11 +28,6 @@ _MAX_BYTES: Final = 2**26  # of the payloads that are kept of one query
 _CHANNEL: Final = 1024  # answers that wait; while there are more, the session waits for whoever asked
 _TOKENS: Final = 131_072  # tokens that wait; Zenoh must never wait for room while it holds the lock of its session
 _CHANGES: Final = 4096  # of tokens, that wait until somebody takes them
-_HEARTBEATS: Final = 16_384  # that are kept until somebody takes them
-_HEARTBEAT: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-_LONGEST: Final = 1024  # characters of the key of a heartbeat, which is remembered
-_NUMBER: Final = 4  # bytes of a heartbeat
-_SPARE: Final = 64  # answers that nobody asked for, of others or of more publishers
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
 _PAUSES: Final = (0.0005, 0.01)  # s between two looks for answers: the first, and the longest
 
@@ -63,7 +52,7 @@ class Answers:
 
     def wait(self, timeout: float) -> Iterator[zenoh.Reply]:
         """Yield the answers as they come, until the query has ended, or its timeout has passed."""
-        end = time.monotonic() + _zenoh_timeout(timeout) + _GRACE
+        end = time.monotonic() + zenoh_timeout(timeout) + _GRACE
         pause, longest = _PAUSES
         while not self.ended and time.monotonic() < end:
             taken = self.take()
@@ -88,7 +77,7 @@ def ask(
             zenoh.handlers.FifoChannel(_CHANNEL),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=_zenoh_timeout(timeout),
+            timeout=zenoh_timeout(timeout),
             priority=priority,
             congestion_control=congestion_control,
         )
@@ -127,80 +116,6 @@ def _size(sample: RawSample) -> int:
     return len(sample.payload) + len(str(sample.key_expr))
 
 
-class KeptAnswers:
-    """What a publisher answers of its messages `numbers`, for the thread of whoever asked."""
-
-    def __init__(self, answers: Answers, key: str, publisher: str, numbers: range) -> None:
-        self._answers = answers
-        self._key = key
-        self._publisher = publisher
-        self._numbers = numbers
-
-    @property
-    def ended(self) -> bool:
-        """Whether the last answer was taken, or the timeout has passed."""
-        return self._answers.ended
-
-    def take(self) -> dict[int, RawSample]:
-        """Return what came since the last call, by its number."""
-        taken: dict[int, RawSample] = {}
-        for reply in self._answers.take():
-            self._add(taken, reply.ok)
-        return taken
-
-    def _add(self, taken: dict[int, RawSample], sample: RawSample | None) -> None:
-        info = None if sample is None else sample.source_info
-        if sample is None or info is None or info.source_sn not in self._numbers:
-            return
-        if str(sample.key_expr) == self._key and entity_name(info.source_id) == self._publisher:  # else another's
-            taken[info.source_sn] = sample
-
-
-def ask_kept(session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> KeptAnswers:
-    """Ask an advanced publisher for messages that it still keeps, by their numbers, and return at once.
-
-    `publisher` is its name as `entity_name` returns it. The key is that of its cache, without wildcards: a router finds
-    it at once, while a key expression is compared with the queryables of all publishers.
-    """
-    with while_open():
-        handler = session.get(
-            f"{key}/@adv/pub/{publisher.replace(':', '/')}/_?_sn={numbers.start}..{numbers.stop - 1}",
-            # With room for all: a channel that is full holds up all that its session receives.
-            zenoh.handlers.FifoChannel(min(len(numbers), MAX_ANSWERS) + _SPARE),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            timeout=_zenoh_timeout(timeout),
-        )
-    return KeptAnswers(Answers(handler), key, publisher, numbers)
-
-
-def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
-    """Follow the heartbeats of advanced publishers; return a function that takes what came, and one that ends it."""
-    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_HEARTBEATS)
-    with while_open():
-        subscriber = session.declare_subscriber(f"{key_expr}/@adv/pub/**", channel)
-
-    def take() -> Heartbeats:
-        newest: Heartbeats = {}
-        with suppress(zenoh.ZError):  # ended meanwhile
-            for beat in islice(iter(subscriber.handler.try_recv, None), _HEARTBEATS):
-                key, payload = str(beat.key_expr), beat.payload.to_bytes()
-                publisher = _publisher_of(key) if len(key) <= _LONGEST else None
-                if publisher is not None and len(payload) == _NUMBER:  # else it is none, whoever sent it
-                    newest[publisher] = int.from_bytes(payload, "little")
-        return newest
-
-    return take, subscriber.undeclare
-
-
-@lru_cache(_HEARTBEATS)
-def _publisher_of(heartbeat: str) -> tuple[str, str] | None:
-    """Return the stream and the name of the publisher on whose key a heartbeat came."""
-    found = _HEARTBEAT.fullmatch(heartbeat)
-    return None if found is None else (found[1], f"{found[2]}:{found[3]}")
-
-
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
     return ask_alive_keys(session, key_expr, timeout=timeout)[0]
@@ -210,7 +125,7 @@ def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[
     """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
     with while_open():
         channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_TOKENS)
-        answers = Answers(session.liveliness().get(key_expr, channel, timeout=_zenoh_timeout(timeout)))
+        answers = Answers(session.liveliness().get(key_expr, channel, timeout=zenoh_timeout(timeout)))
     keys: set[str] = set()
     failed = False  # Zenoh reports a timeout as an error
     size = 0
@@ -245,6 +160,6 @@ class AliveChanges:
         return changes
 
 
-def _zenoh_timeout(timeout: float) -> float:
+def zenoh_timeout(timeout: float) -> float:
     """Return a timeout that Zenoh accepts: neither 0 nor infinity."""
     return min(max(timeout, 0.001), 86_400.0)
