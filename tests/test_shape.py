@@ -28,8 +28,9 @@ FLOORS = [
 ONLY_BY_FOLDER = {
     "zenoh": {
         "nedbus/transport": "session router queries zenoh_ext refusals write_probe",
-        "nedbus/client": "channels zenoh_subscriber follower decoder sample publisher publisher_registry "
-        "acknowledgement recovery rejections query_server qos demand thinned_streams thinned_subscriber",
+        "nedbus/client": "channels zenoh_subscriber follower decoder sample recovery rejections qos thinned_subscriber",
+        "nedbus/client/publishing": "publisher publisher_registry writer flow_control heartbeats "
+        "downsampler query_server",
         "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",
     },
     "msgpack": {"nedbus_msgs": "wire"},
@@ -46,7 +47,7 @@ ONLY_BY_FOLDER = {
         "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
     },
     "pydantic_core": {
-        "nedbus_msgs": "px4_types position fast_path wire", "nedbus/client": "publisher_registry",
+        "nedbus_msgs": "px4_types position fast_path wire", "nedbus/client/publishing": "publisher_registry",
         "nedbus/settings": "load",
     },
     "pydantic_settings": {"nedbus/settings": "model load"},

@@ -14,10 +14,11 @@ from typing import Final, cast
 import pytest
 import zenoh
 
-from nedbus.client import acknowledgement as module
-from nedbus.client.acknowledgement import Acknowledgement, SharedWindow
+from nedbus.client.publishing import flow_control as module
+from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
+from nedbus.client.publishing.writer import Writer
 from nedbus.client.questions import CLOSED
-from nedbus.transport import LEASE, Session
+from nedbus.transport import LEASE
 
 from .raw_samples import Payload
 
@@ -82,21 +83,20 @@ class World:
     closed: bool = False
     dropping: bool = False  # whether a full queue drops the questions that are asked
 
-    def acknowledgement(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> Acknowledgement:
-        """Return an acknowledgement that lives here."""
+    def flow_control(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> FlowControl:
+        """Return a flow control that lives here."""
         monkeypatch.setattr(module, "_POLLS", (0.0005, _TICK))
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
-        given = cast("Session", self), KEY, "p:1"
-        shared = SharedWindow()
-        return Acknowledgement(*given, priority=zenoh.Priority.DATA, shared=shared, needs_router=needs_router)
+        writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
+        return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
 
-    def publish(self, acknowledgement: Acknowledgement, count: int, *, rate: float = 10_000.0) -> None:
+    def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
         """Publish so many messages, so many a second where nothing holds it up."""
         for _ in range(count):
             self.advance(1 / rate)
             self.published += 1
             self.sent.append(self.now)
-            acknowledgement.pace(self.published)
+            control.pace(self.published)
 
     def plan(self, seconds: float, action: Callable[[], object]) -> None:
         """Let something happen in so many seconds."""
@@ -141,7 +141,7 @@ class World:
         times = [since, *(each for each in self.sent if each >= since)]
         return max(later - earlier for earlier, later in pairwise(times))
 
-    # What an acknowledgement needs of a session.
+    # What a flow control needs of a session.
 
     @property
     def info(self) -> SimpleNamespace:

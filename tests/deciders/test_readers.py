@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import pytest
 
-from nedbus.client.readers import RETURN, THAW, Readers
+from nedbus.client.publishing.flow_control import RETURN, THAW, ReaderTable
 
 
-def note(readers: Readers, now: float, *answers: str, late: bool = False, stood_still: bool = False) -> bool:
+def note(readers: ReaderTable, now: float, *answers: str, late: bool = False, froze: bool = False) -> bool:
     """Note who answered a question, with a minus before one that is closed; return whether anybody is away."""
     by_reader = {each.removeprefix("-"): each.startswith("-") for each in answers}
-    readers.note(by_reader, late=late, stood_still=stood_still, now=now)
-    return readers.away
+    readers.note(by_reader, late=late, froze=froze, now=now)
+    return bool(readers.away)
 
 
-def known(*names: str) -> Readers:
+def known(*names: str) -> ReaderTable:
     """Return readers of which these have answered."""
-    readers = Readers()
+    readers = ReaderTable()
     note(readers, 0.0, *names)
     return readers
 
 
-def away_for(readers: Readers, start: float, *answers: str) -> float:
+def away_for(readers: ReaderTable, start: float, *answers: str) -> float:
     """Return for how many seconds somebody is still away where these readers answer twice a second."""
     now = start
     while note(readers, now, *answers):
@@ -31,7 +31,7 @@ def away_for(readers: Readers, start: float, *answers: str) -> float:
 
 def test_nobody_is_away_where_all_answer() -> None:
     """Also when new ones come, and when nobody is there."""
-    readers = Readers()
+    readers = ReaderTable()
     assert not note(readers, 0.0)
     assert not note(readers, 1.0, "a")
     assert not note(readers, 2.0, "a", "b")
@@ -55,7 +55,7 @@ def test_nobodys_time_runs_while_the_publisher_has_no_router() -> None:
         for second in range(1, 60):
             readers.wait_for_link(float(second))
         assert away_for(readers, 60.0) == pytest.approx(RETURN, abs=1.6)
-    late = Readers()
+    late = ReaderTable()
     late.wait_for_link(0.0)
     assert not note(late, 1.0, "a"), "a reader that answers for the first time is the one that was waited for"
 
@@ -68,21 +68,21 @@ def test_reader_that_is_closed_is_not_waited_for() -> None:
         assert not note(readers, 2.0, "b")
 
 
-def test_reader_that_stood_still_may_return_for_90_seconds() -> None:
+def test_reader_that_froze_may_return_for_90_seconds() -> None:
     """The question was open until Zenoh's lease ended: it may have been stopped."""
     readers = known("a", "b")
-    assert note(readers, 10.0, "b", stood_still=True)
+    assert note(readers, 10.0, "b", froze=True)
     assert away_for(readers, 10.0, "b") == pytest.approx(THAW, abs=0.6)
 
 
-def test_reader_that_stood_still_before_its_first_answer_may_return_for_90_seconds() -> None:
+def test_reader_that_froze_before_its_first_answer_may_return_for_90_seconds() -> None:
     """Nobody knows its name, and somebody was there; the first one with a new name is it."""
-    readers = Readers()
-    assert note(readers, 0.0, stood_still=True)
+    readers = ReaderTable()
+    assert note(readers, 0.0, froze=True)
     assert note(readers, 80.0)
     assert not note(readers, 81.0, "a")
-    forgotten = Readers()
-    note(forgotten, 0.0, stood_still=True)
+    forgotten = ReaderTable()
+    note(forgotten, 0.0, froze=True)
     assert away_for(forgotten, 0.0) == pytest.approx(THAW, abs=0.6)
 
 
@@ -107,7 +107,7 @@ def test_late_reader_that_has_gone_may_return_for_90_seconds(before: list[str]) 
 
 def test_reader_that_answered_and_ended_is_not_waited_for_beside_a_silent_one() -> None:
     """The one suspected of standing still is the one that did not answer, not one that did and was closed."""
-    readers = Readers()
+    readers = ReaderTable()
     assert not note(readers, 10.0, "a", late=True)
     assert not note(readers, 10.1, "-a", "b")
     assert not note(readers, 20.0, "b", late=True)

@@ -29,7 +29,7 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
 
 def is_read(publisher: nedbus.Publisher) -> bool:
     """Return whether a publisher knows of a subscriber."""
-    probe = publisher._session.declare_publisher(publisher.key)  # no other session knows what this one does
+    probe = publisher._writer.session.declare_publisher(publisher.key)  # no other session knows what this one does
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
     return status.matching

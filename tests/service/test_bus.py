@@ -269,7 +269,7 @@ def test_two_threads_get_one_publisher_of_an_address(bus: nedbus.Bus, monkeypatc
             both.wait(0.2)
         return nedbus.Publisher(*arguments, **options)  # type: ignore[arg-type] # whatever is given
 
-    monkeypatch.setattr("nedbus.client.publisher_registry.Publisher", meet)
+    monkeypatch.setattr("nedbus.client.publishing.publisher_registry.Publisher", meet)
     with ThreadPoolExecutor(2) as pool:
         made = [pool.submit(bus.publisher, VLP, vehicle="1") for _ in range(2)]
     assert sorted(each.exception() is None for each in made) == [False, True]

@@ -12,7 +12,7 @@ import pytest
 
 import nedbus
 from nedbus import Batch
-from nedbus.client.acknowledgement import KEPT, WINDOW
+from nedbus.client.publishing.flow_control import KEPT, WINDOW
 from nedbus.transport import Session, open_router
 from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
 from nedbus_msgs.arrays import DTYPE, to_array, to_message

@@ -15,8 +15,8 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
+from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
-from nedbus.client.thinned_streams import ThinnedStreams
 from nedbus.client.unthinned import Unthinned
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
@@ -146,7 +146,7 @@ def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock
                 wait_for_demand(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._thinned_demands  # as nobody else could see
+            assert not bus._publishers._downsampled  # as nobody else could see
         assert subscription.counts == nedbus.Counts(received=11)
 
 
@@ -266,8 +266,8 @@ def test_publisher_of_an_older_nedbus(
 ) -> None:
     """One that thins nothing is read whole, thinned by the reader, said once; when it learns to thin, no longer."""
     knows = False
-    put = ThinnedStreams.put
-    monkeypatch.setattr(ThinnedStreams, "put", lambda *args: put(*args) if knows else None)
+    put = Downsampler.put
+    monkeypatch.setattr(Downsampler, "put", lambda *args: put(*args) if knows else None)
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
         for publisher in publishers:

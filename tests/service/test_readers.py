@@ -11,7 +11,7 @@ from contextlib import suppress
 import pytest
 
 import nedbus
-from nedbus.client.acknowledgement import WINDOW
+from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.transport import LEASE, open_router
 from nedbus.transport.session import COMMON_SETTINGS
 from tests.messages import VLP
@@ -95,7 +95,7 @@ def test_stopped_reader_gets_everything(
     assert COMMON_SETTINGS["transport/link/tx/lease"] == 1000 * LEASE == 5000
     begin = time.monotonic()
     if lease != LEASE:
-        monkeypatch.setattr("nedbus.client.acknowledgement.LEASE", float(lease))
+        monkeypatch.setattr("nedbus.client.publishing.flow_control.LEASE", float(lease))
     stopped = start("-c", READER, endpoint, str(COUNT), when, *([str(lease)] if lease != LEASE else []))
     wait_for(lambda: "ready" in stopped.out, what="the reader")
     if when == "before":
@@ -162,7 +162,7 @@ def test_reader_that_dies_is_given_up(
     number: signal.Signals,
 ) -> None:
     """A replay goes on without one that is killed, or ends, and others miss nothing."""
-    monkeypatch.setattr("nedbus.client.readers.RETURN", 0.5)
+    monkeypatch.setattr("nedbus.client.publishing.flow_control.RETURN", 0.5)
     dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
     _, sending = publish_all(bus)

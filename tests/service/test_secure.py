@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.client.acknowledgement import WINDOW
+from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
 from nedbus.transport import Session, open_client, open_router, write_access_rules
 from nedbus_msgs import Address, encode

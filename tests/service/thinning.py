@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 import nedbus
-from nedbus.client import thinned_streams
+from nedbus.client.publishing import downsampler
 from tests.messages import message
 from tests.waits import wait_for
 
@@ -77,7 +77,7 @@ class Clock:
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """Let publishers of this process thin by a clock of the test's."""
     clock = Clock()
-    monkeypatch.setattr(thinned_streams, "time", clock)
+    monkeypatch.setattr(downsampler, "time", clock)
     return clock
 
 
@@ -90,7 +90,7 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 def is_wanted(publisher: nedbus.Publisher) -> bool:
     """Return whether a publisher knows that somebody reads its vehicle thinned."""
-    return publisher._thinned.vehicle.is_wanted()  # what it does about that shows only once it publishes
+    return publisher._downsampler.vehicle.is_matched()  # what it does about that shows only once it publishes
 
 
 def wait_for_demand(publisher: nedbus.Publisher) -> None:

@@ -11,10 +11,12 @@ from .bus import Bus
 from .connect import connect, connect_async, connect_with
 from .health import Health, StreamHealth
 from .histogram import Histogram
+from .housekeeping import Housekeeping
 from .monitor import Monitor
-from .publisher import HEARTBEAT, Publisher
-from .publisher_registry import PublisherRegistry
-from .query_server import QueryServer
+from .publishing.heartbeats import HEARTBEAT
+from .publishing.publisher import Publisher
+from .publishing.publisher_registry import PublisherRegistry
+from .publishing.query_server import QueryServer
 from .rate_gate import check_max_rate
 from .rejections import RejectionReport, Rejections
 from .sample import Counts, Mode, Sample
@@ -36,6 +38,7 @@ __all__ = [
     "Counts",
     "Health",
     "Histogram",
+    "Housekeeping",
     "Mode",
     "Monitor",
     "Publisher",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 from nedbus_msgs import Address, Row, VehicleLocalPosition
 
-from .publisher import FLUSH_TIMEOUT, Publisher
+from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray

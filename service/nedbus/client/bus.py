@@ -15,10 +15,11 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, PAYLOAD_SIZE, Address, Selection, de
 from .closing import Finalizer
 from .decoder import Decoder
 from .discovery import find_layouts, find_services
+from .housekeeping import Housekeeping
 from .layout_lookup import LayoutLookup
-from .publisher import Publisher
-from .publisher_registry import LIVE, PublisherRegistry
-from .query_server import QueryServer
+from .publishing.publisher import Publisher
+from .publishing.publisher_registry import LIVE, PublisherRegistry
+from .publishing.query_server import QueryServer
 from .receive_queue import ReceiveQueue
 from .rejections import Rejections
 from .sample import Mode, Sample
@@ -42,11 +43,13 @@ class Bus:
         self._tls = tls
         self._session = session
         self._queries = QueryServer(session)
-        self._publishers = PublisherRegistry(session, self._queries, prefix=prefix, is_client=True)
+        self._housekeeping = Housekeeping()
+        self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(session, prefix=prefix)
         self._layouts = LayoutLookup(partial(find_layouts, session, prefix=prefix))
         self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
-        self._finalizer = Finalizer(self, partial(_close, session, self._queries, self._layouts, self._subscribers))
+        close = partial(_close, session, self._queries, self._housekeeping, self._layouts, self._subscribers)
+        self._finalizer = Finalizer(self, close)
 
     @property
     def connected(self) -> bool:
@@ -212,11 +215,16 @@ def _rank(sample: Sample) -> tuple[bool, int]:
 
 
 def _close(
-    session: Session, queries: QueryServer, layouts: LayoutLookup, subscribers: weakref.WeakSet[ZenohSubscriber]
+    session: Session,
+    queries: QueryServer,
+    housekeeping: Housekeeping,
+    layouts: LayoutLookup,
+    subscribers: weakref.WeakSet[ZenohSubscriber],
 ) -> None:
     with ExitStack() as closing:  # whatever fails, the rest is closed as well
         closing.callback(layouts.close)  # which ends with the session
         closing.callback(session.close)
+        closing.callback(housekeeping.close)
         closing.callback(queries.close)
         for subscriber in list(subscribers):
             closing.callback(subscriber.close)

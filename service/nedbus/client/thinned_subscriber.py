@@ -21,7 +21,7 @@ from nedbus.transport import AliveChanges, Session, alive_keys, query, while_ope
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key, get_topic
 
 from .channels import declare_reader, take_all
-from .publisher_registry import LIVE
+from .publishing.publisher_registry import LIVE
 from .recovery import Recovery
 from .thinned_queue import ThinnedQueue
 from .unthinned import Unthinned

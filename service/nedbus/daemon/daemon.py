@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Final
 
-from nedbus.client import HEARTBEAT, PublisherRegistry, QueryServer, Sample
+from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample
 from nedbus.errors import ConnectError
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
@@ -149,9 +149,9 @@ class Daemon:
         if self.role == "router":
             self._log_router()
         self._session = session
-        settings, queries = self._settings, QueryServer(session)
+        settings, queries, housekeeping = self._settings, QueryServer(session), Housekeeping()
         registry = self._registry = PublisherRegistry(
-            session, queries, prefix=self._settings.prefix, is_client=self.role == "client"
+            session, queries, housekeeping, prefix=self._settings.prefix, is_client=self.role == "client"
         )
         try:
             queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
@@ -169,6 +169,7 @@ class Daemon:
             if self._workers is not None:
                 self._workers.end(_GRACE)
             queries.close()
+            housekeeping.close()
             session.close()
             if self._permission is not None:
                 self._permission.close()

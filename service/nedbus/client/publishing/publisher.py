@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Final, Self
 
 import zenoh
 
+from nedbus.client.qos import TOPIC_QOS
 from nedbus.errors import ClosedError, NedbusError
-from nedbus.transport import Session, entity_name, require_unforked, translate_error, while_open
+from nedbus.transport import Session, require_unforked, translate_error, while_open
 from nedbus_msgs import (
     FIELD_TYPES,
     PAYLOAD_SIZE,
@@ -23,15 +24,14 @@ from nedbus_msgs import (
     encoding_of,
 )
 
-from .acknowledgement import KEPT, Acknowledgement, SharedWindow
-from .demand import Demand
-from .qos import TOPIC_QOS
-from .thinned_streams import ThinnedStreams
+from .downsampler import Downsampler, MatchingListener
+from .flow_control import KEPT, FlowControl, SharedWindow
+from .heartbeats import Heartbeats
+from .writer import Writer
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
 
-HEARTBEAT: Final = 0.5  # s: how soon a reader learns that it missed the newest message
 FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
 _ALL: Final = frozenset(FIELD_TYPES)
 
@@ -53,50 +53,42 @@ class Publisher:
         prefix: str,
         lossless: bool,
         source: str | None,
-        thinned_demand: Demand,
-        shared_window: SharedWindow,
+        heartbeats: Heartbeats,
+        downsampled: MatchingListener,
+        window: SharedWindow,
         needs_router: bool,
         on_close: Callable[[], object],
         owner: object,
     ) -> None:
         self.address = address
         self.key = address.key(prefix=prefix)
-        self.published = 0
         self.source = Provenance(source).source
         self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
-        self._session = session
+        self._new_timestamp = session.new_timestamp
         self._on_close = on_close
-        self._owner = owner  # the bus stays open for as long as somebody may publish
-        self._provided: Set[str] = frozenset()
-        self._partial_encoding = ""
+        self._owner = owner  # the bus stays open for as long as a script may publish
+        self._closed = False
         self._encoding = encoding_of(source)
+        self._partial: tuple[Set[str], str] = _ALL, self._encoding  # the fields of messages, and their encoding
         qos = TOPIC_QOS[address.topic]
-        misses = zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT, sporadic_heartbeat=None)
         with while_open():
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
-            # A router remembers where to send what comes on a key that it knows as such; of any other it finds out for
-            # each message, which is most of what one costs where several routers are joined.
-            self._key_token = session.liveliness().declare_token(self.key)
-            publisher = zenoh.ext.declare_advanced_publisher(
-                session,
-                self.key,
-                encoding=self._encoding,
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=qos.priority,
-                cache=zenoh.ext.CacheConfig(KEPT if lossless else qos.cache),
-                sample_miss_detection=misses,
-            )
-        self._publisher: zenoh.ext.AdvancedPublisher | None = publisher
-        self._acknowledgement = Acknowledgement(
+        self._writer = Writer(
             session,
             self.key,
-            entity_name(publisher.id),
+            heartbeats,
             priority=qos.priority,
-            shared=shared_window,
-            needs_router=needs_router,
+            cache=KEPT if lossless else qos.cache,
+            encoding=self._encoding,
         )
-        self._thinned = ThinnedStreams(session, address, prefix=prefix, vehicle=thinned_demand)
+        self._flow_control = FlowControl(self._writer, window, needs_router=needs_router)
+        self._downsampler = Downsampler(session, address, prefix=prefix, vehicle=downsampled, heartbeats=heartbeats)
+
+    @property
+    def published(self) -> int:
+        """How many messages it has published."""
+        return self._writer.published
 
     def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
         """Validate a message, or the fields of one by name, and publish it.
@@ -120,31 +112,21 @@ class Publisher:
         self._put(encode_row(values), _ALL)
 
     def publish_many(self, messages: MessageArray) -> None:
-        """Validate messages in a structured array of shape (n,) and dtype DTYPE, and publish them; all or none.
+        """Validate all messages in a structured array of shape (n,) and dtype DTYPE, then publish them in order.
 
-        Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`.
+        None is published if one is invalid. `published` tells how many were where the bus is closed meanwhile.
+
+        Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`,
+        ClosedError once the publisher or its bus is closed.
         """
         from nedbus_msgs.arrays import DTYPE, encode_array, require_valid
 
         if messages.dtype != DTYPE:
             raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
         require_valid(messages)
-        if self._publisher is None:
-            raise ClosedError
-        require_unforked()
         payloads = encode_array(messages)
-        put, new_timestamp = self._publisher.put, self._session.new_timestamp
-        lossless, pace, thinned = self.lossless, self._acknowledgement.pace, self._thinned
-        with while_open():
-            for start in range(0, len(payloads), PAYLOAD_SIZE):
-                payload, stamp = payloads[start : start + PAYLOAD_SIZE], new_timestamp()
-                put(payload, timestamp=stamp)
-                if thinned.opened or thinned.vehicle.is_wanted():
-                    thinned.put(payload, stamp, self._encoding)
-                self.last = payload, stamp, self._encoding
-                self.published += 1
-                if lossless:
-                    pace(self.published)
+        for start in range(0, len(payloads), PAYLOAD_SIZE):
+            self._put(payloads[start : start + PAYLOAD_SIZE], _ALL)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have what was published; return False if one has not in time.
@@ -154,26 +136,24 @@ class Publisher:
 
         Raises ClosedError once the bus is closed.
         """
-        return self._acknowledgement.wait(self.published, timeout=timeout)
+        return self._flow_control.wait(self.published, timeout=timeout)
 
     def close(self) -> None:
         """Stop publishing this address: it is no longer listed, and free for another publisher.
 
         A lossless publisher flushes before.
         """
-        if self._publisher is None:
+        if self._closed:
             return
-        # Dropped, as nothing else refers to it: undeclare() would wait for Zenoh while it holds the interpreter's lock.
-        publisher, self._publisher = self._publisher, None
+        self._closed = True
         if self.lossless:
             with suppress(NedbusError):
                 self.flush()
-        del publisher
+        self._writer.close()
         self._on_close()
-        self._thinned.close()
+        self._downsampler.close()
         with suppress(zenoh.ZError):  # closed already with the session
             self._token.undeclare()
-            self._key_token.undeclare()
 
     def __enter__(self) -> Self:
         return self
@@ -182,26 +162,21 @@ class Publisher:
         self.close()
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
-        publisher = self._publisher
-        if publisher is None:
+        """Put the payload of a message that was made with these fields."""
+        if self._closed:
             raise ClosedError
         require_unforked()
-        encoding = self._encoding
+        encoding, is_whole = self._encoding, len(provided) == len(_ALL)
+        if not is_whole:
+            if provided != self._partial[0]:  # almost always the same fields are missing
+                self._partial = frozenset(provided), encoding_of(self.source, frozenset(provided))
+            encoding = self._partial[1]
         try:
-            stamp = self._session.new_timestamp()
-            if len(provided) == len(_ALL):
-                publisher.put(payload, timestamp=stamp)
-            else:
-                if provided != self._provided:  # almost always the same fields are missing
-                    self._provided = frozenset(provided)
-                    self._partial_encoding = encoding_of(self.source, self._provided)
-                encoding = self._partial_encoding
-                publisher.put(payload, timestamp=stamp, encoding=encoding)
-            if self._thinned.opened or self._thinned.vehicle.is_wanted():
-                self._thinned.put(payload, stamp, encoding)
+            stamp = self._new_timestamp()
+            self._writer.put(payload, stamp, None if is_whole else encoding)
+            self.last = payload, stamp, encoding
+            self._downsampler.put(payload, stamp, encoding)
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
-        self.last = payload, stamp, encoding
-        self.published += 1
         if self.lossless:
-            self._acknowledgement.pace(self.published)
+            self._flow_control.pace(self.published)

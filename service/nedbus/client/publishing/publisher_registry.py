@@ -12,22 +12,22 @@ from typing import Final, cast
 import zenoh
 from pydantic_core import to_json
 
+from nedbus.client.housekeeping import Housekeeping
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
 from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table, schema_key
 
-from .acknowledgement import SharedWindow
-from .demand import Demand
+from .downsampler import MatchingListener
+from .flow_control import SharedWindow
+from .heartbeats import Heartbeats
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
 
 _log = logging.getLogger(__name__)
 
-_PATIENCE: Final = 2.0  # s for a router that is slow to say which publishers it knows; it answers within milliseconds
-_ASK_AGAIN: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
-
-
+_TOKENS_TIMEOUT: Final = 2.0  # s for a router that is slow to say which publishers it knows; it takes milliseconds
+_FLUSH_LOOK: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 LIVE: Final = b"live"
 """Attachment of a publisher's answer with its last message, which that of a storage does not have."""
 
@@ -35,18 +35,23 @@ LIVE: Final = b"live"
 class PublisherRegistry:
     """Make the publishers of a session, at most one for each address, and answer queries for their last messages.
 
-    `is_client`: the session is that of a client, whose readers are behind its router.
+    `housekeeping` sends their heartbeats. `is_client`: the session is that of a client, whose readers are behind its
+    router.
     """
 
-    def __init__(self, session: Session, queries: QueryServer, *, prefix: str, is_client: bool) -> None:
+    def __init__(
+        self, session: Session, queries: QueryServer, housekeeping: Housekeeping, *, prefix: str, is_client: bool
+    ) -> None:
         self.prefix = prefix
         self._session = session
         self._is_client = is_client
         self._queries = queries
+        self._housekeeping = housekeeping
+        self._heartbeats = Heartbeats(session)
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
-        self._thinned_demands: dict[str, Demand] = {}  # by vehicle, for any thinned stream of it
-        self._shared_window = SharedWindow()
+        self._downsampled: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
+        self._window = SharedWindow()
         self._lock = threading.Lock()
 
     @property
@@ -61,18 +66,18 @@ class PublisherRegistry:
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
-            demand = self._thinned_demands.get(address.vehicle)
-            if demand is None:
+            if address.vehicle not in self._downsampled:
                 key_expr = Selection(vehicle=address.vehicle).rate_key_expr(ANY, prefix=self.prefix)
-                demand = self._thinned_demands[address.vehicle] = Demand(self._session, key_expr)
+                self._downsampled[address.vehicle] = MatchingListener(self._session, key_expr)
             publisher = Publisher(
                 self._session,
                 address,
                 prefix=self.prefix,
                 lossless=lossless,
                 source=source,
-                thinned_demand=demand,
-                shared_window=self._shared_window,
+                heartbeats=self._heartbeats,
+                downsampled=self._downsampled[address.vehicle],
+                window=self._window,
                 needs_router=self._is_client,
                 on_close=lambda: self._forget(address),
                 owner=owner,
@@ -80,6 +85,7 @@ class PublisherRegistry:
             self._publishers[address] = publisher
             if not self._vehicles:
                 self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
+                self._housekeeping.add(self._heartbeats.send_due)
             if address.vehicle not in self._vehicles:
                 self._vehicles.add(address.vehicle)
                 key_expr = f"{self.prefix}/{address.vehicle}/**"
@@ -98,7 +104,7 @@ class PublisherRegistry:
 
     def is_alive(self, address: Address) -> bool:
         """Return whether this address is published already, by this process or another."""
-        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_PATIENCE))
+        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_TOKENS_TIMEOUT))
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether there is a subscriber for any of these addresses."""
@@ -115,7 +121,7 @@ class PublisherRegistry:
         end = time.monotonic() + FLUSH_TIMEOUT
         for publisher in publishers:
             logged = False
-            while not publisher.flush(_ASK_AGAIN):
+            while not publisher.flush(_FLUSH_LOOK):
                 if (stop and stop.is_set()) or time.monotonic() > end:
                     extra = about("slow-reader", publisher.address)
                     _log.warning("%s: a reader does not have all of it", publisher.address, extra=extra)
@@ -128,10 +134,8 @@ class PublisherRegistry:
     def _forget(self, address: Address) -> None:
         with self._lock:
             self._publishers.pop(address, None)
-            demand = self._thinned_demands.get(address.vehicle)
-            if demand is not None and not any(each.vehicle == address.vehicle for each in self._publishers):
-                del self._thinned_demands[address.vehicle]
-                demand.close()
+            if not any(each.vehicle == address.vehicle for each in self._publishers):
+                self._downsampled.pop(address.vehicle).close()
 
     def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,10 +20,11 @@ _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 1000  # queries that wait for an answer, on each key expression; the oldest are not answered
 _TURN: Final = 64  # queries on one key expression until others have their turn
-_POLL: Final = 0.01  # s between two looks for queries
+_POLL: Final = 0.01  # s between two polls for queries
+_IDLE_POLL: Final = 0.05  # s, when none has come for a second
+_BUSY: Final = 1.0  # s
 _JOIN: Final = 10.0  # s that an answer has to get out of Zenoh: its thread would abort a process that ends
 JSON: Final = "application/json"
-"""Encoding of answers that are JSON documents."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,31 +39,31 @@ class Answer:
 
 
 Reply = Callable[[zenoh.Query], Iterable[Answer]]
-"""What answers a query; it must not refer to the owner of the server, which may be dropped without a close."""
+"""Answer a query; it must not refer to the owner of the server, which may be dropped without a close."""
 
 
 class QueryServer:
-    """Answer queries on the key expressions of a session; whoever makes one closes it before the session."""
+    """Answer queries on the key expressions of a session; its maker closes it before the session."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self._queryables: list[zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
-        self._replies: list[tuple[zenoh.Handler[zenoh.Query], Reply]] = []
-        self._lock = threading.Lock()
+        self._handlers: list[tuple[zenoh.Handler[zenoh.Query], Reply]] = []
         self._ended = threading.Event()
+        self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def answer(self, key_expr: str, reply: Reply) -> None:
         """Answer queries on a key expression with what `reply` returns; raise ClosedError once it is closed."""
-        with self._lock:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
-                self._thread.start()
         channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
             queryable = self._session.declare_queryable(key_expr, channel)
         self._queryables.append(queryable)
-        self._replies.append((queryable.handler, reply))
+        self._handlers.append((queryable.handler, reply))
+        with self._starting:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
+                self._thread.start()
 
     def answer_json(self, key: str, content: Callable[[], Mapping[str, object]]) -> None:
         """Answer queries on a key with a JSON document, made anew for each."""
@@ -77,14 +79,16 @@ class QueryServer:
                 queryable.undeclare()
 
     def _run(self) -> None:
-        while not self._ended.wait(_POLL):
-            for handler, reply in list(self._replies):
+        busy_until = 0.0
+        while not self._ended.wait(_POLL if time.monotonic() < busy_until else _IDLE_POLL):
+            for handler, reply in list(self._handlers):
                 with suppress(zenoh.ZError):  # the session is closed
                     for _ in range(_TURN):
                         query = handler.try_recv()
                         if query is None or self._ended.is_set():
                             break
                         _answer(query, reply)
+                        busy_until = time.monotonic() + _BUSY
 
 
 def _answer(query: zenoh.Query, reply: Reply) -> None:

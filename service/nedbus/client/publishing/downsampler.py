@@ -1,0 +1,137 @@
+"""Downsampled copies of a stream: published beside it, on keys of their own, for readers with a maximum rate.
+
+`<key>/@rate/5` has at most 5 messages a second of `<key>`, with sequence numbers and a cache of their own: what is left
+out is no gap, and what is lost is one. There is one for each of RATES, and only while it has subscribers.
+A vehicle whose downsampled streams have none costs one declaration; a stream declares more once that one is matched.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from contextlib import suppress
+from typing import Final
+
+import zenoh
+
+from nedbus.client.qos import RATES, TOPIC_QOS
+from nedbus.client.rate_gate import RateGate
+from nedbus.transport import Session, while_open
+from nedbus_msgs import ANY, Address
+
+from .heartbeats import Heartbeats
+from .writer import Writer
+
+_CACHE: Final = 20.0  # s of messages that are kept for readers that missed some
+_MIN_CACHE: Final = 20  # messages
+_LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come back, and get what they missed
+
+
+class MatchingListener:
+    """Follow whether a key expression has subscribers: by a publisher that publishes nothing. Thread-safe."""
+
+    def __init__(self, session: Session, key_expr: str) -> None:
+        channel: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
+        with while_open():
+            self._probe = session.declare_publisher(key_expr)
+            self._listener = self._probe.declare_matching_listener(channel)  # begins with how it is now
+        self._matched = False
+        self._taking = threading.Lock()
+        self._take = self._listener.handler.try_recv
+
+    def is_matched(self) -> bool:
+        """Return whether there are subscribers, as far as Zenoh has told."""
+        with self._taking, suppress(zenoh.ZError):  # closed
+            while (status := self._take()) is not None:
+                self._matched = status.matching
+        return self._matched
+
+    def close(self) -> None:
+        """Follow it no more."""
+        with suppress(zenoh.ZError):  # closed already with the session
+            self._listener.undeclare()
+            self._probe.undeclare()
+
+
+class Downsampler:
+    """Publish the messages of one address at lower rates; `vehicle` follows all downsampled streams of its vehicle.
+
+    For use from one thread at a time, that of the publisher.
+    """
+
+    def __init__(
+        self, session: Session, address: Address, *, prefix: str, vehicle: MatchingListener, heartbeats: Heartbeats
+    ) -> None:
+        self.vehicle = vehicle
+        self._session, self._address, self._prefix, self._heartbeats = session, address, prefix, heartbeats
+        self._any_rate: MatchingListener | None = None
+        self._streams: list[_Stream] = []
+
+    def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
+        """Publish a message at the rates for which it is due and wanted; this never waits for a reader."""
+        if self._any_rate is None:
+            if not self.vehicle.is_matched():
+                return
+            self._any_rate = MatchingListener(self._session, self._address.rate_key(ANY, prefix=self._prefix))
+        now = time.monotonic_ns()  # not the message's time: a replay at ten times the speed would fill a link
+        is_matched = self._any_rate.is_matched()
+        if is_matched and not self._streams:
+            make, priority = self._address.rate_key, TOPIC_QOS[self._address.topic].priority
+            self._streams = [
+                _Stream(self._session, make(rate, prefix=self._prefix), rate, priority, self._heartbeats)
+                for rate in RATES
+            ]
+        for stream in self._streams:
+            stream.put(now, payload, stamp, encoding)
+        if not is_matched and not any(stream.writer for stream in self._streams):
+            self._close_streams()
+            if not self.vehicle.is_matched():
+                self.close()
+
+    def close(self) -> None:
+        """Withdraw all that is declared; a message that is put later declares it anew."""
+        self._close_streams()
+        if self._any_rate is not None:
+            self._any_rate.close()
+        self._any_rate = None
+
+    def _close_streams(self) -> None:
+        for stream in self._streams:
+            stream.close()
+        self._streams = []
+
+
+class _Stream:
+    """The stream of one rate; it has a writer while it is matched, and for a minute after."""
+
+    def __init__(self, session: Session, key: str, rate: int, priority: zenoh.Priority, heartbeats: Heartbeats) -> None:
+        self.writer: Writer | None = None
+        self._session, self._key, self._rate = session, key, rate
+        self._priority, self._heartbeats = priority, heartbeats
+        self._listener = MatchingListener(session, key)
+        self._gate = RateGate(rate)
+        self._matched_at = 0
+
+    def put(self, now: int, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
+        if self._listener.is_matched():
+            self._matched_at = now
+            if self.writer is None:
+                self._gate = RateGate(self._rate)
+                cache = max(_MIN_CACHE, math.ceil(_CACHE * self._rate))
+                self.writer = Writer(self._session, self._key, self._heartbeats, priority=self._priority, cache=cache)
+        if self.writer is None or not self._gate.passes(now):
+            return
+        if now - self._matched_at > _LINGER:
+            self._withdraw()
+        else:
+            self.writer.put(payload, stamp, encoding)  # without a subscriber this only fills the cache
+
+    def close(self) -> None:
+        self._withdraw()
+        self._listener.close()
+
+    def _withdraw(self) -> None:
+        if self.writer is not None:
+            self.writer.close()
+        self.writer = None
