@@ -1,0 +1,106 @@
+"""When heartbeats are sent: by the counts of the writers, at times that the test gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+import zenoh
+
+from nedbus.client.publishing.heartbeats import HEARTBEAT, Heartbeats
+from nedbus.client.publishing.writer import Writer
+from nedbus.transport import Session
+
+
+@dataclass(eq=False)
+class Stream:
+    """A session of one writer, and its clock: `sent` has the time and the payload of each heartbeat."""
+
+    now: float = 100.0
+    looks: int = 0
+    sent: list[tuple[float, bytes]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.writer = cast("Writer", SimpleNamespaceWithHash(key="key", name="ab:7", priority=None, published=0))
+        self.heartbeats = Heartbeats(cast("Session", self))
+        self.heartbeats.add(self.writer)
+        self.next_look = self.now
+
+    def put(self, key: str, payload: bytes, *, congestion_control: zenoh.CongestionControl, priority: object) -> None:
+        assert (key, congestion_control) == ("key/@adv/pub/ab/7/_", zenoh.CongestionControl.DROP)
+        self.sent.append((self.now, payload))
+
+    def wait(self, seconds: float) -> list[float]:
+        """Let time go by; return how long after its begin heartbeats were sent."""
+        begin, before = self.now, len(self.sent)
+        while self.next_look <= begin + seconds:
+            self.now = max(self.now, self.next_look)
+            self.next_look = self.now + max(0.002, self.heartbeats.send_due(self.now))
+            self.looks += 1
+        self.now = begin + seconds
+        return [time - begin for time, _ in self.sent[before:]]
+
+
+class SimpleNamespaceWithHash(SimpleNamespace):
+    """What heartbeats need of a writer."""
+
+    __hash__ = object.__hash__
+
+
+@pytest.mark.parametrize("rate", [5, 7, 50, 400])
+def test_stream_that_goes_on_sends_none(rate: int) -> None:
+    """At 5 Hz or more the next message shows what was lost; nor does a stream that has never published."""
+    stream = Stream()
+    assert stream.wait(10.0) == []
+    for _ in range(20 * rate):
+        stream.writer.published += 1
+        assert stream.wait(1 / rate) == []
+
+
+def test_silent_stream_sends_ever_more_rarely() -> None:
+    """0.4 s after the last message, 0.5, 1, 2 and 4 s later, then each 4 s; an hour has 900, and few looks."""
+    stream = Stream()
+    for _ in range(2):  # a message begins anew
+        stream.writer.published += 1
+        first, *others = stream.wait(60.0)
+        assert 0.4 <= first <= 0.4 + 0.5  # the look that finds the message comes within 0.5 s
+        steps = [later - earlier for earlier, later in zip([first, *others], others, strict=False)]
+        assert steps == pytest.approx([0.5, 1.0, 2.0] + [4.0] * (len(steps) - 3), abs=0.02)
+        assert len(steps) == pytest.approx(3 + 55 / 4, abs=1)
+    before = stream.looks
+    assert len(stream.wait(3600.0)) == 900
+    assert stream.looks - before < 3 * 3600
+    for _ in range(50):
+        stream.writer.published += 1
+        stream.wait(0.1)
+    assert stream.wait(HEARTBEAT), "a stream that went on until now is known to be silent sooner"
+
+
+def test_heartbeat_has_the_number_of_the_last_message() -> None:
+    """Zenoh counts from 0, and begins again after 2^32."""
+    stream = Stream()
+    for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
+        stream.writer.published = published
+        stream.wait(1.0)
+        assert stream.sent[-1][1] == payload
+    stream.writer.published += 1
+    stream.wait(1.0)
+    assert stream.sent[-1][1] == b"\0\0\0\0"
+    stream.heartbeats.remove(stream.writer)
+    assert stream.wait(10.0) == []
+
+
+def test_many_heartbeats_are_sent_in_turns() -> None:
+    """What falls silent at once does not hold up the other jobs of a session."""
+    stream = Stream()
+    writers = [SimpleNamespaceWithHash(key="key", name="ab:7", priority=None, published=1) for _ in range(1000)]
+    for writer in writers:
+        stream.heartbeats.add(cast("Writer", writer))
+    stream.heartbeats.send_due(0.0)
+    assert stream.heartbeats.send_due(0.5) <= 0.0
+    assert 0 < len(stream.sent) < 500
+    while stream.heartbeats.send_due(0.5) <= 0.0:
+        pass
+    assert len(stream.sent) == 1000
