@@ -42,10 +42,13 @@ class MatchingListener:
 
     def is_matched(self) -> bool:
         """Return whether there are subscribers, as far as Zenoh has told."""
-        with self._taking, suppress(zenoh.ZError):  # closed
-            while (status := self._take()) is not None:
-                self._matched = status.matching
-        return self._matched
+        with self._taking:  # all publishers of a vehicle share one
+            try:
+                if (status := self._take()) is not None:
+                    self._matched = status.matching
+            except zenoh.ZError:  # closed
+                self._matched = False
+            return self._matched
 
     def close(self) -> None:
         """Follow it no more."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Self
 import zenoh
 
 from nedbus.client.qos import TOPIC_QOS
-from nedbus.errors import ClosedError, NedbusError
+from nedbus.errors import NedbusError
 from nedbus.transport import Session, require_unforked, translate_error, while_open
 from nedbus_msgs import (
     FIELD_TYPES,
@@ -68,7 +68,6 @@ class Publisher:
         self._new_timestamp = session.new_timestamp
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as a script may publish
-        self._closed = False
         self._encoding = encoding_of(source)
         self._partial: tuple[Set[str], str] = _ALL, self._encoding  # the fields of messages, and their encoding
         qos = TOPIC_QOS[address.topic]
@@ -143,9 +142,8 @@ class Publisher:
 
         A lossless publisher flushes before.
         """
-        if self._closed:
+        if self._writer.closed:
             return
-        self._closed = True
         if self.lossless:
             with suppress(NedbusError):
                 self.flush()
@@ -163,8 +161,6 @@ class Publisher:
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
         """Put the payload of a message that was made with these fields."""
-        if self._closed:
-            raise ClosedError
         require_unforked()
         encoding, is_whole = self._encoding, len(provided) == len(_ALL)
         if not is_whole:

@@ -57,6 +57,11 @@ class Writer:
         self._publisher.put(payload, timestamp=stamp, encoding=encoding)
         self.published += 1
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing can be put any more."""
+        return self._publisher is None
+
     def close(self) -> None:
         """Withdraw the key and the cache; a second call does nothing."""
         self._heartbeats.remove(self)
