@@ -63,11 +63,9 @@ class Downsampler:
     For use from one thread at a time, that of the publisher.
     """
 
-    def __init__(
-        self, session: Session, address: Address, *, prefix: str, vehicle: MatchingListener, heartbeats: Heartbeats
-    ) -> None:
+    def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
         self.vehicle = vehicle
-        self._session, self._address, self._prefix, self._heartbeats = session, address, prefix, heartbeats
+        self._heartbeats, self._address, self._prefix = heartbeats, address, prefix
         self._any_rate: MatchingListener | None = None
         self._streams: list[_Stream] = []
 
@@ -76,15 +74,12 @@ class Downsampler:
         if self._any_rate is None:
             if not self.vehicle.is_matched():
                 return
-            self._any_rate = MatchingListener(self._session, self._address.rate_key(ANY, prefix=self._prefix))
+            self._any_rate = MatchingListener(self._heartbeats.session, self._key(ANY))
         now = time.monotonic_ns()  # not the message's time: a replay at ten times the speed would fill a link
         is_matched = self._any_rate.is_matched()
         if is_matched and not self._streams:
-            make, priority = self._address.rate_key, TOPIC_QOS[self._address.topic].priority
-            self._streams = [
-                _Stream(self._session, make(rate, prefix=self._prefix), rate, priority, self._heartbeats)
-                for rate in RATES
-            ]
+            priority = TOPIC_QOS[self._address.topic].priority
+            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, priority) for rate in RATES]
         for stream in self._streams:
             stream.put(now, payload, stamp, encoding)
         if not is_matched and not any(stream.writer for stream in self._streams):
@@ -99,6 +94,9 @@ class Downsampler:
             self._any_rate.close()
         self._any_rate = None
 
+    def _key(self, rate: int | str) -> str:
+        return self._address.rate_key(rate, prefix=self._prefix)
+
     def _close_streams(self) -> None:
         for stream in self._streams:
             stream.close()
@@ -108,11 +106,10 @@ class Downsampler:
 class _Stream:
     """The stream of one rate; it has a writer while it is matched, and for a minute after."""
 
-    def __init__(self, session: Session, key: str, rate: int, priority: zenoh.Priority, heartbeats: Heartbeats) -> None:
+    def __init__(self, heartbeats: Heartbeats, key: str, rate: int, priority: zenoh.Priority) -> None:
         self.writer: Writer | None = None
-        self._session, self._key, self._rate = session, key, rate
-        self._priority, self._heartbeats = priority, heartbeats
-        self._listener = MatchingListener(session, key)
+        self._heartbeats, self._key, self._rate, self._priority = heartbeats, key, rate, priority
+        self._listener = MatchingListener(heartbeats.session, key)
         self._gate = RateGate(rate)
         self._matched_at = 0
 
@@ -122,7 +119,7 @@ class _Stream:
             if self.writer is None:
                 self._gate = RateGate(self._rate)
                 cache = max(_MIN_CACHE, math.ceil(_CACHE * self._rate))
-                self.writer = Writer(self._session, self._key, self._heartbeats, priority=self._priority, cache=cache)
+                self.writer = Writer(self._heartbeats, self._key, priority=self._priority, cache=cache)
         if self.writer is None or not self._gate.passes(now):
             return
         if now - self._matched_at > _LINGER:

@@ -38,7 +38,7 @@ class Heartbeats:
     """Send the heartbeats of all writers of a session; `send_due` is a job of its housekeeping."""
 
     def __init__(self, session: Session) -> None:
-        self._session = session
+        self.session = session
         self._silences: dict[Writer, _Silence] = {}
 
     def add(self, writer: Writer) -> None:
@@ -68,7 +68,7 @@ class Heartbeats:
 
     def _send(self, writer: Writer) -> None:
         with suppress(zenoh.ZError):  # the session is closed
-            self._session.put(
+            self.session.put(
                 heartbeat_key(writer.key, writer.name),
                 heartbeat_payload(writer.published),
                 congestion_control=zenoh.CongestionControl.DROP,

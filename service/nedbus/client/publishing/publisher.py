@@ -10,7 +10,7 @@ import zenoh
 
 from nedbus.client.qos import TOPIC_QOS
 from nedbus.errors import NedbusError
-from nedbus.transport import Session, require_unforked, translate_error, while_open
+from nedbus.transport import require_unforked, translate_error, while_open
 from nedbus_msgs import (
     FIELD_TYPES,
     PAYLOAD_SIZE,
@@ -47,7 +47,6 @@ class Publisher:
 
     def __init__(
         self,
-        session: Session,
         address: Address,
         *,
         prefix: str,
@@ -65,6 +64,7 @@ class Publisher:
         self.source = Provenance(source).source
         self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
+        session = heartbeats.session
         self._new_timestamp = session.new_timestamp
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as a script may publish
@@ -73,16 +73,10 @@ class Publisher:
         qos = TOPIC_QOS[address.topic]
         with while_open():
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
-        self._writer = Writer(
-            session,
-            self.key,
-            heartbeats,
-            priority=qos.priority,
-            cache=KEPT if lossless else qos.cache,
-            encoding=self._encoding,
-        )
+        cache = KEPT if lossless else qos.cache
+        self._writer = Writer(heartbeats, self.key, priority=qos.priority, cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, window, needs_router=needs_router)
-        self._downsampler = Downsampler(session, address, prefix=prefix, vehicle=downsampled, heartbeats=heartbeats)
+        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=downsampled)
 
     @property
     def published(self) -> int:

@@ -70,7 +70,6 @@ class PublisherRegistry:
                 key_expr = Selection(vehicle=address.vehicle).rate_key_expr(ANY, prefix=self.prefix)
                 self._downsampled[address.vehicle] = MatchingListener(self._session, key_expr)
             publisher = Publisher(
-                self._session,
                 address,
                 prefix=self.prefix,
                 lossless=lossless,
@@ -120,15 +119,13 @@ class PublisherRegistry:
         """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
         end = time.monotonic() + FLUSH_TIMEOUT
         for publisher in publishers:
-            logged = False
+            address, logged = publisher.address, False
             while not publisher.flush(_FLUSH_LOOK):
                 if (stop and stop.is_set()) or time.monotonic() > end:
-                    extra = about("slow-reader", publisher.address)
-                    _log.warning("%s: a reader does not have all of it", publisher.address, extra=extra)
+                    _log.warning("%s: a reader does not have all of it", address, extra=about("slow-reader", address))
                     return
                 if not logged:
-                    extra = about("slow-reader", publisher.address)
-                    _log.info("%s: waiting for a slow reader", publisher.address, extra=extra)
+                    _log.info("%s: waiting for a slow reader", address, extra=about("slow-reader", address))
                 logged = True
 
     def _forget(self, address: Address) -> None:

@@ -6,9 +6,10 @@ from contextlib import suppress
 from typing import Final
 
 import zenoh
+from zenoh import Priority
 
 from nedbus.errors import ClosedError
-from nedbus.transport import Session, entity_name, while_open
+from nedbus.transport import entity_name, while_open
 
 from .heartbeats import Heartbeats
 
@@ -19,16 +20,9 @@ class Writer:
     """Put payloads on one key; `cache` messages are kept for readers that missed some."""
 
     def __init__(
-        self,
-        session: Session,
-        key: str,
-        heartbeats: Heartbeats,
-        *,
-        priority: zenoh.Priority,
-        cache: int,
-        encoding: str | None = None,
+        self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
     ) -> None:
-        self.session = session
+        self.session = session = heartbeats.session
         self.key = key
         self.priority = priority
         self.published = 0
