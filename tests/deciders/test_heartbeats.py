@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
@@ -20,7 +21,7 @@ class FakeWriter:
     published: int = 0
     key: str = "key"
     name: str = "ab:7"
-    priority: zenoh.Priority = zenoh.Priority.DATA
+    priority: zenoh.Priority | None = None
 
 
 @dataclass(eq=False)
@@ -37,9 +38,11 @@ class Stream:
         self.heartbeats.add(self.writer)
         self.next_look = self.now
 
-    def put(self, key: str, payload: bytes, *, congestion_control: zenoh.CongestionControl, priority: object) -> None:
+    def declare_publisher(
+        self, key: str, *, congestion_control: zenoh.CongestionControl, priority: object
+    ) -> SimpleNamespace:
         assert (key, congestion_control) == ("key/@adv/pub/ab/7/_", zenoh.CongestionControl.DROP)
-        self.sent.append((self.now, payload))
+        return SimpleNamespace(put=lambda payload: self.sent.append((self.now, payload)))
 
     def wait(self, seconds: float) -> list[float]:
         """Let time go by; return how long after its begin heartbeats were sent."""

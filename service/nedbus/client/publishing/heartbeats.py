@@ -29,6 +29,7 @@ class _Silence:
     """The silence of a writer since it had published so many messages; `due`: the next heartbeat [s]."""
 
     writer: Writer
+    publisher: zenoh.Publisher
     published: int = 0
     heartbeats: int = 1  # in this silence, or as if
     due: float = float("inf")
@@ -43,7 +44,13 @@ class Heartbeats:
 
     def add(self, writer: Writer) -> None:
         """Send heartbeats from the writer's first message on."""
-        self._silences[writer] = _Silence(writer)
+        # Declared, so that nothing is sent while nobody reads it.
+        publisher = self.session.declare_publisher(
+            heartbeat_key(writer.key, writer.name),
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=writer.priority,
+        )
+        self._silences[writer] = _Silence(writer, publisher)
 
     def remove(self, writer: Writer) -> None:
         """Send no more heartbeats of a writer, if it has any."""
@@ -58,19 +65,11 @@ class Heartbeats:
                 silence.due = now + _PAUSES[0]
             elif silence.due <= now and left:
                 left -= 1
-                self._send(silence.writer)
+                with suppress(zenoh.ZError):  # the session is closed
+                    silence.publisher.put(heartbeat_payload(silence.published))
                 silence.heartbeats += 1
                 silence.due = now + _PAUSES[min(silence.heartbeats, len(_PAUSES) - 1)]
             if not silence.heartbeats:
                 pause = _LOOK
             soonest = min(soonest, silence.due)
         return min(pause, soonest - now)
-
-    def _send(self, writer: Writer) -> None:
-        with suppress(zenoh.ZError):  # the session is closed
-            self.session.put(
-                heartbeat_key(writer.key, writer.name),
-                heartbeat_payload(writer.published),
-                congestion_control=zenoh.CongestionControl.DROP,
-                priority=writer.priority,
-            )

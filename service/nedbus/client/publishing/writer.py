@@ -39,10 +39,10 @@ class Writer:
                 cache=zenoh.ext.CacheConfig(cache),
                 sample_miss_detection=NUMBERED,
             )
-        self._publisher: zenoh.ext.AdvancedPublisher | None = publisher
-        self.name = entity_name(publisher.id)
+            self._publisher: zenoh.ext.AdvancedPublisher | None = publisher
+            self.name = entity_name(publisher.id)
+            heartbeats.add(self)
         self._heartbeats = heartbeats
-        heartbeats.add(self)
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
         """Put a payload, with an encoding in place of the writer's if one is given; never wait for a reader."""
