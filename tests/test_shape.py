@@ -28,7 +28,8 @@ FLOORS = [
 ONLY_BY_FOLDER = {
     "zenoh": {
         "nedbus/transport": "session router queries zenoh_ext refusals write_probe",
-        "nedbus/client": "channels zenoh_subscriber follower decoder sample recovery rejections qos thinned_subscriber",
+        "nedbus/client": "sample qos", "nedbus/client/discovery": "services",
+        "nedbus/client/receiving": "receiver thinned_receiver decoder",
         "nedbus/client/publishing": "publisher publisher_registry writer flow_control heartbeats "
         "downsampler query_server",
         "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",

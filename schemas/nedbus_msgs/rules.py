@@ -72,7 +72,8 @@ def make_fast_check(indexes: Mapping[str, Any]) -> Callable[[Any], bool]:
         for index, bound in bounds:
             if abs(values[index]) > bound:
                 return False
-        return cast("bool", values[timestamp_sample] <= values[timestamp])
+        in_order: bool = values[timestamp_sample] <= values[timestamp]
+        return in_order
 
     return passes_rules
 

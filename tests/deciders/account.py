@@ -11,12 +11,8 @@ from typing import Final, NamedTuple, Protocol
 from unittest import mock
 
 from nedbus import Counts, Mode
-from nedbus.client import receive_queue, sequence_tracker
-from nedbus.client.decoder import Decoder
-from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.publisher_sequence import Hole
-from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.search import Search
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue, writer_proxy
+from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.transport import RawSample
 from nedbus_msgs import decode
 
@@ -74,40 +70,45 @@ class Account(Protocol):
     def held(self) -> int: ...
 
 
-class QueueAccount(ReceiveQueue):
-    """The account as ReceiveQueue keeps it."""
+class QueueAccount(PendingQueue):
+    """The account as PendingQueue keeps it, with a clock of the test's."""
 
-    known_faults = frozenset({LATE, PARTIAL, SHORTCUT, FORGOTTEN})
+    known_faults: frozenset[str] = frozenset()
 
     def __init__(self, setting: Setting) -> None:
-        super().__init__(setting.mode, Decoder(LayoutLookup(dict), prefix="nedbus"))
-        self._begins, self._searches = setting.begins, dict[Hole, Search]()
-        if setting.mode == "every":
-            self.recover(lambda hole: self._searches.update({hole: Search(hole, 0.0)}))
-        self._capacity = mock.patch.object(receive_queue, "CAPACITY", setting.capacity)
-        self._settled = mock.patch.object(sequence_tracker, "SETTLED", setting.settled)
+        self._begins, self._now = setting.begins, 0.0
+        decoder = Decoder(LayoutLookup(dict), prefix="nedbus")
+        super().__init__(setting.mode, decoder, clock=lambda: self._now)
+        self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
+        self._patience = mock.patch.object(writer_proxy, "_PATIENCE", 1e6)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        with self._capacity, self._settled:
+        with self._capacity:
             super().put(batch, overflowed=overflowed)
 
     def heartbeat(self, key: str, publisher: str, number: int) -> None:
-        self.beat(key, publisher, number, begins=self._begins)
+        self.on_heartbeat(key, publisher, number, begins=self._begins)
 
     def link(self, *, broken: bool) -> None:
-        self.unsettled_until = float("inf") if broken else 0.0
+        if broken:
+            self.on_link()
+        else:
+            self._now += 60.0
 
     def requests(self) -> list[Request]:
-        return [Request(hole, hole.publisher, search.numbers) for hole, search in self._searches.items()]
+        with self._patience:
+            self._now += 1.0
+            for writer in self.requesting:
+                self.next_request(writer, self._now)
+        asked = [(writer, writer.request.asked) for writer in self.requesting if writer.request is not None]
+        return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
-        assert isinstance(request.handle, Hole)
-        search = self._searches[request.handle]
-        search.found |= {sample.source_info.source_sn: sample for sample in samples if sample.source_info}
-        if final or search.complete:
-            del self._searches[search.hole]
-            with self._capacity, self._settled:
-                self.fill(search.hole, list(search.found.values()))
+        assert isinstance(request.handle, WriterProxy)
+        found = {sample.source_info.source_sn: sample for sample in samples if sample.source_info}
+        self._now += 1e7 if final else 0.0
+        with self._capacity:
+            self.on_retransmission(request.handle, found, ended=True, now=self._now)
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:

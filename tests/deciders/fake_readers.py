@@ -14,10 +14,10 @@ from typing import Final, cast
 import pytest
 import zenoh
 
+from nedbus.client.protocol import CLOSED
 from nedbus.client.publishing import flow_control as module
 from nedbus.client.publishing.flow_control import FlowControl, SharedWindow
 from nedbus.client.publishing.writer import Writer
-from nedbus.client.questions import CLOSED
 from nedbus.transport import LEASE
 
 from .raw_samples import Payload

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import SimpleNamespace
 from typing import cast
@@ -11,10 +12,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client.decoder import Decoder
-from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.sequence_tracker import SequenceTracker
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.transport import RawSample
 from nedbus_msgs import decode, encode, encoding_of
 from tests.messages import message
@@ -46,13 +44,8 @@ def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
 
 
 def name_of(publisher: str) -> str:
-    """Return what the sequence tracker calls a publisher."""
+    """Return what a reader calls a publisher."""
     return f"{publisher}:1"
-
-
-def follow(tracker: SequenceTracker, *numbers: int, stream: str = "key", publisher: str = "a") -> list[int]:
-    """Return what was lost just before each of these numbers."""
-    return [tracker.arrived(stream, source_info(number, publisher)) for number in numbers]
 
 
 def raw(
@@ -78,21 +71,22 @@ def junk(payload: bytes, key: str = KEY) -> RawSample:
     return raw(None, payload=Payload(payload), key=key)
 
 
-def miss(count: int, publisher: str = "a") -> zenoh.ext.Miss:
-    """Return Zenoh's announcement that messages of a publisher are lost."""
-    return cast("zenoh.ext.Miss", SimpleNamespace(source=SimpleNamespace(zid=publisher, eid=1), nb=count))
+def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> PendingQueue:
+    """Return an empty queue."""
+    return PendingQueue(mode, Decoder(LayoutLookup(dict), prefix="nedbus"), name="queue", clock=clock)
 
 
-def make_queue(mode: Mode, *, layouts: Mapping[int, Sequence[str]] | None = None) -> ReceiveQueue:
-    """Return an empty queue that knows these layouts besides PX4's."""
-    return ReceiveQueue(mode, Decoder(LayoutLookup(lambda: layouts or {}), prefix="nedbus"), name="queue")
+def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
+    """Put samples into a queue; what is missing is given up, as nobody has it."""
+    pending_queue.put(samples, overflowed=overflowed)
+    pending_queue.give_up()
 
 
-def drain(receive_queue: ReceiveQueue) -> list[nedbus.Sample]:
+def drain(pending_queue: PendingQueue) -> list[nedbus.Sample]:
     """Take all that is queued."""
-    return list(iter(partial(receive_queue.pop, decode), None))
+    return list(iter(partial(pending_queue.pop, decode), None))
 
 
-def timestamps(receive_queue: ReceiveQueue) -> list[int]:
+def timestamps(pending_queue: PendingQueue) -> list[int]:
     """Take all that is queued, and return the timestamp of each."""
-    return [sample.message.timestamp for sample in drain(receive_queue)]
+    return [sample.message.timestamp for sample in drain(pending_queue)]

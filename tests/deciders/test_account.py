@@ -7,7 +7,7 @@ from operator import attrgetter
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
 from nedbus import Mode
@@ -62,7 +62,7 @@ class AccountMachine(RuleBasedStateMachine):
 
 
 TestAccount = AccountMachine.TestCase
-TestAccount.settings = settings(stateful_step_count=40)
+TestAccount.settings = settings(stateful_step_count=40, phases=set(Phase) - {Phase.explain})  # which takes minutes
 
 SEEDS = [
     # It is read twice.

@@ -11,17 +11,14 @@ import pytest
 from hypothesis import given
 
 from nedbus import Counts, Mode
-from nedbus.client.decoder import Decoder
-from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.publisher_sequence import Hole
 from nedbus.client.qos import RATES
 from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
-from nedbus.client.thinned_queue import ThinnedQueue
-from nedbus.client.unthinned import PATIENCE, Unthinned
+from nedbus.client.receiving import Decoder, LayoutLookup, ThinnedQueue
+from nedbus.client.receiving.thinned_queue import PATIENCE
 from nedbus.errors import ConfigError
 from nedbus.transport import RawSample
 
-from .raw_samples import KEY, OTHER_KEY, drain, miss, name_of, raw, timestamps
+from .raw_samples import KEY, OTHER_KEY, drain, name_of, put, raw, timestamps
 
 THINNED = f"{KEY}/@rate/5"
 
@@ -46,15 +43,15 @@ def test_thinned_stream_passes_whole() -> None:
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
     assert queue.counts == Counts(received=5)
-    assert queue.heard == {KEY}
+    queue.on_token(KEY, 0.0, alive=True)
+    assert queue.unthinned(PATIENCE) == set()
 
 
 def test_gap_of_a_thinned_stream_is_lost() -> None:
-    """Its sequence numbers are its own: what is absent of them is counted to the message, announced or not."""
+    """Its sequence numbers are its own: what is absent of them is counted to the message behind it."""
     queue = make_queue()
-    queue.put([at(1.0, 0), at(1.2, 1), at(1.8, 4)])
-    queue.announce_loss(miss(3))
-    queue.put([at(2.6, 8)])
+    put(queue, [at(1.0, 0), at(1.2, 1), at(1.8, 4)])
+    put(queue, [at(2.6, 8)])
     assert [sample.lost for sample in drain(queue)] == [0, 0, 2, 3]
     assert queue.counts == Counts(received=4, lost=5)
 
@@ -62,15 +59,14 @@ def test_gap_of_a_thinned_stream_is_lost() -> None:
 def test_whole_stream_begins_with_now_after_a_break() -> None:
     """A reader turns to it when nobody sends it thinned: what its publisher keeps would take it back in time."""
     queue = make_queue()
-    holes: list[Hole] = []
-    queue.recover(holes.append)
-    queue.unsettled_until = math.inf
+    queue.on_link()
     queue.put([at(1.0, 50, key=KEY)])
-    queue.beat(OTHER_KEY, name_of("b"), 70, begins=False)
-    assert not holes
+    queue.on_heartbeat(OTHER_KEY, name_of("b"), 70, begins=False)
+    assert not queue.requesting
     assert timestamps(queue) == [1000]
     queue.put([at(2.0, 7, key=f"{OTHER_KEY}/@rate/5", publisher="c")])
-    assert [(hole.stream, hole.start, hole.stop) for hole in holes] == [(f"{OTHER_KEY}/@rate/5", 0, 7)]
+    [writer] = queue.requesting
+    assert (writer.stream.heard, queue.next_request(writer, 0.0)) == (f"{OTHER_KEY}/@rate/5", range(7))
 
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
@@ -80,21 +76,22 @@ def test_rest_is_thinned_here(mode: Mode) -> None:
     assert queue.rate == 1
     taken = []
     for number in (0, 1, 2, 4, 5, 6, 7, 8):
-        queue.put([at(10.0 + number, number, key=f"{KEY}/@rate/1")])
+        put(queue, [at(10.0 + number, number, key=f"{KEY}/@rate/1")])
         taken += [(sample.message.timestamp, sample.lost) for sample in drain(queue)]
     assert taken == [(10_000, 0), (12_000, 0), (14_000, 1), (16_000, 0), (18_000, 0)]
     assert queue.counts == Counts(received=5, lost=1)
-    queue.put([at(19.0, 10, key=f"{KEY}/@rate/1"), at(20.0, 11, key=f"{KEY}/@rate/1")])
+    put(queue, [at(19.0, 10, key=f"{KEY}/@rate/1"), at(20.0, 11, key=f"{KEY}/@rate/1")])
     assert [sample.lost for sample in drain(queue)] == [1]
 
 
 def test_whole_stream_is_thinned_here() -> None:
     """Of 100 Hz that nobody thins 5 Hz are queued; what is left out is not lost, and what is lost is."""
     queue = make_queue()
-    queue.put([at(number / 100, number, key=KEY) for number in range(1000) if number != 505])
+    put(queue, [at(number / 100, number, key=KEY) for number in range(1000) if number != 505])
     assert timestamps(queue) == list(range(0, 10_000, 200))
     assert queue.counts == Counts(received=50, lost=1)
-    assert not queue.heard
+    queue.on_token(KEY, 0.0, alive=True)
+    assert queue.unthinned(PATIENCE) == {KEY}
 
 
 def test_last_message_comes_once() -> None:
@@ -119,7 +116,7 @@ def test_restart_with_an_earlier_clock_passes() -> None:
 def test_message_without_a_timestamp_is_thinned_by_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plain publisher need not stamp; and a clock that stands still does not silence a stream."""
     now = [100_000_000_000]
-    monkeypatch.setattr("nedbus.client.thinned_queue.time", SimpleNamespace(monotonic_ns=lambda: now[0]))
+    monkeypatch.setattr("nedbus.client.receiving.thinned_queue.time", SimpleNamespace(monotonic_ns=lambda: now[0]))
     queue, standing = make_queue(), make_queue()
     for number in range(200):
         queue.put([raw(None, timestamp=number)])
@@ -130,26 +127,21 @@ def test_message_without_a_timestamp_is_thinned_by_arrival(monkeypatch: pytest.M
 
 
 def test_stream_is_read_whole_when_nobody_thins_it() -> None:
-    """One that is alive for a while and not heard thinned; a publisher that returns is waited for again.
-
-    Who asks for one stream alone reads it whole when nothing comes, as a plain publisher has no token.
-    """
-    unthinned = Unthinned(0.0)
-    unthinned.appeared("a", 0.0)
-    unthinned.appeared("b", 0.0)
-    assert unthinned.needed(set(), PATIENCE - 0.1) == set()
-    assert unthinned.needed({"b"}, PATIENCE) == {"a"}
-    assert unthinned.needed({"a", "b"}, PATIENCE) == set()
-    unthinned.gone("a", 10.0)
-    assert unthinned.needed({"b"}, 20.0) == set()
-    unthinned.appeared("a", 20.0)
-    assert unthinned.needed({"b"}, 20.0) == set()
-    assert unthinned.needed({"b"}, 20.0 + PATIENCE) == {"a"}
-    plain = Unthinned(0.0, always="a")
-    assert plain.needed(set(), PATIENCE) == {"a"}
-    plain.gone("a", 5.0)
-    assert plain.needed(set(), 5.0) == set()
-    assert plain.needed(set(), 5.0 + PATIENCE) == {"a"}
+    """One that is alive for a while and not heard thinned; a publisher that returns is waited for again."""
+    queue = make_queue()
+    for key in (KEY, OTHER_KEY):
+        queue.on_token(key, 0.0, alive=True)
+    queue.put([at(1.0, 0)])
+    assert queue.unthinned(PATIENCE - 0.1) == set()
+    queue.on_token(OTHER_KEY, 1.0, alive=True)  # told twice
+    assert queue.unthinned(PATIENCE) == {OTHER_KEY}
+    queue.put([at(1.0, 0, key=f"{OTHER_KEY}/@rate/5")])
+    assert queue.unthinned(PATIENCE) == set()
+    queue.on_token(OTHER_KEY, 10.0, alive=False)
+    assert queue.unthinned(20.0) == set()
+    queue.on_token(OTHER_KEY, 20.0, alive=True)
+    assert queue.unthinned(20.0) == set()
+    assert queue.unthinned(20.0 + PATIENCE) == {OTHER_KEY}
 
 
 def passed(rate: float, times: list[float]) -> list[float]:

@@ -7,16 +7,13 @@ from functools import partial
 from types import SimpleNamespace
 
 import nedbus
-from nedbus.client.decoder import Decoder
-from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.zenoh_subscriber import ZenohSubscriber
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
 from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept
 
 from .publishing import publish, take
 
 
-class LossyQueue(ReceiveQueue):
+class LossyQueue(PendingQueue):
     """A queue to which the messages `missing`, by sequence number, do not come."""
 
     def __init__(self) -> None:
@@ -31,13 +28,11 @@ class LossyQueue(ReceiveQueue):
 class Lossy:
     """A subscription with a lossy queue, and its questions: so many `unanswered`, as those that a router drops."""
 
-    def __init__(
-        self, session: Session, queue: LossyQueue, subscriber: ZenohSubscriber, publisher: nedbus.Publisher
-    ) -> None:
+    def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session
         self.publish = partial(publish, publisher)
         self.queue = queue
-        self.subscription = nedbus.Subscription(subscriber, queue, name="lossy", owner=None)
+        self.subscription = nedbus.Subscription(receiver, queue, name="lossy", owner=None)
         self.receive = partial(take, self.subscription)
         self.asked: list[tuple[str, int, int]] = []
         self.unanswered = 0

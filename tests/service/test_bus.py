@@ -106,7 +106,7 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
         asked.append(key_expr)
         return ask_alive_keys(session, key_expr, timeout=timeout)
 
-    monkeypatch.setattr("nedbus.client.vehicle_directory.ask_alive_keys", ask)
+    monkeypatch.setattr("nedbus.client.discovery.vehicle_directory.ask_alive_keys", ask)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
@@ -137,7 +137,8 @@ def test_incomplete_list_of_vehicles_is_said(
 ) -> None:
     """With more tokens than are kept, or a router that is too slow to list them, what is known is no whole list."""
     monkeypatch.setattr(
-        "nedbus.client.vehicle_directory.ask_alive_keys", lambda *_, timeout: ([f"nedbus/1/@alive/{VLP}"], False)
+        "nedbus.client.discovery.vehicle_directory.ask_alive_keys",
+        lambda *_, timeout: ([f"nedbus/1/@alive/{VLP}"], False),
     )
     assert list(bus.vehicles()) == list(bus.vehicles()) == ["1"]
     assert len([text for text in caplog.messages if "not all liveliness tokens are known" in text]) == 1
@@ -218,7 +219,7 @@ def test_status_that_grows_when_it_is_read_fills_no_memory(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """JSON may take up 30 times its length: of 480 kB, what is beyond 4 MiB is left out, and that is logged."""
-    monkeypatch.setattr("nedbus.client.discovery._MAX_CONTENT", 2**22, raising=False)
+    monkeypatch.setattr("nedbus.client.discovery.services._MAX_CONTENT", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
     with answering(raw, "nedbus/@service/*/status", services_of(many)):

@@ -16,10 +16,7 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.client.decoder import Decoder
-from nedbus.client.layout_lookup import LayoutLookup
-from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.zenoh_subscriber import ZenohSubscriber
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
 from nedbus.transport import Session, open_router
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
@@ -179,8 +176,8 @@ def test_collecting_garbage_never_closes() -> None:
             with lock:
                 closed.append(threading.current_thread())
 
-    queue = ReceiveQueue("latest", Decoder(LayoutLookup(dict), prefix="nedbus"))
-    subscription = nedbus.Subscription(cast("ZenohSubscriber", Subscriber()), queue, name="", owner=None)
+    queue = PendingQueue("latest", Decoder(LayoutLookup(dict), prefix="nedbus"))
+    subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, name="", owner=None)
     with lock:  # as a thread holds it that is in the midst of something
         del subscription
         gc.collect()  # a closing in this thread would wait for the lock for ever

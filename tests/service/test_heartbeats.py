@@ -7,7 +7,7 @@ from contextlib import closing
 import zenoh
 
 import nedbus
-from nedbus.client.channels import take_all
+from nedbus.client.receiving.receiver import take_all
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
 from nedbus_msgs import decode
 from tests.messages import VLP

@@ -17,7 +17,7 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
-from nedbus.client.unthinned import Unthinned
+from nedbus.client.receiving import ThinnedQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
 from tests.messages import VLP, message
@@ -258,7 +258,7 @@ def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let readers give up the wait for a thinned stream at once."""
-    monkeypatch.setattr("nedbus.client.unthinned.PATIENCE", 0.0)
+    monkeypatch.setattr("nedbus.client.receiving.thinned_queue.PATIENCE", 0.0)
 
 
 def test_publisher_of_an_older_nedbus(
@@ -324,13 +324,13 @@ def test_vehicle_that_thins_is_never_read_whole(
 ) -> None:
     """Who sends thinned is not read whole, also when the last message was long ago."""
     looks: list[set[str]] = []
-    needed = Unthinned.needed
+    unthinned = ThinnedQueue.unthinned
 
-    def look(unthinned: Unthinned, heard: set[str], now: float) -> set[str]:
-        looks.append(needed(unthinned, heard, now))
+    def look(queue: ThinnedQueue, now: float) -> set[str]:
+        looks.append(unthinned(queue, now))
         return looks[-1]
 
-    monkeypatch.setattr(Unthinned, "needed", look)
+    monkeypatch.setattr(ThinnedQueue, "unthinned", look)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
     with caplog.at_level(logging.WARNING), bus.subscribe(VLP, max_rate=5) as subscription:
@@ -338,7 +338,7 @@ def test_vehicle_that_thins_is_never_read_whole(
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)
         assert take(subscription, 1) == [2]
-        monkeypatch.setattr("nedbus.client.unthinned.PATIENCE", 0.0)
+        monkeypatch.setattr("nedbus.client.receiving.thinned_queue.PATIENCE", 0.0)
         before = len(looks)
         wait_for(lambda: len(looks) > before + 1, what="a look at streams that nobody thins")
         assert not any(looks)

@@ -15,10 +15,10 @@ import zenoh
 
 import nedbus
 from nedbus import Counts
-from nedbus.client import recovery as module
-from nedbus.client.channels import take_all
-from nedbus.client.decoder import WAKE_UP
-from nedbus.client.zenoh_subscriber import ZenohSubscriber
+from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
+from nedbus.client.receiving.decoder import WAKE_UP
+from nedbus.client.receiving.receiver import take_all
 from nedbus.transport import KeptAnswers, Session, ask_kept, open_client, open_router
 from nedbus_msgs import encode, encoding_of
 from tests.messages import VLP, message
@@ -33,12 +33,21 @@ KEY = f"nedbus/7/{VLP}"
 
 
 @pytest.fixture
-def lossy(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[Lossy]:
+def housekeeping() -> Iterator[Housekeeping]:
+    """Run the thread that a session's receivers share."""
+    with closing(Housekeeping()) as thread:
+        yield thread
+
+
+@pytest.fixture
+def lossy(
+    endpoint: str, bus: nedbus.Bus, housekeeping: Housekeeping, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Lossy]:
     """Subscribe to all vehicles, and wait until the one that publishes knows it."""
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
-        lossy = Lossy(session, queue, ZenohSubscriber(session, f"nedbus/*/{VLP}", queue), publisher)
-        monkeypatch.setattr(module, "ask_kept", lossy.ask)
+        lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue, housekeeping=housekeeping), publisher)
+        monkeypatch.setattr(retransmission, "ask_kept", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -58,13 +67,13 @@ def test_what_is_missing_is_asked_for_by_the_exact_key(lossy: Lossy, unanswered:
     assert lossy.subscription.counts == Counts(received=7)
 
 
-def test_answer_that_is_not_whole_is_the_last(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A publisher that sends the newest one has no more: the rest is lost, without another question."""
+def test_what_a_publisher_keeps_no_more_is_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A publisher that sends the newest one has no more: the rest is lost, once it was asked for a second time."""
 
     def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> KeptAnswers:
-        return ask_kept(session, key, name, numbers[-2:], timeout=timeout)
+        return ask_kept(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
 
-    monkeypatch.setattr(module, "ask_kept", forget)
+    monkeypatch.setattr(retransmission, "ask_kept", forget)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]
@@ -76,7 +85,7 @@ def test_publisher_that_keeps_nothing_is_asked_once(
     lossy: Lossy, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another program numbers its messages, and has no cache: after one wait in vain it is asked once for a hole."""
-    monkeypatch.setattr(module, "_PATIENCE", 0.2)
+    monkeypatch.setattr(writer_proxy, "_PATIENCE", 0.2)
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
     foreign = zenoh.ext.declare_advanced_publisher(raw, key, sample_miss_detection=misses)
@@ -97,11 +106,11 @@ def test_publisher_that_keeps_nothing_is_asked_once(
 
 def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that was silent has lost nothing by that once it has answered."""
-    monkeypatch.setattr(module, "_PATIENCE", 0.2)
+    monkeypatch.setattr(writer_proxy, "_PATIENCE", 0.2)
     lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
     lossy.publish(0, 1, 2)
     assert lossy.receive(2) == [0, 2]
-    monkeypatch.setattr(module, "_PATIENCE", DEADLINE)
+    monkeypatch.setattr(writer_proxy, "_PATIENCE", DEADLINE)
     lossy.unanswered = 0
     lossy.publish(3, 4)
     assert lossy.receive(2) == [3, 4]
@@ -111,7 +120,9 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypa
 
 
 @pytest.mark.parametrize("waits", ["without", "with a timeout"])
-def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, waits: str) -> None:
+def test_newest_message_is_recovered_by_heartbeat(
+    lossy: Lossy, raw: Session, housekeeping: Housekeeping, waits: str
+) -> None:
     """No message comes after it, and whoever waits without a timeout waits for Zenoh's channel, where nothing comes.
 
     What wakes that one is no message for other readers of its session, and does not leave the process.
@@ -120,7 +131,7 @@ def test_newest_message_is_recovered_by_heartbeat(lossy: Lossy, raw: Session, wa
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
     foreign = raw.declare_subscriber(KEY, seen)
     lossless = LossyQueue()
-    other = ZenohSubscriber(lossy.session, KEY, lossless)
+    other = Receiver(lossy.session, KEY, lossless, housekeeping=housekeeping)
 
     def read() -> None:
         if waits == "without":
@@ -159,7 +170,7 @@ def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, when: str) -> None:
+def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, housekeeping: Housekeeping, when: str) -> None:
     """More answers than were asked for: the session goes on receiving, also after its reader has closed."""
     asked = threading.Event()
 
@@ -178,7 +189,7 @@ def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, when: str)
         else:
             assert lossy.receive(3) == [0, 1, 2]
         queue = LossyQueue()
-        other = ZenohSubscriber(lossy.session, KEY, queue)
+        other = Receiver(lossy.session, KEY, queue, housekeeping=housekeeping)
 
         def goes_on() -> bool:
             lossy.publish(7)
@@ -201,7 +212,7 @@ def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> Non
     lossy.publish(3)
     assert lossy.receive(1) == [3]
     assert {key for key, _, _ in lossy.asked} == {KEY}
-    assert not lossy.queue.incomplete
+    assert not lossy.queue.requesting
 
 
 def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Session) -> None:
@@ -215,28 +226,33 @@ def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Se
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
-        assert lossy.queue.incomplete  # the others still wait
+        assert lossy.queue.requesting  # the others still wait
         taken.clear()
 
 
-def test_recovery_that_ends_holds_nothing(
-    lossy: Lossy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A bug may end its thread: then what is missing is lost at once, and counted, and the reader goes on."""
-    monkeypatch.setattr(threading, "excepthook", lambda _: None)
-    with monkeypatch.context() as patched:
-        patched.setattr(module.Recovery, "notice_links", fail)
-        wait_for(lambda: "nedbus-recovery" not in {each.name for each in threading.enumerate()}, what="its end")
-    assert "recovery ends after an unexpected error" in caplog.text
-    lossy.queue.missing = {1}
-    lossy.publish(0, 1, 2)
-    assert lossy.receive(2) == [0, 2]
-    assert lossy.subscription.counts == Counts(received=2, lost=1)
+def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pytest.LogCaptureFixture) -> None:
+    """A bug in what one subscription needs is logged once, and keeps neither it nor any other from what is due."""
+    calls: list[float] = []
+
+    def fail_at_first(now: float) -> float:
+        calls.append(now)
+        return 0.0 if len(calls) > 2 else 1 / 0
+
+    def go_on(now: float) -> float:
+        others.append(now)
+        return 0.01
+
+    others: list[float] = []
+    ends = [housekeeping.add(fail_at_first), housekeeping.add(go_on)]
+    wait_for(lambda: len(calls) > 5 and len(others) > 5, what="both")
+    for end in ends:
+        end()
+    assert sum("unexpected error" in text for text in caplog.messages) == 1
 
 
 def test_only_so_many_questions_are_open(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """What 60 vehicles miss at the same moment is asked for a few at a time, and all of it comes."""
-    monkeypatch.setattr(module, "_OPEN", 4)
+    monkeypatch.setattr(retransmission, "_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
         wait_for_subscriber(publisher)
@@ -253,14 +269,14 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
-    wait_for(lambda: lossy.queue.incomplete, what="the hole")
+    wait_for(lambda: lossy.queue.requesting, what="the hole")
     lossy.subscription.close()
     assert lossy.subscription.counts.lost == 2
 
 
 def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(module, "_HELD", 50)
+    monkeypatch.setattr(pending_queue, "_HELD_OF_KEY", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
@@ -269,7 +285,7 @@ def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyP
 
 def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is recovered does not push out what a slow reader has not read yet."""
-    monkeypatch.setattr(module, "_BEHIND", 5)
+    monkeypatch.setattr(retransmission, "_BEHIND", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(lambda: (lossy.queue.waiting, lossy.queue.held) == (10, 9), what="what comes before the hole and after it")
@@ -282,8 +298,12 @@ def test_unexpected_error_costs_what_caused_it(
     lossy: Lossy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A bug that a recovered message triggers is logged, the message is lost, and the reader goes on."""
-    fill = lossy.queue.fill
-    monkeypatch.setattr(lossy.queue, "fill", lambda hole, found: fail() if found else fill(hole, found))
+    take = lossy.queue.on_retransmission
+    monkeypatch.setattr(
+        lossy.queue,
+        "on_retransmission",
+        lambda writer, found, **options: fail() if found else take(writer, found, **options),
+    )
     lossy.queue.missing = {1}
     lossy.publish(0, 1, 2)
     assert lossy.receive(2) == [0, 2]

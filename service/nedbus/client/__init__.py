@@ -4,24 +4,20 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
-from .async_bus import AsyncBus
-from .async_publisher import AsyncPublisher
-from .async_subscription import AsyncSubscription
-from .bus import Bus
-from .connect import connect, connect_async, connect_with
-from .health import Health, StreamHealth
-from .histogram import Histogram
+from .async_bus import AsyncBus, AsyncPublisher, connect_async
+from .bus import Bus, connect, connect_with
+from .discovery.services import RejectionReport, Rejections
+from .health.histogram import Histogram
+from .health.stream_health import Health, Monitor, StreamHealth
+from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
 from .housekeeping import Housekeeping
-from .monitor import Monitor
 from .publishing.heartbeats import HEARTBEAT
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
 from .rate_gate import check_max_rate
-from .rejections import RejectionReport, Rejections
 from .sample import Counts, Mode, Sample
-from .stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
-from .subscription import Subscription
+from .subscription import AsyncSubscription, Subscription
 
 if TYPE_CHECKING:
     from .batch import Batch

@@ -1,20 +1,27 @@
-"""The bus for asyncio: the twin of Bus."""
+"""The bus and its publishers for asyncio: the twins of Bus and Publisher."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
 
 from nedbus.errors import ClosedError
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
+from nedbus.settings import load_settings
+from nedbus.transport import Tls
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Row, Selection, VehicleLocalPosition, vehicle_name
 
-from .async_publisher import AsyncPublisher
-from .async_subscription import AsyncSubscription
-from .bus import Bus
-from .rejections import Rejections
+from .bus import Bus, connect_with
+from .discovery.services import Rejections
+from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import Mode, Sample
+from .subscription import AsyncSubscription
+
+if TYPE_CHECKING:
+    from nedbus_msgs.arrays import MessageArray
 
 
 class AsyncBus:
@@ -60,9 +67,9 @@ class AsyncBus:
     ) -> AsyncSubscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
         bus = self._opened()
-        receive_queue = bus._make_queue(selection, mode, max_rate)
+        pending_queue = bus._make_queue(selection, mode, max_rate)
         name = selection.key_expr(prefix=bus.prefix)
-        return AsyncSubscription(lambda: bus._open_subscriber(selection, receive_queue), receive_queue, name=name)
+        return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue, name=name)
 
     async def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
@@ -120,3 +127,67 @@ class AsyncBus:
         if self._bus is None:
             raise ClosedError
         return self._bus
+
+
+def connect_async(
+    endpoint: str | Sequence[str] | None = None,
+    *,
+    timeout: float | None = 3.0,
+    prefix: str | None = None,
+    tls: Tls | None = None,
+    config: str | Path | None = None,
+) -> AsyncBus:
+    """Return a bus for asyncio, to be opened with `async with`; arguments and errors are those of `connect`."""
+    load = partial(load_settings, config, connect=endpoint, prefix=prefix)
+    return AsyncBus(lambda stop: connect_with(load(), timeout=timeout, tls=tls, stop=stop))
+
+
+class AsyncPublisher:
+    """Publish the messages of one address from asyncio; get one from `await bus.publisher(...)`.
+
+    The twin of Publisher, with the same attributes and errors, and its methods awaited.
+    What may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) waits in a thread, and other
+    tasks of the event loop go on; await one call before the next.
+    """
+
+    def __init__(self, publisher: Publisher) -> None:
+        self.address, self.key = publisher.address, publisher.key
+        self.source, self.lossless = publisher.source, publisher.lossless
+        self._publisher = publisher
+
+    @property
+    def published(self) -> int:
+        """How many messages it has published."""
+        return self._publisher.published
+
+    async def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
+        """Validate a message, or the fields of one by name, and publish it, as `Publisher.publish` does."""
+        if self.lossless:
+            await asyncio.to_thread(self._publisher.publish, message)
+        else:
+            self._publisher.publish(message)
+
+    async def publish_row(self, values: Sequence[object] | Row) -> None:
+        """Validate the values of all fields in PX4's order, and publish them, as `Publisher.publish_row` does."""
+        if self.lossless:
+            await asyncio.to_thread(self._publisher.publish_row, values)
+        else:
+            self._publisher.publish_row(values)
+
+    async def publish_many(self, messages: MessageArray) -> None:
+        """Validate the messages in a structured array, and publish them, as `Publisher.publish_many` does."""
+        await asyncio.to_thread(self._publisher.publish_many, messages)
+
+    async def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
+        """Wait until all readers of mode "every" have what was published, as `Publisher.flush` does."""
+        return await asyncio.to_thread(self._publisher.flush, timeout)
+
+    async def close(self) -> None:
+        """Stop publishing this address, as `Publisher.close` does."""
+        await asyncio.to_thread(self._publisher.close)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()

@@ -13,14 +13,12 @@ import numpy.typing as npt
 from nedbus_msgs import PAYLOAD_SIZE, Address, Provenance, decode_row
 from nedbus_msgs.arrays import MessageArray, decode_array
 
-from .decoder import Arrival, Decoder
+from .receiving.decoder import Arrival, Decoder
 
 
 @dataclass(eq=False)
 class Batch:
-    """Messages that arrived together, in the order of their arrival; get one from `subscription.batches()`.
-
-    All are valid.
+    """Valid messages that arrived together, in that order; get one from `subscription.batches()`.
 
     `messages`: structured array of shape (n,) and dtype DTYPE, a column for each field: `messages["x"]`.
     `addresses`: the addresses that occur; `address_index`: for each message, the index of its address among them.
@@ -41,9 +39,8 @@ class Batch:
 
     def of(self, address: Address) -> MessageArray:
         """Return the messages of one address."""
-        if address not in self.addresses:
-            return self.messages[:0]
-        chosen: MessageArray = self.messages[self.address_index == self.addresses.index(address)]
+        index = self.addresses.index(address) if address in self.addresses else -1
+        chosen: MessageArray = self.messages[self.address_index == index]
         return chosen
 
     @cached_property
@@ -67,9 +64,8 @@ class Batch:
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
     received = time.time_ns()
-    payloads = [payload for _, payload, _, _ in arrivals]
-    if set(map(len, payloads)) != {PAYLOAD_SIZE}:
-        payloads = [payload if len(payload) == PAYLOAD_SIZE else bytes(PAYLOAD_SIZE) for payload in payloads]
+    blank = bytes(PAYLOAD_SIZE)  # in the place of another layout, invalid, so that it is decoded by itself
+    payloads = [payload if len(payload) == PAYLOAD_SIZE else blank for _, payload, _, _ in arrivals]
     messages, valid = decode_array(b"".join(payloads))
     if not valid.all():
         for index in np.flatnonzero(~valid).tolist():

@@ -1,39 +1,38 @@
-"""The bus as scripts see it: subscribe, ask, publish; blocking."""
+"""The bus as scripts see it: connect, subscribe, ask, publish; blocking."""
 
 from __future__ import annotations
 
+import threading
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from pathlib import Path
 from typing import Self
 
 from nedbus.errors import ClosedError, NedbusError
+from nedbus.settings import Settings, load_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, DEFAULT_TOPIC, PAYLOAD_SIZE, Address, Selection, decode, vehicle_name
 
 from .closing import Finalizer
-from .decoder import Decoder
-from .discovery import find_layouts, find_services
+from .discovery.services import Rejections, find_layouts, find_services
+from .discovery.vehicle_directory import VehicleDirectory
 from .housekeeping import Housekeeping
-from .layout_lookup import LayoutLookup
+from .protocol import LIVE
 from .publishing.publisher import Publisher
-from .publishing.publisher_registry import LIVE, PublisherRegistry
+from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receive_queue import ReceiveQueue
-from .rejections import Rejections
+from .receiving import Decoder, LayoutLookup, PendingQueue, Receiver, ThinnedQueue, ThinnedReceiver
 from .sample import Mode, Sample
 from .subscription import Subscription
-from .thinned_queue import ThinnedQueue
-from .thinned_subscriber import ThinnedSubscriber
-from .vehicle_directory import VehicleDirectory
-from .zenoh_subscriber import ZenohSubscriber
 
 
 class Bus:
     """A connection to a router, from `connect`.
 
     Topics and vehicles are selected by name, instances by number; "*" and None stand for any; vehicle 7 is "7".
+    Without a topic it is vehicle_local_position.
     All methods may be called from any thread; an invalid name raises AddressError, a closed bus ClosedError.
     """
 
@@ -42,14 +41,15 @@ class Bus:
         self.routers = tuple(routers)
         self._tls = tls
         self._session = session
-        self._queries = QueryServer(session)
         self._housekeeping = Housekeeping()
+        self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(session, prefix=prefix)
         self._layouts = LayoutLookup(partial(find_layouts, session, prefix=prefix))
-        self._subscribers: weakref.WeakSet[ZenohSubscriber] = weakref.WeakSet()
-        close = partial(_close, session, self._queries, self._housekeeping, self._layouts, self._subscribers)
-        self._finalizer = Finalizer(self, close)
+        self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
+        # In the reverse order: an open question for layouts ends with the session.
+        closes = self._layouts.close, session.close, self._housekeeping.close, self._queries.close
+        self._finalizer = Finalizer(self, partial(_close, self._receivers, closes))
 
     @property
     def connected(self) -> bool:
@@ -68,7 +68,6 @@ class Bus:
     ) -> Subscription:
         """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
 
-        Without a topic it is vehicle_local_position; "*" is all four topics.
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
@@ -86,35 +85,33 @@ class Bus:
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
     ) -> Subscription:
         """Subscribe to a selection of addresses, as `subscribe` does."""
-        receive_queue = self._make_queue(selection, mode, max_rate)
-        subscriber = self._open_subscriber(selection, receive_queue)
-        return Subscription(subscriber, receive_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
+        pending_queue = self._make_queue(selection, mode, max_rate)
+        receiver = self._open_receiver(selection, pending_queue)
+        return Subscription(receiver, pending_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
 
     def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
     ) -> list[Sample]:
         """Return the last sample of each key, sorted by address; `latency` is then its age.
 
-        Without a topic it is vehicle_local_position; "*" is all four topics.
         It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
         The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
         self._require_open()
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
-        decoder = self._make_decoder()
-        newest: dict[Address, Sample] = {}
+        decoder = Decoder(self._layouts, prefix=self.prefix)
+        samples: list[Sample] = []
         answers = query(self._session, key_expr, timeout=timeout, newest=False)
         self._layouts.learn(raw.payload.to_bytes() for raw in answers if len(raw.payload) != PAYLOAD_SIZE)
         for raw in answers:
             for arrival in decoder.admit([raw]):
                 sample = decoder.decode(arrival, decode)
-                if sample is None:
-                    continue
-                sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
-                other = newest.get(sample.address)
-                if other is None or _rank(sample) > _rank(other):
-                    newest[sample.address] = sample
-        return sorted(newest.values(), key=lambda sample: sample.address)
+                if sample is not None:
+                    sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
+                    samples.append(sample)
+        samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))  # the last one of each address counts
+        newest = {sample.address: sample for sample in samples}
+        return [newest[address] for address in sorted(newest)]
 
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
         """Return the vehicles that are published now, and the addresses of each; `latest` has their messages.
@@ -184,47 +181,66 @@ class Bus:
         if not self._finalizer.alive:
             raise ClosedError
 
-    def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> ReceiveQueue:
+    def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> PendingQueue:
         """Return the queue of a new subscription; AsyncBus uses it too."""
         self._require_open()
-        decoder, name = self._make_decoder(), selection.key_expr(prefix=self.prefix)
+        decoder, name = Decoder(self._layouts, prefix=self.prefix), selection.key_expr(prefix=self.prefix)
         if max_rate is None:
-            return ReceiveQueue(mode, decoder, name=name)
+            return PendingQueue(mode, decoder, name=name)
         return ThinnedQueue(mode, decoder, max_rate=max_rate, name=name)
 
-    def _open_subscriber(self, selection: Selection, receive_queue: ReceiveQueue) -> ZenohSubscriber:
+    def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
         self._require_open()
-        if isinstance(receive_queue, ThinnedQueue):
-            subscriber: ZenohSubscriber = ThinnedSubscriber(self._session, selection, receive_queue, prefix=self.prefix)
+        session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
+        receiver: Receiver
+        if isinstance(pending_queue, ThinnedQueue):
+            receiver = ThinnedReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
         else:
-            subscriber = ZenohSubscriber(self._session, selection.key_expr(prefix=self.prefix), receive_queue)
-        self._subscribers.add(subscriber)
+            receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue, housekeeping=housekeeping)
+        self._receivers.add(receiver)
         if not self._finalizer.alive:  # closed meanwhile, by another thread
-            subscriber.close()
+            receiver.close()
             raise ClosedError
-        return subscriber
-
-    def _make_decoder(self) -> Decoder:
-        return Decoder(self._layouts, prefix=self.prefix)
+        return receiver
 
 
-def _rank(sample: Sample) -> tuple[bool, int]:
-    """Order samples of one address: those of a publisher are above stored ones, later ones above earlier ones."""
-    return not sample.stored, sample.sent or 0
+def connect(
+    endpoint: str | Sequence[str] | None = None,
+    *,
+    timeout: float | None = 3.0,
+    prefix: str | None = None,
+    tls: Tls | None = None,
+    config: str | Path | None = None,
+) -> Bus:
+    """Connect to a router and return a bus; use it as a context manager, or drop it: it closes itself.
+
+    `endpoint` is Zenoh's, such as tcp/192.168.1.5:7447, or several of which the first that answers is taken.
+    Without it, NEDBUS_CONNECT or `connect` in nedbus.toml decides, else it is the router of this host's `nedbus serve`.
+    `timeout` is how long to try [s]; None waits until Ctrl-C. Later breaks of the link are reconnected by themselves.
+    `tls` is for tls/ endpoints; without it, the settings decide. `config` names a file instead of nedbus.toml.
+
+    Raises ConnectError when nothing answers, ConfigError for an invalid setting.
+    """
+    return connect_with(load_settings(config, connect=endpoint, prefix=prefix), timeout=timeout, tls=tls)
 
 
-def _close(
-    session: Session,
-    queries: QueryServer,
-    housekeeping: Housekeeping,
-    layouts: LayoutLookup,
-    subscribers: weakref.WeakSet[ZenohSubscriber],
-) -> None:
-    with ExitStack() as closing:  # whatever fails, the rest is closed as well
-        closing.callback(layouts.close)  # which ends with the session
-        closing.callback(session.close)
-        closing.callback(housekeeping.close)
-        closing.callback(queries.close)
-        for subscriber in list(subscribers):
-            closing.callback(subscriber.close)
+def connect_with(
+    settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
+) -> Bus:
+    """Connect as settings say, with `tls` in place of theirs if it is given; errors are those of `connect`.
+
+    Setting `stop` ends the wait for a router, with ConnectError.
+    """
+    tls = tls or settings.tls
+    session = open_client(settings.routers, timeout=timeout, tls=tls, stop=stop)
+    return Bus(session, routers=settings.routers, prefix=settings.prefix, tls=tls)
+
+
+def _close(receivers: Iterable[Receiver], closes: Iterable[Callable[[], object]]) -> None:
+    """Close the receivers, then the rest, the last first; if one fails, the others are closed as well."""
+    with ExitStack() as closing:
+        for close in closes:
+            closing.callback(close)
+        for receiver in list(receivers):
+            closing.callback(receiver.close)

@@ -18,9 +18,9 @@ _log = logging.getLogger(__name__)
 
 _DRAIN: Final = 2.0  # s that the end of a process waits for what is being closed
 _pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # may be filled in the midst of anything
-_finalizers: weakref.WeakSet[Finalizer] = weakref.WeakSet()
+_owners: weakref.WeakSet[object] = weakref.WeakSet()
 _start = threading.Lock()
-_closer: list[threading.Thread] = []
+_closer: list[threading.Thread] = []  # made when it is started: a fork marks a thread as stopped
 
 
 class Finalizer:
@@ -32,9 +32,8 @@ class Finalizer:
     """
 
     def __init__(self, owner: object, close: Callable[[], object]) -> None:
-        self.owner = weakref.ref(owner)
         self._close = close
-        _finalizers.add(self)
+        _owners.add(owner)
         self._finalize = weakref.finalize(owner, _close_later, close)
         with _start:
             if not _closer:
@@ -81,10 +80,8 @@ def _drain() -> None:
 
 def _after_fork() -> None:
     """Never drop what a forked process inherited: Zenoh's objects hang when they are dropped there."""
-    for finalizer in list(_finalizers):
-        owner = finalizer.owner()
-        if owner is not None:
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
+    for owner in list(_owners):
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
 
 
 os.register_at_fork(after_in_child=_after_fork)

@@ -3,38 +3,30 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
 from nedbus.errors import ConfigError
 
 from .qos import RATES
 
-_EARLY: Final = 2_500_000  # ns
-
 
 class RateGate:
-    """Let at most `rate` messages a second pass.
-
-    A message passes when it is due, and the next one is due a period after that moment, not after the message: of
-    100 Hz to 30 Hz messages come 30 or 40 ms apart, and 30 a second. So the mean is the rate, or that of the stream
-    where that is less, while the stream has no pause of more than two periods. After such a pause two messages may
-    pass at once: in T seconds never more than rate x (T + 2.5 ms) + 2.
-    """
+    """Let at most `rate` messages a second pass: in T seconds rate x (T + 2.5 ms) + 2, two at once after a pause."""
 
     def __init__(self, rate: float) -> None:
-        self._period = math.ceil(1e9 / rate)
-        # Messages are due a moment before they come: of 100 Hz to 5 Hz each 20th passes, whatever their jitter.
-        self._early = min(_EARLY, self._period // 10)
-        self._due: int | None = None
+        self._period = math.ceil(1e9 / rate)  # ns
+        # Messages are due up to 2.5 ms before they come: of 100 Hz to 5 Hz each 20th passes, whatever their jitter.
+        self._early = min(2_500_000, self._period // 10)
+        self._due = math.inf
 
     def passes(self, now: int) -> bool:
         """Return whether a message at `now`, in nanoseconds of any clock, passes."""
         due = self._due
-        if due is not None and due - 2 * self._period <= now < due:
+        if due - 2 * self._period <= now < due:
             return False
-        if due is None or now < due:  # the first, or the clock was set back: a vehicle restarted
+        if now < due:  # the first, or the clock was set back: a vehicle restarted
             self._due = now + self._period - self._early
         else:
+            # Not a period after this message: of 100 Hz to 30 Hz pass 30 a second, 30 or 40 ms apart.
             self._due = max(due + self._period, now - self._early)
         return True
 

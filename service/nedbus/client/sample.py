@@ -12,9 +12,7 @@ from nedbus_msgs import FIELD_TYPES, Address, Provenance, Row, VehicleLocalPosit
 if TYPE_CHECKING:
     import zenoh
 
-Mode = Literal["latest", "every"]
-"""How a reader that is slower than the data is treated: it gets the newest message of each key, or every message."""
-
+Mode = Literal["latest", "every"]  # of each key a slow reader gets the newest message, or every message
 M_co = TypeVar("M_co", bound=VehicleLocalPosition | Row, default=VehicleLocalPosition, covariant=True)
 
 _UNKNOWN: Final = Provenance()
@@ -92,8 +90,7 @@ class Sample(Generic[M_co]):
         return type(self), self._state()
 
     def _state(self) -> tuple[object, ...]:
-        facts = (self.message, self.address, self.received, None, self.lost, self.provenance, self.stored)
-        return (*facts, self.sent)
+        return self.message, self.address, self.received, None, self.lost, self.provenance, self.stored, self.sent
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +101,7 @@ class Counts:
     `lost`: lost in transit, and not recovered.
     `dropped`: arrived, but not read in time: superseded in mode "latest", beyond 65,536 that wait in mode "every".
     `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
-    `discarded`: came twice, or too late, as somebody sends under the id of another publisher, perhaps; mode "every".
+    `discarded`: came twice, or too late, as somebody sends under the id of another publisher, perhaps.
     """
 
     received: int = 0

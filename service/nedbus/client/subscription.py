@@ -1,41 +1,38 @@
-"""A subscription as a script iterates over it, blocking."""
+"""A subscription as a reader iterates over it: blocking, or with asyncio."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.transport import require_unforked
 from nedbus_msgs import Row, VehicleLocalPosition, decode, decode_row
 
 from .closing import Finalizer
-from .receive_queue import ReceiveQueue
+from .receiving import PendingQueue, Receiver
 from .sample import Counts, Sample
-from .zenoh_subscriber import ZenohSubscriber
 
 if TYPE_CHECKING:
     from .batch import Batch
 
+_YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop run
 _T = TypeVar("_T")
 
 
-class Subscription:
-    """Iterate over the samples of a subscription; get one from `bus.subscribe(...)`.
+class _SubscriptionBase:
+    """What does not depend on how a reader waits: name, counts, and the forms of a message."""
 
-    Iteration waits for the next sample and ends when the subscription or the bus is closed.
-    It is closed when it is no longer referenced, and at the end of the process.
-    """
-
-    def __init__(self, subscriber: ZenohSubscriber, receive_queue: ReceiveQueue, *, name: str, owner: object) -> None:
+    def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
         self.name = name
-        self._queue = receive_queue
-        self._subscriber = subscriber
-        self._owner = owner  # the bus stays open for as long as somebody may read
-        self._finalizer = Finalizer(self, subscriber.close)
+        self._queue = pending_queue
+        self._pop = partial(pending_queue.pop, decode)
+        self._pop_row = partial(pending_queue.pop, decode_row)
 
     @property
     def counts(self) -> Counts:
@@ -47,12 +44,26 @@ class Subscription:
         """How many messages have arrived and wait to be read."""
         return self._queue.waiting
 
+
+class Subscription(_SubscriptionBase):
+    """Iterate over the samples of a subscription; get one from `bus.subscribe(...)`.
+
+    Iteration waits for the next sample and ends when the subscription or the bus is closed.
+    It is closed when it is no longer referenced, and at the end of the process.
+    """
+
+    def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, name: str, owner: object) -> None:
+        super().__init__(pending_queue, name=name)
+        self._receiver = receiver
+        self._owner = owner  # the bus stays open for as long as somebody may read
+        self._finalizer = Finalizer(self, receiver.close)
+
     def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
         """Wait for the next sample and return it.
 
         Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
         """
-        return self._next(partial(self._queue.pop, decode), timeout)
+        return self._next(self._pop, timeout)
 
     def receive_batch(self, timeout: float | None = None) -> Batch:
         """Wait for at least one message, and return all that have arrived, as one array; errors as of `receive`."""
@@ -60,7 +71,7 @@ class Subscription:
 
     def rows(self) -> Iterator[Sample[Row]]:
         """Iterate over the same samples with a Row, a named tuple, as `message`: faster, with the same checks."""
-        return self._each(partial(self._queue.pop, decode_row))
+        return self._each(self._pop_row)
 
     def batches(self) -> Iterator[Batch]:
         """Iterate over NumPy arrays of what arrived meanwhile, up to 4096 messages at once, with the same checks."""
@@ -75,7 +86,7 @@ class Subscription:
 
     def __next__(self) -> Sample[VehicleLocalPosition]:
         try:
-            return self.receive()
+            return self._next(self._pop)
         except ClosedError:
             raise StopIteration from None
 
@@ -85,28 +96,125 @@ class Subscription:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _next(self, pop: Callable[[], _T | None], timeout: float | None) -> _T:
+    def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
         require_unforked()
         deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
         if self._queue.newest_only:
-            self._subscriber.receive()  # what is queued may not be the newest any more
+            self._receiver.receive()  # what is queued may not be the newest any more
         while True:
             if self._queue.ended:
                 raise ClosedError
             item = pop()
             if item is not None:
                 return item
-            if not self._subscriber.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
+            if not self._receiver.wait(None if deadline is None else max(0.0, deadline - time.monotonic())):
                 raise NoDataError(self.name, timeout or 0.0)
 
     def _each(self, pop: Callable[[], _T | None]) -> Iterator[_T]:
-        receive_queue, subscriber = self._queue, self._subscriber
+        with suppress(ClosedError):
+            while True:
+                yield self._next(pop)
+
+
+class AsyncSubscription(_SubscriptionBase):
+    """Iterate over the samples of a subscription from asyncio; get one from `bus.subscribe(...)`.
+
+    The twin of Subscription, with `async for`, `await receive()` and `await close()`; it opens at its first use, and
+    belongs to the event loop of that moment.
+    """
+
+    def __init__(self, open_receiver: Callable[[], Receiver], pending_queue: PendingQueue, *, name: str) -> None:
+        super().__init__(pending_queue, name=name)
+        self._open_receiver = open_receiver
+        self._finalizer: Finalizer | None = None
+        self._opening: asyncio.Task[None] | None = None
+        self._arrival = asyncio.Event()
+        self._taken = 0
+
+    async def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
+        """Wait for the next sample and return it; `timeout` and errors are those of `Subscription.receive`."""
+        return await self._next(self._pop, timeout)
+
+    async def receive_batch(self, timeout: float | None = None) -> Batch:
+        """Wait for at least one message, and return all, as `Subscription.receive_batch` does."""
+        return await self._next(self._queue.pop_batch, timeout)
+
+    def rows(self) -> AsyncIterator[Sample[Row]]:
+        """Iterate over rows as `Subscription.rows` does."""
+        return self._each(self._pop_row)
+
+    def batches(self) -> AsyncIterator[Batch]:
+        """Iterate over NumPy arrays as `Subscription.batches` does."""
+        return self._each(self._queue.pop_batch)
+
+    async def close(self) -> None:
+        """End the subscription; a second call does nothing."""
+        self._queue.end()
+        if self._opening is not None:
+            await asyncio.wait([self._opening])
+        if self._finalizer is not None:
+            await asyncio.to_thread(self._finalizer.close_now)
+
+    def __aiter__(self) -> AsyncIterator[Sample[VehicleLocalPosition]]:
+        return self
+
+    async def __anext__(self) -> Sample[VehicleLocalPosition]:
+        try:
+            return await self._next(self._pop)
+        except ClosedError:
+            raise StopAsyncIteration from None
+
+    async def __aenter__(self) -> Self:
+        await self._open()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()
+
+    async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
+        self._taken += 1
+        if self._taken % _YIELD_AFTER == 0:
+            await asyncio.sleep(0)  # a reader that always finds a sample would never yield to other tasks
+        try:
+            async with asyncio.timeout(timeout):
+                await self._open()
+                while True:
+                    self._arrival.clear()
+                    if self._queue.ended:
+                        raise ClosedError
+                    item = pop()
+                    if item is not None:
+                        return item
+                    await self._arrival.wait()
+        except TimeoutError:
+            raise NoDataError(self.name, timeout or 0.0) from None
+
+    async def _each(self, pop: Callable[[], _T | None]) -> AsyncIterator[_T]:
+        with suppress(ClosedError):
+            while True:
+                yield await self._next(pop)
+
+    async def _open(self) -> None:
+        """Wait until it is open; giving up the wait does not end the opening, which others, or `close`, wait for."""
         require_unforked()
-        while not receive_queue.ended:
-            if receive_queue.newest_only:
-                subscriber.receive()  # what is queued may not be the newest any more
-            item = pop()
-            if item is None:
-                subscriber.wait(None)
-            else:
-                yield item
+        loop, opening = asyncio.get_running_loop(), self._opening
+        if opening is not None and opening.get_loop() is not loop:
+            raise RuntimeError(f"the subscription to {self.name} belongs to another event loop: subscribe in this one")
+        if self._finalizer is not None or self._queue.ended:
+            return
+        if opening is None or opening.done():
+            opening = self._opening = loop.create_task(self._open_in(loop))
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # perhaps nobody waits for it
+        await asyncio.shield(opening)
+
+    async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._queue.on_wake = partial(_wake, loop, self._arrival)
+        receiver = await asyncio.to_thread(self._open_receiver)
+        receiver.pump()
+        self._finalizer = Finalizer(self, receiver.close)
+
+
+def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:
+    """Wake the reader, from any thread; a method would keep the subscription alive."""
+    with suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        loop.call_soon_threadsafe(arrival.set)

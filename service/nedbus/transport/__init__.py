@@ -13,6 +13,7 @@ from .queries import (
     Answers,
     alive_keys,
     ask,
+    ask_alive,
     ask_alive_keys,
     query,
 )
@@ -104,6 +105,7 @@ __all__ = [
     "Verdict",
     "alive_keys",
     "ask",
+    "ask_alive",
     "ask_alive_keys",
     "ask_kept",
     "ask_routers",

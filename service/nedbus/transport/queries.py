@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Final
 
@@ -116,6 +116,13 @@ def _size(sample: RawSample) -> int:
     return len(sample.payload) + len(str(sample.key_expr))
 
 
+def ask_alive(session: Session, key_expr: str, *, timeout: float) -> Answers:
+    """Ask for the liveliness tokens that match, and return at once; one token is in each answer that has no error."""
+    channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_TOKENS)
+    with while_open():
+        return Answers(session.liveliness().get(key_expr, channel, timeout=zenoh_timeout(timeout)))
+
+
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
     """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
     return ask_alive_keys(session, key_expr, timeout=timeout)[0]
@@ -123,9 +130,7 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 
 def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
     """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
-    with while_open():
-        channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_TOKENS)
-        answers = Answers(session.liveliness().get(key_expr, channel, timeout=zenoh_timeout(timeout)))
+    answers = ask_alive(session, key_expr, timeout=timeout)
     keys: set[str] = set()
     failed = False  # Zenoh reports a timeout as an error
     size = 0
@@ -147,7 +152,7 @@ class AliveChanges:
             subscriber = session.liveliness().declare_subscriber(key_expr, channel)
         self.missed = False
         """Whether more tokens changed than are kept until they are taken: all have to be asked for again."""
-        self.close = subscriber.undeclare
+        self.undeclare: Callable[[], object] = subscriber.undeclare
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
 
     def take(self) -> list[tuple[str, bool]]:

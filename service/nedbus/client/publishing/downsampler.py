@@ -1,16 +1,15 @@
-"""Downsampled copies of a stream: published beside it, on keys of their own, for readers with a maximum rate.
+"""Downsampled copies of a stream, one for each of RATES, while readers with a maximum rate subscribe to it.
 
-`<key>/@rate/5` has at most 5 messages a second of `<key>`, with sequence numbers and a cache of their own: what is left
-out is no gap, and what is lost is one. There is one for each of RATES, and only while it has subscribers.
-A vehicle whose downsampled streams have none costs one declaration; a stream declares more once that one is matched.
+`<key>/@rate/5` has at most 5 messages a second of `<key>`, with sequence numbers and a cache of its own.
+A vehicle without such readers costs one declaration; a stream declares more once that one is matched.
 """
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 from typing import Final
 
 import zenoh
@@ -23,8 +22,7 @@ from nedbus_msgs import ANY, Address
 from .heartbeats import Heartbeats
 from .writer import Writer
 
-_CACHE: Final = 20.0  # s of messages that are kept for readers that missed some
-_MIN_CACHE: Final = 20  # messages
+_CACHE: Final = 20  # s of messages that are kept for readers that missed some
 _LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come back, and get what they missed
 
 
@@ -37,12 +35,12 @@ class MatchingListener:
             self._probe = session.declare_publisher(key_expr)
             self._listener = self._probe.declare_matching_listener(channel)  # begins with how it is now
         self._matched = False
-        self._taking = threading.Lock()
+        self._lock = threading.Lock()  # all publishers of a vehicle share one
         self._take = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
         """Return whether there are subscribers, as far as Zenoh has told."""
-        with self._taking:  # all publishers of a vehicle share one
+        with self._lock:
             try:
                 if (status := self._take()) is not None:
                     self._matched = status.matching
@@ -58,14 +56,12 @@ class MatchingListener:
 
 
 class Downsampler:
-    """Publish the messages of one address at lower rates; `vehicle` follows all downsampled streams of its vehicle.
-
-    For use from one thread at a time, that of the publisher.
-    """
+    """Publish one address at lower rates, from one thread; `vehicle` follows all downsampled streams of its vehicle."""
 
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
-        self.vehicle = vehicle
-        self._heartbeats, self._address, self._prefix = heartbeats, address, prefix
+        self.vehicle, self._heartbeats = vehicle, heartbeats
+        self._key = partial(address.rate_key, prefix=prefix)
+        self._priority = TOPIC_QOS[address.topic].priority
         self._any_rate: MatchingListener | None = None
         self._streams: list[_Stream] = []
 
@@ -78,8 +74,7 @@ class Downsampler:
         now = time.monotonic_ns()  # not the message's time: a replay at ten times the speed would fill a link
         is_matched = self._any_rate.is_matched()
         if is_matched and not self._streams:
-            priority = TOPIC_QOS[self._address.topic].priority
-            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, priority) for rate in RATES]
+            self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._priority) for rate in RATES]
         for stream in self._streams:
             stream.put(now, payload, stamp, encoding)
         if not is_matched and not any(stream.writer for stream in self._streams):
@@ -94,9 +89,6 @@ class Downsampler:
             self._any_rate.close()
         self._any_rate = None
 
-    def _key(self, rate: int | str) -> str:
-        return self._address.rate_key(rate, prefix=self._prefix)
-
     def _close_streams(self) -> None:
         for stream in self._streams:
             stream.close()
@@ -108,30 +100,23 @@ class _Stream:
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, priority: zenoh.Priority) -> None:
         self.writer: Writer | None = None
-        self._heartbeats, self._key, self._rate, self._priority = heartbeats, key, rate, priority
         self._listener = MatchingListener(heartbeats.session, key)
-        self._gate = RateGate(rate)
+        self._open = partial(Writer, heartbeats, key, priority=priority, cache=_CACHE * rate)
+        self._rate, self._gate = rate, RateGate(rate)
         self._matched_at = 0
 
     def put(self, now: int, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
         if self._listener.is_matched():
             self._matched_at = now
             if self.writer is None:
-                self._gate = RateGate(self._rate)
-                cache = max(_MIN_CACHE, math.ceil(_CACHE * self._rate))
-                self.writer = Writer(self._heartbeats, self._key, priority=self._priority, cache=cache)
-        if self.writer is None or not self._gate.passes(now):
-            return
-        if now - self._matched_at > _LINGER:
-            self._withdraw()
-        else:
+                self.writer, self._gate = self._open(), RateGate(self._rate)
+        if self.writer is not None and now - self._matched_at > _LINGER:
+            self.writer.close()
+            self.writer = None
+        if self.writer is not None and self._gate.passes(now):
             self.writer.put(payload, stamp, encoding)  # without a subscriber this only fills the cache
 
     def close(self) -> None:
-        self._withdraw()
-        self._listener.close()
-
-    def _withdraw(self) -> None:
         if self.writer is not None:
             self.writer.close()
-        self.writer = None
+        self._listener.close()

@@ -1,10 +1,8 @@
-"""Heartbeats: the number of the newest message of each stream that has fallen silent, for readers that missed it.
-
-While a stream goes on, the next message shows by its number that one was lost.
-"""
+"""Heartbeats: the number of the newest message of each stream that has fallen silent, for readers that missed it."""
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -17,22 +15,20 @@ if TYPE_CHECKING:
     from .writer import Writer
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and before those that follow it
-_LOOK: Final = 0.1  # s between two looks while messages are published
-_IDLE: Final = 0.5  # s between two looks otherwise
+_LOOK, _IDLE = 0.1, 0.5  # s between two looks: while messages are published, and otherwise
 _TURN: Final = 256  # heartbeats at once, as a job of housekeeping must not hold up the others
 HEARTBEAT: Final = _PAUSES[0] + _LOOK
 """Seconds after which a reader learns that it missed the newest message, of a stream that went on until then."""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(slots=True)
 class _Silence:
-    """The silence of a writer since it had published so many messages; `due`: the next heartbeat [s]."""
+    """The silence of a writer since it had `published` so many messages; it begins with the first."""
 
-    writer: Writer
     publisher: zenoh.Publisher
     published: int = 0
-    heartbeats: int = 1  # in this silence, or as if
-    due: float = float("inf")
+    sent: int = 1  # heartbeats in this silence
+    due: float = math.inf  # s, the next one
 
 
 class Heartbeats:
@@ -43,14 +39,10 @@ class Heartbeats:
         self._silences: dict[Writer, _Silence] = {}
 
     def add(self, writer: Writer) -> None:
-        """Send heartbeats from the writer's first message on."""
-        # Declared, so that nothing is sent while nobody reads it.
-        publisher = self.session.declare_publisher(
-            heartbeat_key(writer.key, writer.name),
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=writer.priority,
-        )
-        self._silences[writer] = _Silence(writer, publisher)
+        """Send heartbeats from the writer's first message on; they are declared, so that only readers cost one."""
+        key, drop = heartbeat_key(writer.key, writer.name), zenoh.CongestionControl.DROP
+        publisher = self.session.declare_publisher(key, congestion_control=drop, priority=writer.priority)
+        self._silences[writer] = _Silence(publisher)
 
     def remove(self, writer: Writer) -> None:
         """Send no more heartbeats of a writer, if it has any."""
@@ -58,18 +50,15 @@ class Heartbeats:
 
     def send_due(self, now: float) -> float:
         """Send what is due at this time, in monotonic seconds; return the seconds until the next look."""
-        pause, soonest, left = _IDLE, now + _IDLE, _TURN
-        for silence in tuple(self._silences.values()):
-            if silence.published != silence.writer.published:
-                silence.published, silence.heartbeats = silence.writer.published, 0
-                silence.due = now + _PAUSES[0]
+        pause, left = _IDLE, _TURN
+        for writer, silence in tuple(self._silences.items()):
+            if silence.published != writer.published:
+                silence.published, silence.sent, silence.due = writer.published, 0, now + _PAUSES[0]
             elif silence.due <= now and left:
                 left -= 1
                 with suppress(zenoh.ZError):  # the session is closed
                     silence.publisher.put(heartbeat_payload(silence.published))
-                silence.heartbeats += 1
-                silence.due = now + _PAUSES[min(silence.heartbeats, len(_PAUSES) - 1)]
-            if not silence.heartbeats:
-                pause = _LOOK
-            soonest = min(soonest, silence.due)
-        return min(pause, soonest - now)
+                silence.sent += 1
+                silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
+            pause = min(pause, silence.due - now, _IDLE if silence.sent else _LOOK)
+        return pause

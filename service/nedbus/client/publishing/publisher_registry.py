@@ -13,6 +13,7 @@ import zenoh
 from pydantic_core import to_json
 
 from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
@@ -28,8 +29,6 @@ _log = logging.getLogger(__name__)
 
 _TOKENS_TIMEOUT: Final = 2.0  # s for a router that is slow to say which publishers it knows; it takes milliseconds
 _FLUSH_LOOK: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
-LIVE: Final = b"live"
-"""Attachment of a publisher's answer with its last message, which that of a storage does not have."""
 
 
 class PublisherRegistry:
@@ -43,10 +42,8 @@ class PublisherRegistry:
         self, session: Session, queries: QueryServer, housekeeping: Housekeeping, *, prefix: str, is_client: bool
     ) -> None:
         self.prefix = prefix
-        self._session = session
+        self._session, self._queries, self._housekeeping = session, queries, housekeeping
         self._is_client = is_client
-        self._queries = queries
-        self._housekeeping = housekeeping
         self._heartbeats = Heartbeats(session)
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
@@ -66,16 +63,17 @@ class PublisherRegistry:
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
-            if address.vehicle not in self._downsampled:
-                key_expr = Selection(vehicle=address.vehicle).rate_key_expr(ANY, prefix=self.prefix)
-                self._downsampled[address.vehicle] = MatchingListener(self._session, key_expr)
+            vehicle = address.vehicle
+            if vehicle not in self._downsampled:
+                key_expr = Selection(vehicle=vehicle).rate_key_expr(ANY, prefix=self.prefix)
+                self._downsampled[vehicle] = MatchingListener(self._session, key_expr)
             publisher = Publisher(
                 address,
                 prefix=self.prefix,
                 lossless=lossless,
                 source=source,
                 heartbeats=self._heartbeats,
-                downsampled=self._downsampled[address.vehicle],
+                downsampled=self._downsampled[vehicle],
                 window=self._window,
                 needs_router=self._is_client,
                 on_close=lambda: self._forget(address),
@@ -85,10 +83,9 @@ class PublisherRegistry:
             if not self._vehicles:
                 self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
                 self._housekeeping.add(self._heartbeats.send_due)
-            if address.vehicle not in self._vehicles:
-                self._vehicles.add(address.vehicle)
-                key_expr = f"{self.prefix}/{address.vehicle}/**"
-                self._queries.answer(key_expr, _weakly(self._last_messages, address.vehicle))
+            if vehicle not in self._vehicles:
+                self._vehicles.add(vehicle)
+                self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._last_messages, vehicle))
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -136,9 +133,8 @@ class PublisherRegistry:
 
     def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:
-            if publisher.last is None or publisher.address.vehicle != vehicle:
-                continue
-            if query.key_expr.intersects(publisher.key):
+            is_asked = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
+            if is_asked and publisher.last is not None:
                 payload, stamp, encoding = publisher.last
                 yield Answer(publisher.key, payload, encoding, stamp, LIVE)
 
@@ -146,12 +142,7 @@ class PublisherRegistry:
 def _weakly(last_messages: Callable[[str, zenoh.Query], Iterable[Answer]], vehicle: str) -> Reply:
     """Return an answer that does not keep the registry, its publishers and their bus alive."""
     method = weakref.WeakMethod(last_messages)
-
-    def reply(query: zenoh.Query) -> Iterable[Answer]:
-        alive = method()
-        return alive(vehicle, query) if alive is not None else ()
-
-    return reply
+    return lambda query: alive(vehicle, query) if (alive := method()) is not None else ()
 
 
 def _schema() -> Mapping[str, object]:

@@ -47,8 +47,7 @@ class QueryServer:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._queryables: list[zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
-        self._handlers: list[tuple[zenoh.Handler[zenoh.Query], Reply]] = []
+        self._replies: list[tuple[zenoh.Queryable[zenoh.Handler[zenoh.Query]], zenoh.Handler[zenoh.Query], Reply]] = []
         self._ended = threading.Event()
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -58,8 +57,7 @@ class QueryServer:
         channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
             queryable = self._session.declare_queryable(key_expr, channel)
-        self._queryables.append(queryable)
-        self._handlers.append((queryable.handler, reply))
+        self._replies.append((queryable, queryable.handler, reply))
         with self._starting:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
@@ -74,14 +72,14 @@ class QueryServer:
         self._ended.set()
         if self._thread is not None:
             self._thread.join(_JOIN)
-        for queryable in self._queryables:
+        for queryable, _, _ in self._replies:
             with suppress(zenoh.ZError):
                 queryable.undeclare()
 
     def _run(self) -> None:
         busy_until = 0.0
         while not self._ended.wait(_POLL if time.monotonic() < busy_until else _IDLE_POLL):
-            for handler, reply in list(self._handlers):
+            for _, handler, reply in list(self._replies):
                 with suppress(zenoh.ZError):  # the session is closed
                     for _ in range(_TURN):
                         query = handler.try_recv()

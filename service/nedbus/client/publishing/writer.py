@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import Final
 
 import zenoh
 from zenoh import Priority
@@ -13,8 +12,6 @@ from nedbus.transport import entity_name, while_open
 
 from .heartbeats import Heartbeats
 
-NUMBERED: Final = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
-
 
 class Writer:
     """Put payloads on one key; `cache` messages are kept for readers that missed some."""
@@ -22,27 +19,22 @@ class Writer:
     def __init__(
         self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
     ) -> None:
-        self.session = session = heartbeats.session
-        self.key = key
-        self.priority = priority
-        self.published = 0
+        self.session, self.key, self.priority, self.published = heartbeats.session, key, priority, 0
+        self._heartbeats = heartbeats
         with while_open():
-            # A router remembers where to send what comes on a key that it knows as such; of any other it finds out for
-            # each message, which is most of what one costs where several routers are joined.
-            self._token = session.liveliness().declare_token(key)
-            publisher = zenoh.ext.declare_advanced_publisher(
-                session,
+            # Joined routers look up the way of each message anew, unless something is declared on its very key.
+            self._token = self.session.liveliness().declare_token(key)
+            self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(
+                self.session,
                 key,
                 encoding=encoding,
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=priority,
                 cache=zenoh.ext.CacheConfig(cache),
-                sample_miss_detection=NUMBERED,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None),
             )
-            self._publisher: zenoh.ext.AdvancedPublisher | None = publisher
-            self.name = entity_name(publisher.id)
+            self.name = entity_name(self._publisher.id)
             heartbeats.add(self)
-        self._heartbeats = heartbeats
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
         """Put a payload, with an encoding in place of the writer's if one is given; never wait for a reader."""

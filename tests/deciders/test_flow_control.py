@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from nedbus.client.channels import CHANNEL
 from nedbus.client.publishing.flow_control import KEPT, WINDOW, FlowControl, SharedWindow
-from nedbus.client.receive_queue import CAPACITY
+from nedbus.client.receiving.pending_queue import CAPACITY
+from nedbus.client.receiving.receiver import RING
 from nedbus.errors import ClosedError
 from nedbus.transport import LEASE
 
@@ -32,7 +32,7 @@ def control(world: World, monkeypatch: pytest.MonkeyPatch) -> FlowControl:
 
 def test_limits_fit_into_each_other() -> None:
     """What is sent without an acknowledgement is still kept for recovery, and fits into the queue of each reader."""
-    assert WINDOW < LIMIT < KEPT < CHANNEL < CAPACITY
+    assert WINDOW < LIMIT < KEPT < RING < CAPACITY
     assert LIMIT + WINDOW == KEPT
 
 
@@ -57,7 +57,7 @@ def test_reader_that_keeps_up_is_not_waited_for(world: World, control: FlowContr
 def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, control: FlowControl) -> None:
     """2,000 messages at once, then 10 a second for others, until no more are kept; then nothing at all.
 
-    It is connected and therefore never given up; it is asked every 10 s, and again after 0.5, 1, 2 and 4 s.
+    It is connected and therefore never given up; it is asked again after 0.5, 1, 2, 4 and 8 s, and then every 10 s.
     """
     world.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
@@ -66,7 +66,7 @@ def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, con
     assert world.sent[WINDOW - 1] == pytest.approx(0.2)
     steps = [later - earlier for earlier, later in pairwise(world.sent[WINDOW:])]
     assert steps == pytest.approx([0.1] * len(steps), abs=0.011)
-    assert len(world.asked) == pytest.approx(5 * END / 10, rel=0.05)
+    assert len(world.asked) == pytest.approx(5 + END / 10, rel=0.05)
 
 
 def test_window_is_shared_while_it_is_used() -> None:
@@ -150,12 +150,12 @@ def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> 
 @pytest.mark.parametrize("rate", [math.inf, 5_000.0])
 @pytest.mark.parametrize(
     ("interrupt", "begin", "end"),
-    [(World.cut, 0.1, 2.1), (World.restart_router, 0.1003, 4.5), (World.stop, 0.5, 60.5)],
+    [(World.cut, 0.1, 2.1), (World.restart_router, 0.1003, 4.5), (World.stop, 0.5, 60.5), (World.stop, 0.0, 90.0)],
 )
 def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a table
     world: World, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
 ) -> None:
-    """Its link was reset, the router restarted, or it was stopped for a minute: the publisher has waited for it.
+    """Its link was reset, the router restarted, or it was stopped, perhaps before it ever answered.
 
     Others get ten messages a second meanwhile, and everything soon after.
     """
@@ -168,18 +168,23 @@ def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a
 
 
 @pytest.mark.parametrize(
-    ("interrupt", "least", "most"),
-    [(World.restart_router, 2.0 + 6.0 - 0.3, 2.0 + 6.0 + 0.5), (World.stop, LEASE + 90.0, LEASE + 90.0 + 3.5)],
+    ("interrupt", "at", "seconds"),
+    [
+        (World.cut, 0.1003, 5.0),
+        (World.restart_router, 0.1003, 1.0 + 5.0),
+        (World.stop, 0.1003, LEASE + 90.0),
+        (World.stop, 0.0, LEASE + 90.0),
+    ],
 )
 def test_reader_that_does_not_come_back_is_given_up(
-    world: World, control: FlowControl, interrupt: Interrupt, least: float, most: float
+    world: World, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """5 s after the router is back, or 90 s after its lease ended; others get ten messages a second until then."""
+    """5 s after it or the router is back, or 90 s after its lease ended; others get ten a second until then."""
     reader = Reader("gone", rate=5_000.0)
     world.readers += [reader, Reader("fast")]
-    interrupt(world, reader, 0.1003, until=math.inf)
+    interrupt(world, reader, at, until=math.inf)
     world.publish(control, 20_000)
-    assert least < world.now < most
+    assert seconds - 0.3 < world.now - 18_000 / 10_000.0 < seconds + 1.0
     assert world.longest_pause() < 0.2
 
 
@@ -195,6 +200,7 @@ def test_no_time_runs_while_there_is_no_router(world: World, control: FlowContro
     world.plan(away, lambda: world.routers.append("r2"))
     world.plan(away + 3.0, lambda: setattr(reader, "alive", True))
     assert lead_over(world, control, reader, away + 2.99) < LIMIT
+    assert world.now < away + 3.0 + 20_000 / 10_000.0 + 0.2
 
 
 @pytest.mark.parametrize(("rate", "published"), [(0.0, 10_000.0), (100.0, 10_000.0), (math.inf, 200.0)])
@@ -209,6 +215,16 @@ def test_reader_that_is_stopped_at_any_time_is_waited_for(
     while world.now < second + 60.0:
         world.publish(control, 1, rate=published)
     assert world.published - reader.read < LIMIT
+
+
+def test_reader_that_ended_beside_a_stuck_one_is_given_up_after_5_seconds(world: World, control: FlowControl) -> None:
+    """It had answered the request that is still open: the stuck one may have been stopped, not this one."""
+    stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
+    world.readers += [stuck, ended]
+    world.plan(10.0, lambda: setattr(ended, "closed", True))
+    world.plan(20.0, lambda: setattr(stuck, "rate", math.inf))
+    world.publish(control, 10_000)
+    assert world.now < 20.0 + 5.0 + 1.5
 
 
 def test_closed_session_ends_the_wait(world: World, control: FlowControl) -> None:

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import pytest
 
-from nedbus.client import questions as module
-from nedbus.client.questions import Question, Questions
-from nedbus.client.receive_queue import ReceiveQueue
-from nedbus.client.sequence_tracker import SequenceTracker
+from nedbus.client.receiving.acknowledgements import MAX_PENDING, AckRequest
 from nedbus.transport import RawSample
 from nedbus_msgs import decode
 
-from .raw_samples import INVALID, Payload, follow, make_queue, miss, name_of, raw
+from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, raw
 
 
 @dataclass
 class Asked:
     """A queue that is asked, and the names of the questions that were answered, in order."""
 
-    queue: ReceiveQueue = field(default_factory=lambda: make_queue("every"))
+    now: float = 0.0
     answered: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.queue = make_queue("every", clock=lambda: self.now)
 
     def ask(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> list[str]:
         """Ask the queue, and return what is answered so far."""
-        self.queue.ask(self.question(number, read=read, publisher=publisher, name=name))
+        reply = partial(self.answered.append, name or str(number))
+        self.queue.add(AckRequest(KEY, name_of(publisher), number, read, reply))
+        return self.answered
+
+    def take(self, count: int) -> list[str]:
+        """Read samples, and return what is answered so far."""
+        assert all(self.queue.pop(decode) for _ in range(count))
         return self.answered
 
     def put(self, *samples: RawSample) -> list[str]:
@@ -34,67 +40,49 @@ class Asked:
         self.queue.put(samples)
         return self.answered
 
-    def question(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> Question:
-        return Question(name_of(publisher), number, read, lambda: self.answered.append(name or str(number)))
-
 
 @pytest.fixture
 def asked() -> Asked:
     return Asked()
 
 
-def settled(questions: Questions, *, arrived: int = 0, taken: int = 0, drained: bool = False) -> list[int]:
-    """Return the numbers of the questions that can be answered now."""
-    return [each.number for each in questions.settle(arrived=arrived, taken=taken, drained=drained)]
-
-
 def test_read_is_answered_when_all_up_to_it_was_taken(asked: Asked) -> None:
     """With `read` the reader must have taken whatever was queued when the message had arrived."""
-    tracker = SequenceTracker()
-    questions = Questions(tracker)
-    follow(tracker, 0)
-    questions.add(asked.question(1, read=True))
-    assert settled(questions, arrived=1, taken=1, drained=True) == []  # it is still on its way
-    follow(tracker, 1)
-    assert settled(questions, arrived=5, taken=4) == []
-    assert settled(questions, arrived=9, taken=4) == []  # what comes later need not be taken
-    assert settled(questions, arrived=9, taken=5) == [1]
+    asked.put(raw(0))
+    asked.ask(1, read=True)
+    assert asked.take(1) == []  # it is still on its way
+    asked.put(raw(0, publisher="b"), raw(1))
+    asked.put(raw(2))
+    assert asked.take(1) == []
+    assert asked.take(1) == ["1"]  # what comes later need not be taken
 
 
 def test_unknown_publisher_is_answered_once_all_is_queued(asked: Asked) -> None:
-    """It sent nothing to this reader, which is certain only when nothing is left in the channel.
+    """It sent nothing to this reader, which is certain only when nothing is left in the ring.
 
     Its message may be among what was queued at that moment: with `read` all of that has to be taken.
     """
-    questions = Questions(SequenceTracker())
-    questions.add(asked.question(5))
-    questions.add(asked.question(6, read=True))
-    assert settled(questions, drained=False) == []
-    assert settled(questions, arrived=3, taken=1, drained=True) == [5]
-    assert settled(questions, arrived=3, taken=3) == [6]
+    asked.ask(5, publisher="b")
+    assert asked.ask(6, publisher="b", read=True) == []
+    assert asked.put(raw(0), raw(1)) == ["5"]
+    assert asked.take(1) == ["5"]
+    assert asked.take(1) == ["5", "6"]
 
 
-def test_questions_of_several_publishers_are_answered_apart(asked: Asked) -> None:
-    """None waits for another."""
-    tracker = SequenceTracker()
-    questions = Questions(tracker)
-    follow(tracker, 0, publisher="a")
-    follow(tracker, 0, 1, 2, publisher="b")
-    for publisher, number in [("a", 1), ("b", 2), ("c", 3)]:
-        questions.add(asked.question(number, publisher=publisher))
-    assert settled(questions) == [2]
-    assert settled(questions, drained=True) == [3]
-    assert [each.number for each in questions.take_all()] == [1]
-    assert not questions
+def test_publishers_are_answered_apart(asked: Asked) -> None:
+    """None waits for another, nor is one on another key taken for it, whatever its name."""
+    asked.put(raw(0), raw(0, publisher="b"), raw(1, publisher="b"))
+    asked.ask(1)
+    assert asked.ask(1, publisher="b", name="b") == ["b"]
+    assert asked.put(raw(0, key=OTHER_KEY), raw(1, key=OTHER_KEY)) == ["b"]
 
 
-def test_of_too_many_questions_the_oldest_is_forgotten(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_too_many_requests_the_oldest_is_forgotten(asked: Asked) -> None:
     """No peer can make a reader remember more: an honest one asks again."""
-    monkeypatch.setattr(module, "MAX_PENDING", 3)
-    questions = Questions(SequenceTracker())
-    for number in range(5):
-        questions.add(asked.question(number))
-    assert settled(questions, drained=True) == [2, 3, 4]
+    asked.put(raw(0))
+    for number in range(1, MAX_PENDING + 3):
+        asked.ask(number)
+    assert len(asked.put(*map(raw, range(1, MAX_PENDING + 3)))) == MAX_PENDING
 
 
 def test_queue_answers_when_the_message_is_put(asked: Asked) -> None:
@@ -130,21 +118,29 @@ def test_queue_answers_unknown_publishers_while_nothing_is_left_to_receive(asked
 def test_unknown_publisher_is_not_answered_while_its_messages_may_still_come(asked: Asked) -> None:
     """After a break of the link a publisher that is not known has sent something that heartbeats bring soon."""
     asked.queue.idle = True
-    asked.queue.unsettled_until = math.inf
+    asked.queue.on_link()
     asked.ask(1)
     assert asked.put(raw(0, publisher="b")) == []
     assert asked.put(raw(0), raw(1)) == ["1"]
     asked.ask(7, publisher="c")
-    asked.queue.unsettled_until = 0.0
+    asked.now += 60.0
     assert asked.put(raw(1, publisher="b")) == ["1", "7"]
 
 
-def test_announced_loss_at_the_end_of_a_stream_is_answered(asked: Asked) -> None:
-    """Recovery gave up the last messages, and nothing follows: the next question at the latest is answered."""
-    asked.put(raw(0))
-    asked.ask(3)
-    asked.queue.announce_loss(miss(3))
-    assert asked.ask(3, name="again") == ["3", "again"]
+def test_request_waits_for_a_gap(asked: Asked) -> None:
+    """What is held back has not arrived for its reader; what is given up is not waited for."""
+    asked.put(raw(0), raw(2))
+    assert asked.ask(2) == []
+    asked.queue.give_up()
+    assert asked.put(raw(3)) == ["2"]
+
+
+def test_dropped_message_keeps_no_publisher_waiting(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A publisher that asks whether its message was read is answered when it was dropped, too."""
+    monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 10)
+    asked.put(raw(0), raw(1))
+    assert asked.ask(1, read=True) == []
+    assert asked.put(*map(raw, range(2, 20))) == ["1"]
 
 
 def test_end_of_the_queue_answers_all(asked: Asked) -> None:

@@ -6,57 +6,49 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import zenoh
 
+from nedbus.client.sample import M_co, Sample
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import (
-    PAYLOAD_LIMIT,
-    PAYLOAD_SIZE,
-    Address,
-    AddressError,
-    DecodeError,
-    Provenance,
-    provenance_of,
-)
+from nedbus_msgs import PAYLOAD_LIMIT, PAYLOAD_SIZE, Address, AddressError, DecodeError, Provenance, provenance_of
 
 from .layout_lookup import LayoutLookup
-from .sample import M_co, Sample
+
+if TYPE_CHECKING:
+    from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
-MAX_KEYS: Final = 10_000
-"""Keys that a reader remembers; no peer can make it remember more."""
-
-REJECTED: Final = b""
-"""The payload of what is not worth queueing."""
-
-WAKE_UP: Final = "nedbus/wake-up"
-"""The encoding of what a session sends to itself so that its reader looks again; nobody reads it."""
-
-Decode = Callable[..., M_co]
-"""`nedbus_msgs.decode` or `decode_row`: a payload, and `newer` layouts, to a message."""
-
+MAX_KEYS: Final = 10_000  # that a reader remembers; no peer can make it remember more
+WAKE_UP: Final = "nedbus/wake-up"  # encoding of what a session sends to itself so that its reader looks again
+Decode = Callable[..., M_co]  # `nedbus_msgs.decode` or `decode_row`: a payload, and `newer` layouts, to a message
 _MAX_WARNED: Final = 100  # keys whose invalid messages are logged
 _MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
-_UNKNOWN: Final = Provenance()
 
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """What is derived from a key once, and the provenance of its last encoding.
+    """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
 
     `key`: that of the whole stream. `heard`: that on which messages come. `thinned`: these are those of a thinned copy.
+    `writers`: its publishers, by name; `writer` is that of the last message.
+    `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
+    dropped or invalid; they are reported with the next sample that is read.
     """
 
     key: str
     heard: str
     address: Address
     thinned: bool = False
-    last: tuple[zenoh.Encoding | None, Provenance] = None, _UNKNOWN  # in one piece: two threads look and change it
+    last: tuple[zenoh.Encoding | None, Provenance] = None, Provenance()  # in one piece: two threads look and change it
+    writers: dict[str, WriterProxy] = field(default_factory=dict)
+    writer: WriterProxy | None = None
+    gap: int = 0
+    unreported: int = 0
 
 
 class Kept(NamedTuple):
@@ -67,8 +59,7 @@ class Kept(NamedTuple):
     provenance: Provenance
 
 
-Arrival = tuple[Stream, bytes, RawSample | Kept, int]
-"""A stream, a payload, the sample that it came with, and how many messages were lost before it."""
+Arrival = tuple[Stream, bytes, RawSample | Kept, int]  # the last: how many messages were lost before it
 
 
 class Decoder:
@@ -82,12 +73,22 @@ class Decoder:
         self._warned: set[int] = set()  # hashes of keys, which may be long
         self._counting = threading.Lock()  # whoever receives and whoever reads both reject
 
+    def stream(self, key: str) -> Stream:
+        """Return what is known of a key; raise AddressError for one that is none of ours."""
+        stream = self._streams.get(key)
+        if stream is None:
+            thinned = "/@" in key  # only who asks for thinned streams gets such keys
+            address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
+            stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
+            if len(self._streams) < MAX_KEYS:
+                self._streams[key] = stream
+        return stream
+
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
         """Return what is worth queueing, with no losses so far; what is rejected, without its payload, for its number.
 
-        A payload of the size that `encode` writes is admitted, and decoded when it is read.
-        Any other is decoded here: it must neither displace a valid sample nor take up much memory. For a layout that is
-        not known here publishers are asked, and waited for.
+        A payload of the size that `encode` writes is decoded when it is read; any other already here, as it must
+        neither displace a valid sample nor take up much memory.
         """
         admitted: list[Arrival] = []
         known = self._streams.get
@@ -99,26 +100,27 @@ class Decoder:
                 if raw.encoding == WAKE_UP:
                     continue
                 try:
-                    stream = stream or self._remember(key)
-                except AddressError as exc:
+                    stream = stream or self.stream(key)
+                    if len(payload) != PAYLOAD_SIZE:
+                        self._inspect(payload, raw.kind)
+                except (AddressError, DecodeError) as exc:
                     self.reject(key, exc)
-                    continue
-                try:
-                    self._inspect(payload, raw.kind)
-                except DecodeError as exc:
-                    self.reject(key, exc)
-                    payload = REJECTED
+                    if stream is None:
+                        continue
+                    payload = b""
             admitted.append((stream, payload, raw, 0))
         return admitted
 
-    def keep(self, arrival: Arrival) -> Arrival:
+    @classmethod
+    def keep(cls, arrival: Arrival) -> Arrival:
         """Return an arrival that takes up no more memory than it needs."""
         stream, payload, raw, lost = arrival
         if isinstance(raw, Kept):
             return arrival
-        return stream, payload, Kept(raw.timestamp, raw.source_info, self.provenance(arrival)), lost
+        return stream, payload, Kept(raw.timestamp, raw.source_info, cls.provenance(arrival)), lost
 
-    def provenance(self, arrival: Arrival) -> Provenance:
+    @staticmethod
+    def provenance(arrival: Arrival) -> Provenance:
         """Return the provenance of an arrival."""
         stream, _, raw, _ = arrival
         if isinstance(raw, Kept):
@@ -147,8 +149,8 @@ class Decoder:
 
     def reject(self, key: str, error: Exception) -> None:
         """Count an invalid sample, and log why, once for each of the first 100 keys: a peer may have any number."""
-        self.count_invalid(1)
         with self._counting:
+            self.invalid += 1
             if len(self._warned) >= _MAX_WARNED or hash(key) in self._warned:
                 return
             self._warned.add(hash(key))
@@ -159,18 +161,8 @@ class Decoder:
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
     def _inspect(self, payload: bytes, kind: zenoh.SampleKind) -> None:
-        if len(payload) == PAYLOAD_SIZE:
-            return
         if len(payload) > PAYLOAD_LIMIT:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
         if kind == zenoh.SampleKind.DELETE:
             raise DecodeError("a delete, which no publisher of nedbus sends")
         self._layouts.check(payload)
-
-    def _remember(self, key: str) -> Stream:
-        thinned = "/@" in key  # only who asks for thinned streams gets such keys
-        address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
-        stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
-        if len(self._streams) < MAX_KEYS:
-            self._streams[key] = stream
-        return stream

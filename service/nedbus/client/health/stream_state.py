@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
+from nedbus.client.sample import Sample
 from nedbus_msgs import Message, describe_flags
 
-from .health import Health, StreamHealth
-from .sample import Sample
+from .stream_health import Health, StreamHealth
 
-StateName = Literal["ok", "slow", "stale", "gone", "disconnected"]
+StateName = Literal["disconnected", "gone", "stale", "slow", "ok"]  # the worst first
 
 _LATE: Final = 1.0  # s of latency from which on a stream is slow
 _SLOW: Final = 0.5  # of the usual rate, below which a stream is slow
 _ABSENT: Final = 1.0  # s without a message after which a stream without a liveliness token is gone
-_SEVERITY: Final = ("disconnected", "gone", "stale", "slow", "ok")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +28,7 @@ class StreamState:
     @property
     def severity(self) -> int:
         """Its place among the states, the worst first."""
-        return _SEVERITY.index(self.name)
+        return get_args(StateName).index(self.name)
 
     def __str__(self) -> str:
         return f"{self.name}: {self.reason}" if self.reason else self.name

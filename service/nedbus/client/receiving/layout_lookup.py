@@ -17,12 +17,11 @@ _log = logging.getLogger(__name__)
 
 _MAX_LAYOUTS: Final = 16  # newer layouts that are remembered
 _MAX_UNKNOWN: Final = 256  # numbers that are asked for at once
-_PAUSES: Final = (2.0, 5.0, 10.0, 30.0, 60.0)  # s between two questions that explained nothing new; then the last one
+_PAUSES: Final = (0.0, 2.0, 5.0, 10.0, 30.0, 60.0)  # s after a question, by how many explained nothing new
 _MAX_TEXT: Final = 300  # characters of names that a publisher wrote
 _JOIN: Final = 3.0  # s
 
-FindLayouts = Callable[[], Mapping[int, Sequence[str]]]
-"""Ask publishers for the field names of all layouts that they know, by the number of the layout."""
+Layouts = Mapping[int, Sequence[str]]  # field names, by the number of the layout
 
 
 class LayoutLookup:
@@ -31,11 +30,11 @@ class LayoutLookup:
     A message of such a layout is invalid until the answer is there: whoever receives never waits for it, as any peer
     can send messages of unknown layouts, and leave questions unanswered.
 
-    `newer`: the field names that were found, by the number of the layout, as `decode` takes them.
+    `newer`: the layouts that were found, as `decode` takes them.
     """
 
-    def __init__(self, find: FindLayouts, *, now: Callable[[], float] = time.monotonic) -> None:
-        self.newer: Mapping[int, Sequence[str]] = {}
+    def __init__(self, find: Callable[[], Layouts], *, now: Callable[[], float] = time.monotonic) -> None:
+        self.newer: Layouts = {}
         self._find = find
         self._now = now
         self._asking = threading.Lock()
@@ -71,8 +70,6 @@ class LayoutLookup:
             self._thread.join(_JOIN)
 
     def _ask(self) -> None:
-        if self._now() < self._next_ask:
-            return
         with self._asking:
             if self._now() < self._next_ask or self._closed or len(self.newer) >= _MAX_LAYOUTS:
                 return
@@ -81,19 +78,17 @@ class LayoutLookup:
             self._thread.start()
 
     def _run(self) -> None:
-        found: Mapping[int, Sequence[str]] = {}
+        found: Layouts = {}
         unknown, self._unknown = self._unknown, set()
         try:
             with suppress(NedbusError):  # the session is closed
                 found = self._find()
         finally:
-            new = {number: found[number] for number in found.keys() & unknown if number not in self.newer}
-            for number, names in new.items():
-                if len(self.newer) < _MAX_LAYOUTS:
-                    self.newer = {**self.newer, number: names}
-                    unread = ", ".join(name for name in names if name not in FIELD_TYPES)[:_MAX_TEXT] or "nothing"
-                    extra = about("newer-layout")
-                    _log.warning("layout %d is newer than this reader; not read: %s", number, unread, extra=extra)
-            self._in_vain = 0 if new else self._in_vain + 1
-            pause = _PAUSES[min(self._in_vain, len(_PAUSES)) - 1] if self._in_vain else 0.0
-            self._next_ask = self._now() + pause
+            new = [*found.keys() & unknown - self.newer.keys()][: _MAX_LAYOUTS - len(self.newer)]
+            self.newer = {**self.newer, **{number: found[number] for number in new}}
+            for number in new:
+                unread = ", ".join(name for name in found[number] if name not in FIELD_TYPES)[:_MAX_TEXT] or "nothing"
+                extra = about("newer-layout")
+                _log.warning("layout %d is newer than this reader; not read: %s", number, unread, extra=extra)
+            self._in_vain = 0 if new else min(self._in_vain + 1, len(_PAUSES) - 1)
+            self._next_ask = self._now() + _PAUSES[self._in_vain]

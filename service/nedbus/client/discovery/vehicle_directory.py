@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from itertools import groupby
+from operator import attrgetter
 from typing import Final
 
 from nedbus.log_event import about
@@ -28,6 +30,7 @@ class VehicleDirectory:
     def __init__(self, session: Session, *, prefix: str) -> None:
         self._session = session
         self._prefix = prefix
+        self._key_expr = alive_key_expr(prefix=prefix)
         self._asking = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by the key of the token
         self._next_ask = float("-inf")
@@ -37,32 +40,24 @@ class VehicleDirectory:
     def vehicles(self, *, timeout: float) -> dict[str, list[Address]]:
         """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
         with self._asking:
-            key_expr = alive_key_expr(prefix=self._prefix)
             if self._changes is None:
-                self._changes = AliveChanges(self._session, key_expr)
+                self._changes = AliveChanges(self._session, self._key_expr)
             self._take(self._changes)
             if time.monotonic() >= self._next_ask:
-                self._ask(key_expr, timeout)
+                self._ask(timeout)
                 self._take(self._changes)  # what went while all were asked for
             addresses = sorted(self._addresses.values())
-        vehicles: dict[str, list[Address]] = {}
-        for address in addresses:
-            vehicles.setdefault(address.vehicle, []).append(address)
-        return vehicles
+        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
 
-    def _ask(self, key_expr: str, timeout: float) -> None:
-        keys, complete = ask_alive_keys(self._session, key_expr, timeout=timeout)
+    def _ask(self, timeout: float) -> None:
+        keys, complete = ask_alive_keys(self._session, self._key_expr, timeout=timeout)
         for key in keys:
             self._change(key, alive=True)
         pause = _ASK_AGAIN if not complete else float("inf") if self._confirmed else _CONFIRM
         self._next_ask, self._confirmed = time.monotonic() + pause, complete
         if not complete:
-            _log.warning(
-                "%s: not all liveliness tokens are known, after %d: some vehicles are missing",
-                key_expr,
-                len(keys),
-                extra=about("incomplete"),
-            )
+            text = "%s: not all liveliness tokens are known, after %d: some vehicles are missing"
+            _log.warning(text, self._key_expr, len(keys), extra=about("incomplete"))
 
     def _take(self, changes: AliveChanges) -> None:
         for key, alive in changes.take():

@@ -1,4 +1,4 @@
-"""The health of a stream: rate, jitter, age, gaps, order, reboots, resets, and the share of its flags; no I/O.
+"""The health of streams: rate, jitter, age, gaps, order, reboots, resets, and the share of their flags; no I/O.
 
 The same object serves `nedbus hz`, the status of a service, and scripts.
 Rates and ages are of a monotonic clock: the wall clock may be set at any time.
@@ -9,31 +9,29 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import Final, cast
 
-from nedbus_msgs import DOUBT_FLAGS, RESET_COUNTERS, TOPICS, Message, Quantity
+from nedbus.client.sample import Sample
+from nedbus_msgs import DOUBT_FLAGS, RESET_COUNTERS, TOPICS, Address, Message, Quantity
 
 from .histogram import Histogram
 
 _REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
 _GAP: Final = 3.0  # times the usual step of PX4's time
 _SETTLED: Final = 5  # steps from which on there is a usual one
-_WEIGHT: Final = 0.05  # of a new step in the usual one
+_WEIGHT: Final = 0.05  # of a new step in the usual one, and of a new second in the usual rate
 _MAX_LATENCIES: Final = 1000  # that are kept of a window
 _WINDOW: Final = 1_000_000_000  # ns
 _STALE: Final = 3.0  # s without a message after which a stream has no rate
-_SLOW_WEIGHT: Final = 0.05  # of a new second in the usual rate: a stream that became slow differs from it for a minute
 _COUNTER: Final = 256  # where reset counters wrap
-
-LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
-"""Limits of the histogram of latencies [s]."""
-
+_LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, limits of the histogram
+_MAX_STREAMS: Final = 4096  # that a monitor follows
 _NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # what is looked at
-_of_message = attrgetter(*_NAMES)
-_of_fields = itemgetter(*_NAMES)
+_of_message: Callable[[object], tuple[int, ...]] = attrgetter(*_NAMES)
+_of_fields: Callable[[Mapping[str, object]], tuple[int, ...]] = itemgetter(*_NAMES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +106,7 @@ class StreamHealth:
         self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
         self._counters: tuple[int, ...] = ()
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS, 0)
-        self.latencies = Histogram(LATENCIES)
+        self.latencies = Histogram(_LATENCIES)
         self._window = self._last_window = _Window(0)
 
     def add(
@@ -116,19 +114,21 @@ class StreamHealth:
     ) -> None:
         """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
         timestamp, *seen = _look(message)
+        if received - self._window.start >= _WINDOW:
+            self._end_window(received)
         window = self._window
-        if received - window.start >= _WINDOW:
-            if window.messages:
-                self._last_window = window
-                self._add_rate(window)
-            window = self._window = _Window(received)
         self._messages += 1
         self._lost += lost
         window.messages += 1
         if self._received is not None:
             window.add_interval((received - self._received) / 1e9)
         self._received = received
-        self._add_counters(tuple(seen[len(DOUBT_FLAGS) :]), rebooted=self._add_time(int(timestamp)))
+        rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
+        if counters != self._counters:
+            if self._counters and not rebooted:  # after a reboot they begin anew
+                for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
+                    self._resets[quantity] += (after - before) % _COUNTER
+            self._counters = counters
         if latency is not None:
             window.latencies.append(latency)
             self.latencies.add(latency)
@@ -142,13 +142,14 @@ class StreamHealth:
         now = time.monotonic_ns() if now is None else now
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
+        latencies = sorted(window.latencies)
         is_live = window.intervals and window.mean > 0 and age is not None and age < max(_STALE, 2 * window.mean)
         return Health(
             rate=1 / window.mean if is_live else None,
             nominal=self._nominal,
             jitter=math.sqrt(window.spread / window.intervals) if is_live else None,
-            latency=_median(window.latencies),
-            latency_max=max(window.latencies, default=None),
+            latency=latencies[len(latencies) // 2] if latencies else None,
+            latency_max=latencies[-1] if latencies else None,
             age=age,
             messages=self._messages,
             lost=self._lost,
@@ -161,56 +162,82 @@ class StreamHealth:
             resets=dict(self._resets),
         )
 
-    def _add_rate(self, window: _Window) -> None:
-        """Let the usual rate follow slowly, and a burst, such as what was recovered, count little."""
+    def _end_window(self, received: int) -> None:
+        """Begin the next window; a burst, such as what was recovered, counts little in the usual rate."""
+        window, self._window = self._window, _Window(received)
+        if window.messages:
+            self._last_window = window
         if window.mean > 0:
             rate = 1 / window.mean
-            usual = rate if self._usual_rate is None else self._usual_rate
-            self._usual_rate = usual + _SLOW_WEIGHT * (min(rate, 2 * usual) - usual)
-
-    def _add_counters(self, counters: tuple[int, ...], *, rebooted: bool) -> None:
-        """Count resets; after a reboot the counters begin anew."""
-        if counters == self._counters:
-            return
-        if self._counters and not rebooted:
-            for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
-                self._resets[quantity] += (after - before) % _COUNTER
-        self._counters = counters
+            usual = self._usual_rate or rate
+            self._usual_rate = usual + _WEIGHT * (min(rate, 2 * usual) - usual)
 
     def _add_time(self, timestamp: int) -> bool:
         """Follow PX4's time; return whether it went back, as after a reboot."""
-        last = self._time
-        if last is None or timestamp < last - _REBOOT:
-            self._reboots += last is not None
+        step = None if self._time is None else timestamp - self._time
+        if step is None or step < -_REBOOT:
+            self._reboots += step is not None
             self._time, self._steps = timestamp, 0
             return True
-        if timestamp < last:
+        if step < 0:
             self._disorders += 1
+            return False
+        self._time = timestamp
+        if self._steps >= _SETTLED and step > _GAP * self._usual:
+            self._gaps += 1
         else:
-            step = timestamp - last
-            self._time = timestamp
-            if self._steps >= _SETTLED and step > _GAP * self._usual:
-                self._gaps += 1
-                return False
             self._steps += 1
-            weight = max(_WEIGHT, 1 / self._steps)
-            self._usual += weight * (step - self._usual)
+            self._usual += max(_WEIGHT, 1 / self._steps) * (step - self._usual)
         return False
+
+
+class Monitor:
+    """Follow all streams of a subscription, at most 4096: then the one that was silent for longest is forgotten.
+
+    The first sample of each address does not count: it may be the last value that a subscription starts with.
+    """
+
+    def __init__(self) -> None:
+        self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
+
+    def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
+        """Add a sample that was received just now, or at this time [ns] of another clock; return whether it counts."""
+        address = sample.address
+        known = address in self._streams
+        stream = self._streams.pop(address, None)
+        if known:
+            stream = stream or StreamHealth(sample.topic)
+            now = time.monotonic_ns() if received is None else received
+            stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost)
+        elif len(self._streams) >= _MAX_STREAMS:
+            del self._streams[next(iter(self._streams))]
+        self._streams[address] = stream
+        return known
+
+    def snapshot(self, now: int | None = None) -> dict[Address, Health]:
+        """Return the health of each stream, sorted by address, now or at this time [ns] of the other clock."""
+        streams = sorted(self._streams.items(), key=itemgetter(0))
+        return {address: stream.snapshot(now) for address, stream in streams if stream is not None}
+
+    def latencies(self, address: Address) -> Histogram | None:
+        """Return the latencies of a stream since the start [s]."""
+        stream = self._streams.get(address)
+        return stream.latencies if stream is not None else None
+
+    def forget(self, address: Address) -> None:
+        """Forget a stream; it is followed anew if it comes back."""
+        self._streams.pop(address, None)
 
 
 def _look(message: Message | Mapping[str, object]) -> tuple[int, ...]:
     """Return the values of _NAMES; 0 for what is not given."""
     if not isinstance(message, Mapping):
-        return cast("tuple[int, ...]", _of_message(message))
+        return _of_message(message)
     try:
-        return cast("tuple[int, ...]", _of_fields(message))
+        return _of_fields(message)
     except KeyError:
-        return cast("tuple[int, ...]", tuple(message.get(name, 0) for name in _NAMES))
+        return tuple(cast("int", message.get(name, 0)) for name in _NAMES)
 
 
 def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:
     return {flag: count / total for flag, count in counts.items()} if total else None
-
-
-def _median(values: Collection[float]) -> float | None:
-    return sorted(values)[len(values) // 2] if values else None

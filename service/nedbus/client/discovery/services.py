@@ -1,0 +1,122 @@
+"""What others on the network answer and report: status, layouts, rejected messages. Nothing of it is trusted."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import zenoh
+
+from nedbus.client.closing import Finalizer
+from nedbus.log_event import about
+from nedbus.transport import RawSample, Session, query, while_open
+from nedbus_msgs import ANY, Address, AddressError, address_of_rejected_key, rejected_key_expr, schema_key, status_key
+
+_log = logging.getLogger(__name__)
+
+_MAX_FIELDS: Final = 256  # of a layout
+_MAX_TEXT: Final = 300  # characters of a key that are logged, and of a reason that are kept
+_MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
+_MAX_CONTENT: Final = 2**28  # bytes that the status of all services may take up, about: JSON is up to 32 times larger
+_MAX_LAYOUTS: Final = 32  # of an answer; there are five
+_CHANNEL: Final = 1000  # reports that wait; beyond, the oldest are dropped
+_MAX_REPORT: Final = 2**16  # bytes of a report that is read
+
+
+def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
+    """Return the status of every nedbus service, as it reports it; what would fill the memory is left out."""
+    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
+    accepted: list[RawSample] = []
+    room = _MAX_CONTENT
+    for raw in answers:
+        text = raw.payload.to_bytes()
+        # What it takes up at most when it is parsed, about: measured with CPython 3.11.
+        size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
+        if len(text) <= _MAX_ANSWER and size <= room:
+            accepted.append(raw)
+            room -= size
+    if left_out := len(answers) - len(accepted):
+        _log.warning("%d services are left out: their answers are too large", left_out, extra=about("incomplete"))
+    return [status for status in _parse(accepted) if isinstance(status, dict)]
+
+
+def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
+    """Ask publishers for the field names of all layouts, by number; of different answers for one the first counts."""
+    found: dict[int, Sequence[str]] = {}
+    for content in _parse(query(session, schema_key(prefix=prefix), timeout=0.5, newest=False)):
+        layouts = content.get("layouts") if isinstance(content, dict) else None
+        for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
+            match layout:
+                case {"wire": int(number), "fields": list(fields)}:
+                    named = [field.get("name") for field in fields if isinstance(field, dict)]
+                    names = [name for name in named if isinstance(name, str)]
+                    if len(set(names)) == len(fields) <= _MAX_FIELDS:
+                        found.setdefault(number, names)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class RejectionReport:
+    """A message that a service rejected.
+
+    `received`: when the report arrived here, ns since the epoch.
+    `reason`: the service's words, at most 300 characters: a peer wrote them, and may have written anything.
+    """
+
+    address: Address
+    reason: str
+    received: int
+
+
+class Rejections:
+    """The reports that arrive; get one from `bus.rejections()`.
+
+    It is closed when it is no longer referenced, and with the bus.
+    """
+
+    def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
+        self._prefix = prefix
+        self._owner = owner  # the bus stays open for as long as somebody may read
+        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANNEL)
+        with while_open():
+            subscriber = session.declare_subscriber(rejected_key_expr(prefix=prefix), channel)
+        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
+        self._finalizer = Finalizer(self, subscriber.undeclare)
+
+    def take(self) -> list[RejectionReport]:
+        """Return the reports that have arrived since the last call, at most 1000, without waiting."""
+        with while_open():
+            samples = list(iter(self._handler.try_recv, None))
+        return [report for report in map(self._read, samples) if report is not None]
+
+    def close(self) -> None:
+        """Follow them no more; a second call does nothing."""
+        self._finalizer.close_now()
+
+    def _read(self, sample: zenoh.Sample) -> RejectionReport | None:
+        try:
+            address = address_of_rejected_key(str(sample.key_expr), prefix=self._prefix)
+            content = json.loads(sample.payload.to_bytes()) if len(sample.payload) <= _MAX_REPORT else None
+        except (AddressError, ValueError, RecursionError):
+            return None
+        reason = content.get("reason") if isinstance(content, dict) else None
+        return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
+
+
+def _parse(answers: Iterable[RawSample]) -> Iterator[object]:
+    """Yield the content of answers; the first that is not JSON is logged, as a peer may send any number."""
+    logged = False
+    for raw in answers:
+        if len(raw.payload) > _MAX_ANSWER:
+            continue
+        try:
+            yield json.loads(raw.payload.to_bytes())
+        except (ValueError, RecursionError):
+            if not logged:
+                key = str(raw.key_expr)[:_MAX_TEXT]
+                _log.warning("%r: an answer that is not JSON", key, extra=about("invalid", reason="no JSON"))
+            logged = True

@@ -1,0 +1,1 @@
+"""The health of streams, from their samples: rates, gaps, flags, ages."""

@@ -1,0 +1,295 @@
+"""What waits to be read: every sample in order, or the newest of each key. No I/O.
+
+Whoever receives puts, the reader's thread takes. Here is decided that a reader is too slow: `latest` supersedes what
+was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond. Both are counted, and hold back nobody.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final, get_args
+
+from nedbus.client.sample import Counts, M_co, Mode, Sample
+from nedbus.log_event import about
+from nedbus.transport import RawSample
+from nedbus_msgs import AddressError
+
+from .acknowledgements import Acknowledgements, AckRequest
+from .decoder import MAX_KEYS, Arrival, Decode, Decoder
+from .stateful_reader import StatefulReader
+from .writer_proxy import WriterProxy
+
+if TYPE_CHECKING:
+    from nedbus.client.batch import Batch
+
+_log = logging.getLogger(__name__)
+
+CAPACITY: Final = 65_536
+"""Samples that are kept for a reader of mode `every`, some 45 MB; beyond, the oldest are dropped."""
+
+_HELD: Final = 2 * CAPACITY  # messages that wait for those before them, some 90 MB,
+_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key: whoever may publish there pushes out nobody else
+_MAX_BATCH: Final = 4096  # messages of a batch
+_FRESH: Final = 1024  # samples that are queued as they are; further ones are going to wait
+
+
+class PendingQueue:
+    """Queue what can be delivered until it is read, decode it then, and count what became of it; `name` is for the log.
+
+    `on_gap` is called, in any thread, when something is missing that publishers may still have.
+    """
+
+    def __init__(
+        self,
+        mode: Mode,
+        decoder: Decoder,
+        *,
+        name: str = "",
+        thinned: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        if mode not in get_args(Mode):
+            raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
+        self.newest_only = mode == "latest"
+        self.ended = False
+        self.idle = False
+        """Set by whoever receives, while it waits and nothing is left to receive."""
+        self.drains = 0
+        """How often all that had arrived was put."""
+        self.on_gap: Callable[[], object] | None = None
+        self.on_wake: Callable[[], object] | None = None
+        """Called, in any thread, when there may be something to read: an event loop wakes its reader with it."""
+        self._name = name
+        self._warned = False
+        self._decoder = decoder
+        self._lock = threading.Lock()
+        self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
+        self._every: deque[Arrival] = deque()
+        self._newest: dict[str, Arrival] = {}
+        self._reader = StatefulReader(decoder, recovers=not self.newest_only, thinned=thinned, clock=clock)
+        self._acknowledgements = Acknowledgements(self._reader)
+        self._arrived = self._dropped = self._received = 0
+
+    @property
+    def counts(self) -> Counts:
+        """What became of the messages so far."""
+        with self._lock:
+            account = self._reader.account
+            dropped = self._dropped + account.dropped
+            return Counts(self._received, account.lost, dropped, self._decoder.invalid, account.discarded)
+
+    @property
+    def waiting(self) -> int:
+        """How many messages wait to be read."""
+        return len(self._every) or len(self._newest)
+
+    @property
+    def held(self) -> int:
+        """How many messages wait for those before them."""
+        return self._reader.account.held
+
+    @property
+    def requesting(self) -> list[WriterProxy]:
+        """Publishers of which something is missing."""
+        with self._lock:
+            return list(self._reader.requesting)
+
+    def count_invalid(self, count: int) -> None:
+        """Count samples that could not be queued."""
+        self._decoder.count_invalid(count)
+
+    def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
+        """Queue all that has arrived, in its order, wake the reader, and reject what is not worth queueing.
+
+        `overflowed`: it comes from a ring that was full, and perhaps dropped something: nothing is asked for.
+        """
+        arrivals = self._decoder.admit(batch)
+        with self._lock:
+            missing = len(self._reader.requesting)
+            self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
+            missing = len(self._reader.requesting) - missing
+            self.drains += not overflowed
+        if missing > 0 and self.on_gap is not None:
+            self.on_gap()
+        if self._tokens.empty():  # as `wake` does
+            self._tokens.put(None)
+        if self.on_wake is not None:
+            self.on_wake()
+        if overflowed:
+            self._warn_once()
+        if self._acknowledgements.pending:
+            self.acknowledge(drained=True)
+
+    def on_link(self) -> None:
+        """Note that a link broke or came back."""
+        with self._lock:
+            self._reader.on_link()
+
+    def on_heartbeat(self, key: str, publisher: str, number: int, *, begins: bool) -> None:
+        """Note that a publisher has sent a message that should have arrived by now; see StatefulReader."""
+        with self._lock:
+            if len(self._reader.requesting) < MAX_KEYS:
+                self._reader.on_heartbeat(key, publisher, number, begins=begins)
+
+    def next_request(self, writer: WriterProxy, now: float) -> range | None:
+        """Return the numbers to ask a publisher for now; None if nothing is due."""
+        with self._lock:
+            return writer.next_request(now)
+
+    def on_retransmission(self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float) -> str:
+        """Queue what was recovered, and what waited for it; return a key of which there is something to read by that.
+
+        It takes the place of nothing that is queued: where there is no room for all, the oldest of it are dropped.
+        """
+        arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
+        with self._lock:
+            return self._recover(self._reader.on_retransmission(writer, arrivals, ended=ended, now=now))
+
+    def bound(self) -> str:
+        """Give up gaps for which too many messages are held back; return as `on_retransmission`."""
+        if self.held <= _HELD_OF_KEY:
+            return ""
+        with self._lock:
+            return self._recover(self._reader.give_up(_HELD, _HELD_OF_KEY))
+
+    def give_up(self) -> None:
+        """Give up all that is missing: it is lost."""
+        with self._lock:
+            self._recover(self._reader.give_up(-1, -1))
+
+    def add(self, request: AckRequest) -> None:
+        """Answer a publisher's request as soon as it can be answered."""
+        with self._lock:
+            self._acknowledgements.add(request)
+        self.acknowledge(drained=self.idle)
+
+    def acknowledge(self, *, drained: bool) -> None:
+        """Answer the requests that can be answered now; `drained` as in Acknowledgements."""
+        with self._lock:
+            if self.ended:
+                ready = self._acknowledgements.take_all()
+            else:
+                taken = self._arrived - len(self._every)
+                ready = self._acknowledgements.settle(arrived=self._arrived, taken=taken, drained=drained)
+        for request in ready:
+            request.reply()
+
+    def end(self) -> None:
+        """Let readers know that nothing more comes, and publishers that nobody reads any more."""
+        self.ended = True
+        self.acknowledge(drained=True)
+        self.wake()
+
+    def wake(self) -> None:
+        """Let a thread that waits look again, or the one that waits next, and an event loop."""
+        if self._tokens.empty():
+            self._tokens.put(None)
+        if self.on_wake is not None:
+            self.on_wake()
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while not (self._every or self._newest or self.ended):
+            try:
+                self._tokens.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
+            except queue.Empty:
+                return False
+            if timeout is None:
+                break
+        if self.ended or self.waiting > 1:
+            self.wake()  # another thread that waits: of all that is put at once only one is woken
+        return True
+
+    def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:
+        """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
+        while True:
+            with self._lock:  # several threads may take
+                if self._every:
+                    arrival = self._every.popleft()
+                elif self._newest:
+                    arrival = self._newest.pop(next(iter(self._newest)))
+                else:
+                    return None
+                stream, _, _, lost = arrival
+                if stream.unreported:
+                    lost, stream.unreported = lost + stream.unreported, 0
+            if self._acknowledgements.pending:
+                self.acknowledge(drained=False)
+            sample = self._decoder.decode(arrival, decode, lost=lost)
+            if sample is not None:
+                self._received += 1
+                return sample
+            stream.unreported += lost
+
+    def pop_batch(self) -> Batch | None:
+        """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
+        from nedbus.client.batch import make_batch
+
+        with self._lock:
+            if self.newest_only:
+                taken = list(self._newest.values())
+                self._newest.clear()
+            else:
+                taken = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
+            lost = sum(lost for _, _, _, lost in taken)
+            for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
+                lost, stream.unreported = lost + stream.unreported, 0
+        if self._acknowledgements.pending:
+            self.acknowledge(drained=False)
+        if not taken:
+            return None
+        batch = make_batch(taken, self._decoder, lost=lost)
+        if not len(batch):
+            taken[0][0].unreported += lost
+            return None
+        self._received += len(batch)
+        return batch
+
+    def _queue(self, arrivals: Sequence[Arrival]) -> None:
+        """Queue all; the oldest beyond the capacity are dropped, and those that are superseded."""
+        self._arrived += len(arrivals)
+        if self.newest_only:
+            for arrival in arrivals:
+                self._supersede(arrival)
+            return
+        every = self._every
+        every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
+        while len(every) > CAPACITY:
+            self._drop(every.popleft())
+
+    def _recover(self, arrivals: list[Arrival]) -> str:
+        beyond = min(len(arrivals), max(0, len(self._every) + len(arrivals) - CAPACITY))
+        self._arrived += beyond
+        for arrival in arrivals[:beyond]:
+            self._drop(arrival)
+        self._queue(arrivals[beyond:])
+        return arrivals[-1][0].heard if arrivals else ""
+
+    def _drop(self, arrival: Arrival) -> None:
+        stream, _, _, lost = arrival
+        self._dropped += 1
+        stream.unreported += lost
+        self._warn_once()
+
+    def _warn_once(self) -> None:
+        if not self._warned and not self.newest_only:
+            self._warned = True
+            extra = about("dropped")
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
+
+    def _supersede(self, arrival: Arrival) -> None:
+        stream, payload, raw, lost = arrival
+        waiting = self._newest.get(stream.key)
+        if waiting is not None:
+            self._dropped += 1
+            arrival = stream, payload, raw, lost + waiting[3]
+        elif len(self._newest) >= MAX_KEYS:
+            self._dropped += 1
+            return
+        self._newest[stream.key] = arrival

@@ -1,0 +1,281 @@
+"""Zenoh's side of a subscription: the advanced subscriber, its ring, and who empties it.
+
+The ring lies in Rust: Zenoh never waits for it, so that no reader holds up its session or anybody else.
+A reader that waits without a timeout empties it in its own thread. For one that waits with a timeout, or in asyncio,
+the pump does, a thread that starts with the first such wait; while the reader does something else, housekeeping does.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from contextlib import suppress
+from functools import partial
+from typing import Final, TypeVar
+
+import zenoh
+
+from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.protocol import CLOSED, read_parameters
+from nedbus.log_event import about
+from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
+from nedbus_msgs import ack_key
+
+from .acknowledgements import MAX_PENDING, AckRequest
+from .decoder import WAKE_UP
+from .pending_queue import PendingQueue
+from .retransmission import Retransmission
+
+_log = logging.getLogger(__name__)
+
+RING: Final = 16_384
+"""Samples that may arrive until somebody looks; more than 0.2 s of the largest fleet."""
+
+_LOOK: Final = 0.1  # s between two looks of housekeeping
+_POLL: Final = 0.005  # s between them while publishers ask for acknowledgements,
+_ASKED: Final = 1.0  # s from the last such request on
+_LOOK_AT_HEARTBEATS: Final = 0.25  # s
+_BUSY: Final = 64  # samples at once after which a pause pays: whoever receives is woken once for many
+_PAUSE: Final = 0.001  # s
+_JOIN: Final = 3.0  # s that a busy machine has to end a thread
+_T = TypeVar("_T")
+
+
+class Receiver:
+    """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
+
+    A subscriber of mode `every` asks publishers for what is missing, and answers those that ask whether it has what
+    they sent. One of `thinned` streams does not answer, as these do not wait for it, and begins with what is published
+    from now on.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        key_expr: str,
+        pending_queue: PendingQueue,
+        *,
+        housekeeping: Housekeeping,
+        thinned: bool = False,
+    ) -> None:
+        every = not pending_queue.newest_only
+        self._session = session
+        self._queue = pending_queue
+        self._name = key_expr
+        self._thinned = thinned
+        self._changing = threading.Lock()
+        self._closed = False
+        self._receiving = threading.Lock()  # whoever has it empties the ring
+        self._by_reader = False  # the reader has waited by itself since the pump looked
+        self._reader_waits = False  # for the ring
+        self._reader: int | None = None  # the thread that did so last
+        self._busy = False
+        self._needed = threading.Event()  # the pump is
+        self._pump: threading.Thread | None = None
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING)
+        # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
+        history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
+        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
+        links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
+        with while_open():
+            self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
+            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not thinned else None
+            self._links = session.info.declare_transport_events_listener(links, history=False) if every else None
+        self._take_query = None if self._asked is None else self._asked.handler.try_recv
+        self._take_link = None if self._links is None else self._links.handler.try_recv
+        # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
+        self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
+        self._heartbeats = {key_expr: follow_heartbeats(session, key_expr)} if every else {}
+        self._late: Heartbeats = {}  # what the heartbeats of the last look told of
+        self._next_look = 0.0
+        self._drains = 0  # of the queue, then
+        self._asked_until = 0.0
+        self._retransmission = Retransmission(session, pending_queue)
+        pending_queue.on_gap = housekeeping.wake
+        self._end_job = housekeeping.add(self._keep_house)
+
+    def receive(self) -> bool:
+        """Queue what has arrived by now; return False, at once, if somebody does so already."""
+        if not self._receiving.acquire(blocking=False):
+            return False
+        try:
+            if batch := take_all(self._handler, []):
+                self._put(batch)
+        finally:
+            self._receiving.release()
+        return True
+
+    def wait(self, timeout: float | None) -> bool:
+        """Wait until there may be something in the queue; return False after `timeout` seconds."""
+        if timeout is not None or self._thinned:  # not all of the thinned comes through the ring
+            self.pump()
+            return self._queue.wait(timeout)
+        self._by_reader = True
+        if not self._receiving.acquire(blocking=False):
+            return self._queue.wait(None)
+        try:
+            self._reader, self._reader_waits = threading.get_ident(), True
+            if not self._queue.waiting:  # nothing was recovered since the caller looked
+                self._receive()
+        finally:
+            self._reader_waits = False
+            self._receiving.release()
+        return True
+
+    def pump(self) -> None:
+        """Let a thread empty the ring from now on, until a reader waits for it by itself."""
+        self._by_reader = False
+        with self._changing:
+            if self._pump is None and not self._closed:
+                self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
+                self._pump.start()
+        self._needed.set()
+
+    def close(self) -> None:
+        """End the subscription; a second call does nothing."""
+        with self._changing:
+            if self._closed:
+                return
+            self._closed = True
+        self._queue.end()
+        self._end_job()
+        self._retransmission.close()
+        self._queue.give_up()
+        self._undeclare()
+        self._needed.set()
+        if self._pump is not None:  # one that is inside Zenoh when the interpreter ends aborts the process
+            self._pump.join(_JOIN)
+        if self._reader != threading.get_ident() and self._receiving.acquire(timeout=_JOIN):
+            self._receiving.release()
+
+    def _undeclare(self) -> None:
+        with suppress(zenoh.ZError):  # closed already with the session
+            for _, undeclare in self._heartbeats.values():
+                undeclare()
+            if self._asked is not None:
+                self._asked.undeclare()
+            if self._links is not None:
+                self._links.undeclare()
+            self._subscriber.undeclare()
+
+    def _run(self) -> None:
+        try:
+            while not self._closed:
+                if self._by_reader:
+                    self._needed.clear()
+                    if self._by_reader and not self._closed:  # type: ignore[redundant-expr]  # by another thread
+                        self._needed.wait()
+                    continue
+                with self._receiving:
+                    self._receive()
+        except BaseException:
+            _log.exception("%s: the subscription ends after an unexpected error", self._name, extra=about("error"))
+            raise
+        finally:
+            self._queue.end()  # nobody waits for a pump that has ended
+
+    def _receive(self) -> None:
+        """Wait for something, and queue all that is there; the queue ends with Zenoh's side."""
+        pending, handler = self._queue, self._handler
+        if self._busy:
+            time.sleep(_PAUSE)
+        pending.idle = True
+        try:
+            batch = [handler.recv()]
+            pending.idle = False
+            if (item := handler.try_recv()) is not None:
+                batch.append(item)
+                take_all(handler, batch)
+        except zenoh.ZError:
+            pending.idle = False
+            pending.end()
+            return
+        self._busy = len(batch) >= _BUSY
+        self._put(batch)
+
+    def _put(self, batch: list[zenoh.Sample], *, full: int = RING) -> None:
+        if self._queue.ended:
+            return
+        self._listen()
+        try:
+            self._queue.put(batch, overflowed=len(batch) >= full)
+        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
+            extra = about("bug")
+            _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
+            self._queue.count_invalid(len(batch))
+
+    def _keep_house(self, now: float) -> float:
+        """Do what is due beside receiving; return the seconds until the next time."""
+        self._listen()
+        if drained := self.receive():
+            self._queue.acknowledge(drained=True)
+        if self._links is None:
+            return _LOOK
+        if now >= self._next_look:
+            self._next_look = now + _LOOK_AT_HEARTBEATS
+            self._look_at_heartbeats(drained=drained)
+        filled, pause = self._retransmission.turn(now)
+        filled = self._queue.bound() or filled
+        if filled:
+            self._wake(filled)
+        return min(pause, _LOOK, _POLL if now < self._asked_until else _LOOK)
+
+    def _look_at_heartbeats(self, *, drained: bool) -> None:
+        """Ask for the newest messages that heartbeats of the look before told of, if they have not come since."""
+        drained |= self._queue.idle or self._queue.drains >= self._drains + 2
+        if self._late and not drained:
+            return  # what they tell of may be in the ring still
+        for (key, publisher), number in self._late.items():
+            self._queue.on_heartbeat(key, publisher, number, begins=not self._thinned)
+        self._late = {}
+        for take, _ in self._heartbeats.values():
+            self._late |= take()
+        self._drains = self._queue.drains
+
+    def _wake(self, key: str) -> None:
+        """Let the reader look into the queue, even one that waits for the ring, by something on one of its keys.
+
+        Nothing else ends a wait for Zenoh's ring; only this session gets it, and no reader sees it.
+        """
+        self._queue.wake()
+        if self._reader_waits:
+            with suppress(zenoh.ZError):  # the session is closed
+                here = zenoh.Locality.SESSION_LOCAL
+                self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
+
+    def _listen(self) -> None:
+        """Note that links broke or came back, before what arrived since is queued; take acknowledgement requests."""
+        try:
+            while self._take_link is not None and self._take_link() is not None:
+                self._queue.on_link()
+            while self._take_query is not None and (query := self._take_query()) is not None:
+                self._take_request(query)
+        except zenoh.ZError:  # undeclared
+            pass
+
+    def _take_request(self, query: zenoh.Query) -> None:
+        self._asked_until = time.monotonic() + _ASKED
+        parameters = read_parameters(query.parameters.get)
+        if parameters is not None:  # else it is dropped, and so answered: from a publisher that asks in another way
+            key = str(query.key_expr)
+            reply = partial(_reply, query, key, self._queue)
+            self._queue.add(AckRequest(key.removesuffix(ack_key("")), *parameters, reply))
+
+
+def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+    """Add all that is there to a batch, up to a full ring, and return it."""
+    try:
+        while len(batch) < RING and (item := handler.try_recv()) is not None:
+            batch.append(item)
+    except zenoh.ZError:  # undeclared: the next wait notices
+        pass
+    return batch
+
+
+def _reply(query: zenoh.Query, key: str, pending_queue: PendingQueue) -> None:
+    try:
+        with query:
+            query.reply(key, CLOSED if pending_queue.ended else b"")
+    except zenoh.ZError as exc:  # it asked with a timeout, or is gone
+        _log.debug("%s: an acknowledgement request could not be answered: %s", key, exc)

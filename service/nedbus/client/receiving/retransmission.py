@@ -1,0 +1,87 @@
+"""Ask publishers for what is missing in a subscription of mode `every`: each by its exact key, and again.
+
+Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
+all publishers: the restart of a router with 1,000 of them became a storm in which requests went unanswered. Here at
+most 64 are open, whatever there is to ask, and one without an answer is repeated for 20 s. Meanwhile only what comes
+after it from the same publisher waits.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Final
+
+from nedbus.errors import NedbusError
+from nedbus.log_event import about
+from nedbus.transport import KeptAnswers, Session, ask_kept
+from nedbus_msgs import PAYLOAD_LIMIT
+
+from .pending_queue import CAPACITY, PendingQueue
+from .writer_proxy import WriterProxy
+
+_log = logging.getLogger(__name__)
+
+_OPEN: Final = 64  # requests at a time,
+_OPEN_BEGINNINGS: Final = 16  # and of these for what a publisher sent before it was heard
+_OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
+_BEHIND: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
+_TIMEOUT: Final = 3.0  # s until a request is given up
+_POLL: Final = 0.005  # s between two looks for answers
+_SOON: Final = 0.05  # s between two looks at what is due
+_IDLE: Final = 1.0  # s
+
+
+class Retransmission:
+    """Send the requests of a queue's publishers, and pass on what they answer; a job of Housekeeping's thread."""
+
+    def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
+        self._session = session
+        self._queue = pending_queue
+        self._open: dict[WriterProxy, KeptAnswers] = {}
+
+    def turn(self, now: float) -> tuple[str, float]:
+        """Do what is due; return a key of which something can be read now, or "", and s until the next."""
+        filled = ""
+        for writer, answers in list(self._open.items()):
+            filled = self._take(writer, answers, now) or filled
+        requesting = self._queue.requesting
+        if self._queue.waiting <= _BEHIND:
+            for writer in requesting:
+                if writer not in self._open and self._has_room(writer):
+                    self._ask(writer, now)
+        return filled, _POLL if self._open else _SOON if requesting else _IDLE
+
+    def close(self) -> None:
+        """Ask no more; a channel of answers that nobody takes would hold up the session."""
+        self._open.clear()
+
+    def _take(self, writer: WriterProxy, answers: KeptAnswers, now: float) -> str:
+        found = {number: raw for number, raw in answers.take().items() if len(raw.payload) <= PAYLOAD_LIMIT}
+        ended = answers.ended
+        if ended:
+            del self._open[writer]
+        if not (found or ended):
+            return ""
+        try:
+            return self._queue.on_retransmission(writer, found, ended=ended, now=now)
+        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
+            key = writer.stream.heard
+            _log.exception("%s: what was recovered is left out after an unexpected error", key, extra=about("bug"))
+            self._open.pop(writer, None)
+            return self._queue.on_retransmission(writer, {}, ended=True, now=float("inf"))
+
+    def _has_room(self, writer: WriterProxy) -> bool:
+        share = [each for each in self._open if bool(each.uncertain) == bool(writer.uncertain)]
+        if writer.uncertain:
+            return len(share) < _OPEN_BEGINNINGS
+        of_key = sum(each.stream is writer.stream for each in share)
+        return len(self._open) < _OPEN and of_key < _OPEN_OF_KEY
+
+    def _ask(self, writer: WriterProxy, now: float) -> None:
+        numbers = self._queue.next_request(writer, now)
+        if numbers is None:
+            return
+        try:
+            self._open[writer] = ask_kept(self._session, writer.stream.heard, writer.name, numbers, timeout=_TIMEOUT)
+        except NedbusError:  # the session is closed
+            self._queue.on_retransmission(writer, {}, ended=True, now=now)

@@ -1,0 +1,177 @@
+"""All remote publishers that a subscription hears, and the one account of their messages. Pure, without I/O."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from operator import itemgetter
+from typing import Final
+
+from nedbus.transport import SourceInfo, entity_name
+from nedbus_msgs import AddressError
+
+from .decoder import Arrival, Decoder, Stream
+from .writer_proxy import NUMBERS, Account, WriterProxy
+
+_WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
+_BATCH: Final = 8  # messages of one key for which a look at all of them together pays
+_UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
+_PAYLOAD: Final = itemgetter(1)
+
+
+class StatefulReader:
+    """Follow what arrives, publisher by publisher: `requesting` are those of which something is missing.
+
+    With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
+    Of `thinned` streams only those that publishers thin are followed from their beginning after a link came back.
+    Not thread-safe.
+    """
+
+    def __init__(
+        self, decoder: Decoder, *, recovers: bool, thinned: bool, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.account = Account()
+        self.requesting: dict[WriterProxy, None] = {}
+        self.recovers = recovers
+        self._decoder = decoder
+        self._thinned = thinned
+        self._clock = clock
+        self._unsettled_until = float("-inf")
+
+    @property
+    def unsettled(self) -> bool:
+        """Whether there may be publishers that sent something, and are not known yet."""
+        return self._clock() < self._unsettled_until
+
+    def on_link(self) -> None:
+        """Note that a link broke or came back."""
+        self._unsettled_until = self._clock() + _UNSETTLED
+        for writer in self.requesting:
+            writer.silent = False  # it could not answer, perhaps
+
+    def on_samples(self, arrivals: list[Arrival], *, overflowed: bool) -> list[Arrival]:
+        """Return what can be delivered, each with what was lost before it; `overflowed`: from a ring that was full."""
+        if len(arrivals) >= _BATCH and self._in_order(arrivals):
+            return arrivals
+        delivered: list[Arrival] = []
+        for arrival in arrivals:
+            stream, payload, raw, _ = arrival
+            info, writer = raw.source_info, stream.writer
+            if info is not None:
+                source = info.source_id
+                if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than its name
+                    writer = self._writer_of(stream, info, asks=self.recovers and not overflowed)
+            if info is None or writer is None:
+                if payload:
+                    delivered.append(arrival)
+                continue
+            number = info.source_sn
+            if number == writer.expected and writer.request is None and payload and not stream.gap:
+                writer.expected = (number + 1) % NUMBERS
+                delivered.append(arrival)
+            else:
+                asks = self.recovers and not overflowed
+                delivered += writer.on_sample(number, arrival, asks=asks, overflowed=overflowed)
+                self._note(writer)
+        return delivered
+
+    def on_heartbeat(self, key: str, name: str, number: int, *, begins: bool) -> bool:
+        """Note that a publisher has sent a message that should have arrived by now; return whether some are missing.
+
+        `begins`: of a publisher that is new here this one is missing.
+        """
+        try:
+            stream = self._decoder.stream(key)
+        except AddressError:
+            return False
+        writer = stream.writers.get(name)
+        if writer is None:
+            began = self._may_have_begun(stream)
+            if not (began or begins):
+                return False
+            writer = self._meet(stream, name, 0 if began else number, uncertain=number + 1)
+        if writer is None:
+            return False
+        writer.on_heartbeat(number)
+        return self._note(writer)
+
+    def on_retransmission(
+        self, writer: WriterProxy, found: dict[int, Arrival], *, ended: bool, now: float
+    ) -> list[Arrival]:
+        """Return what can be delivered after an answer to a publisher's retransmission request."""
+        delivered = writer.on_retransmission(found, ended=ended, now=now)
+        self._note(writer)
+        return delivered
+
+    def give_up(self, total: int, of_key: int) -> list[Arrival]:
+        """Give up gaps until no more messages are held back, in all and of one key; return what can be delivered."""
+        delivered: list[Arrival] = []
+        if self.account.held <= min(total, of_key):
+            return delivered
+        by_key: Counter[str] = Counter()
+        for writer in self.requesting:
+            by_key[writer.stream.heard] += len(writer.held)
+        for writer in sorted(self.requesting, key=lambda writer: -len(writer.held)):
+            if self.account.held > total or by_key[writer.stream.heard] > of_key:
+                by_key[writer.stream.heard] -= len(writer.held)
+                delivered += writer.give_up()
+                self._note(writer)
+        return delivered
+
+    def has(self, key: str, name: str, number: int) -> bool | None:
+        """Return whether a message has arrived, or is known to be lost; None if its publisher is not known."""
+        try:
+            writer = self._decoder.stream(key).writers.get(name)
+        except AddressError:
+            return None
+        return None if writer is None else writer.has(number)
+
+    def _writer_of(self, stream: Stream, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
+        """Return the publisher of a sample; None if it is not remembered."""
+        name = entity_name(info.source_id)
+        writer = stream.writers.get(name)
+        if writer is None:
+            late = asks and self._may_have_begun(stream)
+            writer = self._meet(stream, name, 0 if late else info.source_sn, uncertain=info.source_sn)
+        stream.writer = writer
+        if writer is not None:
+            writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
+        return writer
+
+    def _in_order(self, arrivals: list[Arrival]) -> bool:
+        """Return whether all follow each other, of the last publisher of one key, and note that."""
+        writer, info = arrivals[0][0].writer, arrivals[-1][2].source_info
+        if writer is None or info is None or writer.request is not None or writer.stream.gap:
+            return False
+        stop = writer.expected + len(arrivals)
+        if info.source_sn != stop - 1 or stop >= NUMBERS or entity_name(info.source_id) != writer.name:
+            return False
+        if len({id(arrival[0]) for arrival in arrivals}) > 1 or not all(map(_PAYLOAD, arrivals)):
+            return False
+        infos = [raw.source_info for _, _, raw, _ in arrivals]
+        if [info and info.source_sn for info in infos] != list(range(writer.expected, stop)):
+            return False
+        writer.expected = stop
+        return True
+
+    def _may_have_begun(self, stream: Stream) -> bool:
+        return self.unsettled and (stream.thinned or not self._thinned)
+
+    def _meet(self, stream: Stream, name: str, expected: int, *, uncertain: int) -> WriterProxy | None:
+        """Remember a publisher; None if there are too many on its key of which something is missing."""
+        if len(stream.writers) >= _WRITERS_OF_KEY:
+            writers = stream.writers.values()
+            first = next((each for each in writers if each is not stream.writer and each.request is None), None)
+            if first is None:
+                return None
+            del stream.writers[first.name]
+        writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, uncertain=uncertain)
+        return writer
+
+    def _note(self, writer: WriterProxy) -> bool:
+        if writer.request is None:
+            self.requesting.pop(writer, None)
+            return False
+        self.requesting[writer] = None
+        return True

@@ -1,0 +1,285 @@
+"""What waits to be read: what a reader gets, in which order, and what is counted; with samples made by hand."""
+
+from __future__ import annotations
+
+import threading
+import tracemalloc
+import weakref
+from collections.abc import Sequence
+
+import msgpack
+import pytest
+import zenoh
+
+import nedbus
+from nedbus import Batch, Counts, Mode
+from nedbus.client.receiving import LayoutLookup, PendingQueue
+from nedbus.client.receiving import pending_queue as module
+from nedbus.client.receiving.pending_queue import CAPACITY
+from nedbus.transport import RawSample
+from nedbus_msgs import encoding_of
+from tests.waits import DEADLINE
+
+from .raw_samples import INVALID, OTHER_KEY, drain, junk, make_queue, put, raw, timestamps
+
+STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
+
+
+@pytest.mark.parametrize(
+    ("mode", "arriving", "told", "counts"),
+    [
+        ("every", [raw(1), raw(5)], [0, 0, 3], Counts(received=3, lost=3)),
+        ("every", [raw(3, payload=INVALID), raw(4)], [0, 2], Counts(received=2, lost=2, invalid=1)),
+        ("latest", [raw(3), raw(4)], [2], Counts(received=1, lost=2, dropped=2)),
+    ],
+)
+def test_loss_is_told_by_the_next_sample_that_is_read(
+    mode: Mode, arriving: list[RawSample], told: list[int], counts: Counts
+) -> None:
+    """Behind a gap; an invalid sample takes no loss with it, nor one that is superseded."""
+    pending_queue = make_queue(mode)
+    put(pending_queue, [raw(0)])
+    put(pending_queue, arriving)
+    assert [sample.lost for sample in drain(pending_queue)] == told
+    assert pending_queue.counts == counts
+
+
+def test_gap_within_a_settled_stream_is_told_by_the_sample_behind_it() -> None:
+    """Many samples of one stream are looked at together only while none is absent."""
+    pending_queue = make_queue("every")
+    for start in range(0, 2000, 50):
+        put(pending_queue, [raw(number) for number in range(start, start + 50)])
+    assert not any(sample.lost for sample in drain(pending_queue))
+    put(pending_queue, [raw(number) for number in range(2000, 2050) if number not in {2020, 2021, 2049}])
+    assert [sample.lost for sample in drain(pending_queue)] == [0] * 20 + [2] + [0] * 26
+    put(pending_queue, [raw(number) for number in range(2050, 2100)])
+    assert [sample.lost for sample in drain(pending_queue)] == [1] + [0] * 49
+    assert pending_queue.counts == Counts(received=2097, lost=3)
+
+
+def test_latest_gives_the_newest_of_each_key(caplog: pytest.LogCaptureFixture) -> None:
+    """A newer sample of a key takes the place of the one that waits, which is counted as dropped, and is no warning."""
+    pending_queue = make_queue("latest")
+    put(pending_queue, [raw(0, key=OTHER_KEY, publisher="b"), *(raw(each, timestamp=each) for each in range(1, 1001))])
+    assert pending_queue.counts == Counts(dropped=999)
+    assert [(each.vehicle, each.message.timestamp) for each in drain(pending_queue)] == [("2", 1), ("1", 1000)]
+    assert pending_queue.counts == Counts(received=2, dropped=999)
+    assert not caplog.messages
+
+
+def test_invalid_samples_are_counted_and_logged_once_for_each_key(caplog: pytest.LogCaptureFixture) -> None:
+    """Whatever arrives, the good samples come through, and a flood of junk writes one line.
+
+    What has not the size of our payloads is decoded before it may take the place of a valid sample.
+    """
+    latest = make_queue("latest")
+    put(latest, [raw(0, timestamp=5), junk(b"junk")])
+    assert timestamps(latest) == [5]
+    caplog.clear()
+    pending_queue = make_queue("every")
+    wrong_key = raw(None, key="nedbus/*/vehicle_local_position")
+    put(pending_queue, [junk(b"junk"), junk(b""), junk(bytes(5000)), wrong_key, raw(None, timestamp=7)])
+    assert timestamps(pending_queue) == [7]
+    assert pending_queue.counts == Counts(received=1, invalid=4)
+    assert len(caplog.messages) == 2
+
+
+def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known of a key is kept for 10,000 of them, here 10; messages on others come all the same."""
+    monkeypatch.setattr("nedbus.client.receiving.decoder.MAX_KEYS", 10)
+    pending_queue = make_queue("every")
+    tracemalloc.start()
+    for number in range(2000):
+        put(pending_queue, [raw(None, key=f"nedbus/{number}/vehicle_local_position")])
+        assert len(drain(pending_queue)) == 1
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 100_000
+
+
+def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
+    """One question for all, not for every message, and not only once: their publishers may come later."""
+    now, asked, payloads = 0.0, list[float](), [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
+
+    def find() -> dict[int, Sequence[str]]:
+        asked.append(now)
+        return {}
+
+    lookup = LayoutLookup(find, now=lambda: now)
+    while now < 250.0:
+        lookup.learn(payloads)
+        now += 0.5
+    assert asked == [0.0, 2.0, 7.0, 17.0, 47.0, 107.0, 167.0, 227.0]
+
+
+def test_only_layouts_that_are_needed_are_remembered() -> None:
+    """An answer may explain thousands: what nobody sends does not keep a layout out that somebody does."""
+    known = dict.fromkeys(range(9, 2000), ("timestamp", "x"))
+    lookup = LayoutLookup(lambda: known)
+    for layout in range(1500, 1520):
+        lookup.learn([msgpack.packb([layout, 1, 2.0])])
+    assert list(lookup.newer) == list(range(1500, 1516))
+
+
+def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    """A layout with a name of 100,000 characters is one short line."""
+    LayoutLookup(lambda: {1500: ["timestamp", 100_000 * "x"]}).learn([msgpack.packb([1500, 1, 2])])
+    [line] = caplog.messages
+    assert line.startswith("layout 1500 is newer than this reader; not read: xxx")
+    assert len(line) < 1000
+
+
+def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
+    """A peer that never answers holds up nobody; the lookup is closed all the same."""
+    answering = threading.Event()
+
+    def find() -> dict[int, Sequence[str]]:
+        answering.wait(DEADLINE)
+        return {9: ("timestamp", "x")}
+
+    lookup = LayoutLookup(find)
+    with pytest.raises(nedbus.UnknownLayoutError):
+        lookup.check(msgpack.packb([9, 1, 2.0]))
+    assert not lookup.newer
+    answering.set()
+    lookup.close()
+    lookup.check(msgpack.packb([9, 1, 2.0]))
+
+
+def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout() -> None:
+    """Whoever received in another thread lets the reader look again, whether there is something or not."""
+    pending_queue = make_queue("every")
+    assert not pending_queue.wait(0.0)
+    put(pending_queue, [raw(0)])
+    assert pending_queue.wait(None)
+    drain(pending_queue)
+    assert not pending_queue.wait(0.0)
+    woken: list[bool] = []
+    pending_queue.on_wake = lambda: woken.append(True)
+    pending_queue.wake()
+    assert pending_queue.wait(None)
+    assert woken
+    pending_queue.end()
+    assert pending_queue.wait(None)
+
+
+# A reader that is slower than the data
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
+    """Return a queue of mode `every` for 10 samples, of which 4 are kept as they are."""
+    monkeypatch.setattr(module, "CAPACITY", 10)
+    monkeypatch.setattr(module, "_FRESH", 4)
+    return make_queue("every")
+
+
+def test_oldest_are_dropped_counted_and_warned_of_once(small: PendingQueue, caplog: pytest.LogCaptureFixture) -> None:
+    """The reader goes on with what is newer, knows how many it missed, not as lost, and the log says so once."""
+    assert CAPACITY == 65_536
+    for start in range(0, 40, 10):
+        assert (small.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
+        put(small, [raw(number, timestamp=number + 1) for number in range(start, start + 10)])
+    samples = drain(small)
+    assert [(sample.message.timestamp, sample.lost) for sample in samples] == [(each, 0) for each in range(31, 41)]
+    assert small.counts == Counts(received=10, dropped=30)
+    assert caplog.messages == ["queue: the reader is slower than the data: messages are dropped"]
+
+
+def test_losses_before_dropped_samples_are_told_by_a_later_one_of_that_key(small: PendingQueue) -> None:
+    """Nothing lost in transit goes untold because the sample behind the gap was dropped."""
+    put(small, [raw(0), raw(3), raw(0, key=OTHER_KEY, publisher="b"), raw(2, key=OTHER_KEY, publisher="b"), raw(5)])
+    put(small, [raw(number) for number in range(6, 15)])
+    put(small, [raw(3, key=OTHER_KEY, publisher="b")])
+    samples = drain(small)
+    assert [(sample.vehicle, sample.lost) for sample in samples if sample.lost] == [("1", 3), ("2", 1)]
+    assert samples[-1].vehicle == "2"
+    assert small.counts == Counts(received=10, lost=4, dropped=5)
+
+
+def test_losses_before_a_dropped_sample_survive_invalid_ones(small: PendingQueue) -> None:
+    """They wait for the next sample of that key that a reader gets."""
+    put(small, [raw(0), raw(3)])
+    put(small, [raw(number, payload=INVALID) for number in range(4, 13)])
+    put(small, [raw(13)])
+    assert [sample.lost for sample in drain(small)] == [2]
+    assert small.counts == Counts(received=1, lost=2, dropped=2, invalid=9)
+
+
+@pytest.mark.parametrize("in_batches", [False, True])
+def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: bool) -> None:
+    """Zenoh's sample holds the buffer in which it was received: what waits behind others is kept without it.
+
+    It keeps its place in the sequence, stamp and provenance.
+    """
+    encodings = [encoding_of(f"source{number}", frozenset({"timestamp"})) for number in range(9)]
+    arriving = [raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number]) for number in range(9)]
+    arrived = [weakref.ref(each) for each in arriving]
+    while arriving:
+        put(small, [arriving.pop(0)])
+    assert [each() is None for each in arrived] == [False] * 5 + [True] * 4
+    if in_batches:
+        batch = small.pop_batch()
+        assert batch is not None
+        assert batch.sequence.tolist() == list(range(9))
+        sent, provenances = batch.sent.tolist(), list(batch.provenances)
+    else:
+        samples = drain(small)
+        sent, provenances = [sample.sent or 0 for sample in samples], [sample.provenance for sample in samples]
+    assert sent == [STAMP.get_time_as_ntp64().as_nanos() if number % 2 else 0 for number in range(9)]
+    assert [(each.source, len(each.missing)) for each in provenances] == [(f"source{each}", 52) for each in range(9)]
+
+
+def test_ring_that_was_full_dropped_what_is_absent(caplog: pytest.LogCaptureFixture) -> None:
+    """What Zenoh's ring pushed out, unread, was dropped here, and not lost in transit; the log says so once.
+
+    Only what comes out of a full ring is in doubt: a gap after that is a loss again.
+    """
+    pending_queue = make_queue("every")
+    put(pending_queue, [raw(0), raw(1)])
+    put(pending_queue, [raw(50), raw(51), raw(60)], overflowed=True)
+    put(pending_queue, [raw(100)], overflowed=True)
+    put(pending_queue, [raw(101), raw(105)])
+    assert [sample.lost for sample in drain(pending_queue)] == [0] * 7 + [3]
+    assert pending_queue.counts == Counts(received=8, lost=3, dropped=48 + 8 + 39)
+    assert len(caplog.messages) == 1
+
+
+# Batches
+
+
+def take_batch(pending_queue: PendingQueue) -> Batch:
+    batch = pending_queue.pop_batch()
+    assert batch is not None
+    return batch
+
+
+def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
+    """In mode latest a batch has one message of each key, and all that was lost before it."""
+    pending_queue = make_queue("latest")
+    put(pending_queue, [raw(0), raw(3), raw(4)])
+    batch = take_batch(pending_queue)
+    assert (batch.sequence.tolist(), batch.lost) == ([4], 2)
+    assert pending_queue.counts == Counts(received=1, lost=2, dropped=2)
+
+
+def test_losses_come_with_the_batch_in_which_the_gap_is() -> None:
+    """What is too much for one batch takes its losses into the next."""
+    pending_queue = make_queue("every")
+    put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
+    first, second = take_batch(pending_queue), take_batch(pending_queue)
+    assert (len(first), len(second)) == (4096, 902)
+    assert (first.lost, second.lost) == (0, 2)
+
+
+def test_reader_that_changes_its_form_is_told_each_loss_once() -> None:
+    """Samples and batches of one subscription share what was lost."""
+    pending_queue = make_queue("every")
+    put(pending_queue, [raw(0), raw(5)])
+    assert sum(sample.lost for sample in drain(pending_queue)) == 4
+    put(pending_queue, [raw(6), raw(9)])
+    assert take_batch(pending_queue).lost == 2
+    put(pending_queue, [raw(11)])
+    assert [sample.lost for sample in drain(pending_queue)] == [1]
+    put(pending_queue, [raw(12)])
+    assert take_batch(pending_queue).lost == 0
