@@ -47,6 +47,8 @@ class Retransmission:
         requesting = self._queue.requesting
         if self._queue.waiting <= _BEHIND:
             for writer in requesting:
+                if len(self._open) >= _OPEN:
+                    break
                 if writer not in self._open and self._has_room(writer):
                     self._ask(writer, now)
         return filled, _POLL if self._open else _SOON if requesting else _IDLE
@@ -75,7 +77,7 @@ class Retransmission:
         if writer.uncertain:
             return len(share) < _OPEN_BEGINNINGS
         of_key = sum(each.stream is writer.stream for each in share)
-        return len(self._open) < _OPEN and of_key < _OPEN_OF_KEY
+        return of_key < _OPEN_OF_KEY
 
     def _ask(self, writer: WriterProxy, now: float) -> None:
         numbers = self._queue.next_request(writer, now)

@@ -101,6 +101,7 @@ class StatefulReader:
     ) -> list[Arrival]:
         """Return what can be delivered after an answer to a publisher's retransmission request."""
         delivered = writer.on_retransmission(found, ended=ended, now=now)
+        self.requesting.pop(writer, None)  # others come first
         self._note(writer)
         return delivered
 
