@@ -112,7 +112,7 @@ class Receiver:
             self.pump()
             return self._queue.wait(timeout)
         self._by_reader = True
-        if not self._receiving.acquire(blocking=False):
+        if not self._receiving.acquire(timeout=_PAUSE):  # housekeeping has it for less
             return self._queue.wait(None)
         try:
             self._reader, self._reader_waits = threading.get_ident(), True
