@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 import time
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from types import FrameType
 
 import msgpack
 import pytest
@@ -303,3 +305,24 @@ def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
     rejections.close()
     with pytest.raises(ClosedError):
         bus.rejections()
+
+
+def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None:
+    """A reader that waits for each sample takes it with 22 calls of Python functions, in five classes of the client."""
+    called: list[list[str]] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            called[-1].append(frame.f_code.co_qualname)
+
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+        for number in range(20):
+            publish(publisher, number + 2)
+            called.append([])
+            sys.setprofile(note)
+            next(subscription)
+            sys.setprofile(None)
+    usual = sorted(called, key=len)[10]
+    assert len(usual) <= 22
+    classes = {name.partition(".")[0] for name in usual if name[0].isupper()}
+    assert classes == {"Subscription", "Receiver", "PendingQueue", "StatefulReader", "Decoder"}
