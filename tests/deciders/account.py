@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple, Protocol
 from unittest import mock
@@ -21,23 +21,18 @@ from .raw_samples import INVALID, name_of, raw
 UNLIMITED: Final = 100_000
 """More messages than any life of a publisher sends."""
 
-LATE: Final = "late messages and duplicates are read, in mode latest"
-PARTIAL: Final = "a retransmission with its last message is taken for complete"
-SHORTCUT: Final = "the number that is expected of one publisher of a key is taken for it when another sends it"
-FORGOTTEN: Final = "a heartbeat during a request is forgotten: not counted if its publisher ends"
-
 
 class Setting(NamedTuple):
-    """`keeps`: the cache of each publisher, in messages. `capacity` of the reader's queue. `begins`: see Recovery.
+    """What a world begins with.
 
-    `settled`: messages of one publisher in a row after which shortcuts may be taken.
+    `keeps`: the cache of each publisher, in messages. `capacity`: of the queue. `begins`: of a publisher that is
+    heard by a heartbeat first, that message is asked for.
     """
 
     mode: Mode = "every"
     keeps: tuple[int, ...] = (UNLIMITED,)
     capacity: int = UNLIMITED
     begins: bool = True
-    settled: int = 5
 
 
 class Request(NamedTuple):
@@ -55,8 +50,6 @@ class Account(Protocol):
     is given up that these do not complete. `read`: the timestamps of one message or many, and the losses told.
     """
 
-    known_faults: frozenset[str]
-
     def __init__(self, setting: Setting) -> None: ...
     def put(self, batch: Sequence[RawSample], *, overflowed: bool) -> None: ...
     def heartbeat(self, key: str, publisher: str, number: int) -> None: ...
@@ -72,8 +65,6 @@ class Account(Protocol):
 
 class QueueAccount(PendingQueue):
     """The account as PendingQueue keeps it, with a clock of the test's."""
-
-    known_faults: frozenset[str] = frozenset()
 
     def __init__(self, setting: Setting) -> None:
         self._begins, self._now = setting.begins, 0.0
@@ -148,13 +139,10 @@ class Life:
 
 
 class World:
-    """Publishers, the link to one reader, and what it got. Each public method is a step; positions are taken modulo.
+    """Publishers, the link to one reader, and what it got. Each public method is a step; positions are taken modulo."""
 
-    Steps do not cause `spared` faults.
-    """
-
-    def __init__(self, setting: Setting, account: Account, *, spared: Collection[str] = ()) -> None:
-        self.setting, self.account, self._spared = setting, account, spared
+    def __init__(self, setting: Setting, account: Account) -> None:
+        self.setting, self.account = setting, account
         self.flight: list[tuple[Life, int]] = []
         self.open: list[Request] = []
         self.intact = True
@@ -182,11 +170,10 @@ class World:
         life.invalid.update([life.sent - 1] * invalid)
 
     def restart(self, slot: int) -> None:
-        if SHORTCUT not in self._spared or self.setting.settled == UNLIMITED:
-            life = self._running[slot % len(self._running)]
-            life.keeps, life.given_up = 0, True
-            self._running[life.slot] = Life(len(self._lives), life.slot, self.setting.keeps[life.slot])
-            self._lives.append(self._running[life.slot])
+        life = self._running[slot % len(self._running)]
+        life.keeps, life.given_up = 0, True
+        self._running[life.slot] = Life(len(self._lives), life.slot, self.setting.keeps[life.slot])
+        self._lives.append(self._running[life.slot])
 
     def deliver(self, count: int, dropped: int = 0) -> None:
         """Put what comes next; `dropped`: out of a channel that was full, and dropped up to this many of the oldest."""
@@ -205,10 +192,9 @@ class World:
         self._take(position, count)
 
     def delay(self, position: int, count: int, twice: int = 0) -> None:
-        if not (self._latest and LATE in self._spared):
-            taken = self._take(position, count)
-            self.flight[:0] = taken * twice
-            self.flight += taken
+        taken = self._take(position, count)
+        self.flight[:0] = taken * twice
+        self.flight += taken
 
     def link(self, broken: int) -> None:
         """Break the link, or let the time pass in which a new publisher may have sent something before."""
@@ -230,8 +216,6 @@ class World:
         request = requests[position % len(requests)]
         life, numbers = self._lives[int(request.publisher.partition(":")[0])], request.numbers
         assert 0 <= numbers.start < numbers.stop <= life.sent
-        if PARTIAL in self._spared:
-            missing = -(missing & -missing)  # and all behind it
         kept = [number for number in numbers if life.sent - life.keeps <= number]
         found = [number for place, number in enumerate(kept) if not missing >> place & 1]
         life.given_up |= bool(final) and found != kept
@@ -285,9 +269,8 @@ class World:
         return counts.received + counts.lost + counts.dropped + counts.invalid
 
     def _unknown(self, life: Life) -> int:
-        """Return how many messages may have been sent before the reader heard of this life, or be forgotten."""
-        known = life.known if life in self._running or FORGOTTEN not in self._spared else max(life.arrived, default=-1)
-        return life.known - known + (0 if life.exact else min(life.read, default=known + 1))
+        """Return how many messages may have been sent before the reader heard of this life."""
+        return 0 if life.exact else min(life.read, default=life.known + 1)
 
     def _take(self, position: int, count: int) -> list[tuple[Life, int]]:
         start = position % max(1, len(self.flight))
