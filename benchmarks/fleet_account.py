@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from nedbus.client.qos import TOPIC_QOS
+from nedbus_msgs import TOPICS
 
 
 def account(published: Mapping[str, Sequence[Any]], reports: Mapping[str, Any]) -> dict[str, dict[str, int]]:
@@ -39,7 +39,7 @@ def _account(name: str, published: Mapping[str, Sequence[Any]], report: Mapping[
             holes.append((first, report["streams"][stream][0]))
         if expected < count:
             holes.append((expected, count))
-        cache = TOPIC_QOS[stream.split("/")[1]].cache
+        cache = TOPICS[stream.split("/")[1]].kept
         kept += sum(_kept(hole, starts, cache) for hole in holes)
     counted = report["lost"] + report["dropped"]
     return {

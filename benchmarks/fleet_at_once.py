@@ -11,10 +11,9 @@ import time
 from typing import Any, Final
 
 import numpy as np
+from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE, encode_array
 
 import nedbus
-from nedbus_msgs import FIELD_TYPES, PAYLOAD_SIZE
-from nedbus_msgs.arrays import encode_array
 
 from .forms.fields import FIELDS
 from .forms.nedbus_ends import TOPIC

@@ -21,10 +21,9 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE, encode_array
 
 import nedbus
-from nedbus_msgs import FIELD_TYPES, PAYLOAD_SIZE
-from nedbus_msgs.arrays import encode_array
 
 from .fleet_plan import SLOT, Part
 from .forms.fields import FIELDS

@@ -31,8 +31,8 @@ import math, sys, time
 import numpy as np
 import nedbus
 from benchmarks.forms.fields import FIELDS
-from nedbus_msgs import FIELD_TYPES, PAYLOAD_SIZE
-from nedbus_msgs.arrays import encode_array
+from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE
+from tests.first_message import encode_array
 vehicles, rate, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
 messages = np.repeat(nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles)
 for name in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):

@@ -13,7 +13,7 @@ config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
 with suppress(KeyboardInterrupt), zenoh.open(config) as session:
-    samples = session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(100))
+    samples = session.declare_subscriber("nedbus/*/vehicle_local_position", zenoh.handlers.RingChannel(100))
     while True:
         sample = samples.recv()
         array = msgpack.unpackb(sample.payload.to_bytes())

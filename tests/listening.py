@@ -7,21 +7,22 @@ from collections.abc import Callable, Generator
 from typing import Any, Self, cast
 
 import nedbus
-from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
+from nedbus.sources import Absence, LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.transport import Session
 
 from .waits import DEADLINE
 
 
 class Listener:
-    """A live source that listens: the messages that were not received yet, and all rejections, in order."""
+    """A live source that listens: the messages that were not received yet, all rejections, and what is absent now."""
 
     def __init__(self, text: str, *, routers: tuple[str, ...] = (), router: Session | None = None) -> None:
         source = parse_source(text).open_source(vehicle="1", routers=routers)
         assert isinstance(source, LiveSource)
-        self._events = cast("Generator[SourceMessage | Rejection | None]", source.listen(router))
+        self._events = cast("Generator[SourceMessage | Rejection | Absence | None]", source.listen(router))
         self.messages: list[SourceMessage] = []
         self.rejections: list[Rejection] = []
+        self.absence = Absence()
         self.turn()
 
     @property
@@ -34,6 +35,8 @@ class Listener:
         event = next(self._events)
         if isinstance(event, SourceMessage):
             self.messages.append(event)
+        elif isinstance(event, Absence):
+            self.absence = event
         elif event is not None:
             self.rejections.append(event)
 

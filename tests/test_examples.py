@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTS = {
     "position.py": " m up",
     "position_async.py": "Counts(received=",
-    "fleet.py": "vehicle 1: 5 streams",
+    "fleet.py": "vehicle 1: 12 streams",
     "compare_estimators.py": "estimator 1: ",
     "batches.py": " m/s",
     "plain_zenoh.py": "nedbus/1/vehicle_local_position timestamp ",

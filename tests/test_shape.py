@@ -24,6 +24,7 @@ FLOORS = [
     "errors", "extras", "whole_file", "log_event", "transport", "settings", "client", "recording", "sources", "daemon",
     "monitoring", "doctor", "bridges", "web", "cli",
 ]  # fmt: skip
+MESSAGE_FILES = sorted(path.stem for path in ROOT.glob("schemas/nedbus_msgs/messages/[a-z]*.py"))
 # Packages that only these files import, by folder; nothing else says who may use Zenoh.
 ONLY_BY_FOLDER = {
     "zenoh": {
@@ -34,31 +35,33 @@ ONLY_BY_FOLDER = {
         "downsampler query_server",
         "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",
     },
-    "msgpack": {"nedbus_msgs": "wire"},
+    "msgpack": {"nedbus_msgs/codecs": "msgpack"},
     "xxhash": {"nedbus/transport": "rmw_zenoh"},
     "numpy": {
-        "nedbus_msgs": "arrays", "nedbus/client": "batch", "nedbus/sources": "ulog",
-        "nedbus/recording": "ulog arrays plot", "nedbus/web": "stream tracks background plots",
+        "nedbus_msgs": "arrays", "nedbus_msgs/codecs": "arrays", "nedbus/client": "batch", "nedbus/sources": "ulog",
+        "nedbus/recording": "ulog arrays alignment utc plot", "nedbus/web": "stream tracks background plots",
     },
     "bokeh": {"nedbus/web": "background map_plot playback plots send serve server style table tracks viewer"},
     "tornado": {"nedbus/web": "server"},
     "PIL": {"nedbus/web": "background"},
     "pydantic": {
-        "nedbus_msgs": "position px4_types fast_path wire", "nedbus/settings": "model load",
+        "nedbus_msgs": "message px4_types validation other", "nedbus_msgs/codecs": "msgpack",
+        "nedbus_msgs/messages": " ".join(MESSAGE_FILES), "nedbus/settings": "model load",
         "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
     },
     "pydantic_core": {
-        "nedbus_msgs": "px4_types position fast_path wire", "nedbus/client/publishing": "publisher_registry",
+        "nedbus_msgs": "px4_types message validation", "nedbus_msgs/codecs": "msgpack",
+        "nedbus/client/publishing": "publisher_registry",
         "nedbus/settings": "load",
     },
     "pydantic_settings": {"nedbus/settings": "model load"},
-    "typing_extensions": {"nedbus/client": "sample"},
+    "typing_extensions": {"nedbus_msgs": "functions", "nedbus/client": "sample subscription"},
     "pyulog": {"nedbus/recording": "ulog"},
     "mcap": {"nedbus/recording": "writer reader chunks records"},
     "lz4": {"nedbus/recording": "records"},
     "zstandard": {"nedbus/recording": "records"},
-    "pandas": {"nedbus/recording": "arrays"},
-    "polars": {"nedbus/recording": "arrays"},
+    "pandas": {"nedbus/recording": "arrays alignment"},
+    "polars": {"nedbus/recording": "arrays alignment"},
     "matplotlib": {"nedbus/recording": "plot"},
     "pymavlink": {"nedbus/sources": "mavlink", "nedbus/doctor": "mavlink"},
     "serial": {"nedbus/sources": "mavlink_link"},
@@ -114,7 +117,7 @@ def test_imports_point_down() -> None:
         if top in ONLY:
             assert path in ONLY[top], where
         elif top == "nedbus_msgs" and package == "nedbus":
-            assert inner in ([], ["arrays"]), f"{where}: import from nedbus_msgs, or nedbus_msgs.arrays for NumPy"
+            assert inner in ([], ["arrays"], ["messages"]), f"{where}: import from nedbus_msgs, or .arrays for NumPy"
         elif top == "nedbus":
             assert package == "nedbus", f"{where}: nedbus_msgs knows nothing of the service"
             if inner and floor in FLOORS:
@@ -184,7 +187,20 @@ def test_public_interface_is_sorted_and_complete(name: str) -> None:
 # What a public signature may mention besides what nedbus exports.
 KNOWN = {*dir(builtins), *typing.__all__, "Path", "np", "npt", "pd", "pl", "zenoh"}
 # The model's fields are int, float, bool and pairs of floats, with PX4's ranges.
-KNOWN |= {"Uint64", "Uint8", "Bool", "Float32", "Float32x2", "Float64"}
+KNOWN |= {
+    "Definition",
+    "M",
+    "datetime",
+    "Library",
+    "np",
+    "npt",
+    "Uint64",
+    "Uint8",
+    "Bool",
+    "Float32",
+    "Float32x2",
+    "Float64",
+}
 
 
 def annotations_of(public: type | typing.Callable[..., object]) -> typing.Iterator[str]:
@@ -193,7 +209,7 @@ def annotations_of(public: type | typing.Callable[..., object]) -> typing.Iterat
         yield from inspect.get_annotations(public).values()
     elif inspect.isclass(public):
         yield from (text for name, text in inspect.get_annotations(public).items() if not name.startswith("_"))
-        for name, member in vars(public).items():
+        for name, member in list(vars(public).items()):
             function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
             made_by_users = name == "__init__" and not re.search(r"get one from|from `connect", public.__doc__ or "")
             if inspect.isfunction(function) and (not name.startswith("_") or made_by_users):

@@ -6,7 +6,8 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from nedbus_msgs import FIELD_TYPES, LAYOUTS, VehicleLocalPosition, downgrade
+from nedbus_msgs import VehicleLocalPosition
+from tests.first_message import FIELD_TYPES, LAYOUTS, downgrade
 
 LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
 """Real flight logs, which tests marked `logs` read where they are."""
@@ -27,10 +28,10 @@ class UlogWriter:
         self._layout = layout
         self._ids: dict[tuple[str, int], int] = {}
         self.data = bytearray(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + struct.pack("<Q", 0))
-        self._message("B", bytes(40))
+        self.put("B", bytes(40))
         if system_id is not None:
             key = b"int32_t MAV_SYS_ID"
-            self._message("P", bytes([len(key)]) + key + struct.pack("<i", system_id))
+            self.put("P", bytes([len(key)]) + key + struct.pack("<i", system_id))
         self._defined: set[str] = set()
 
     def define(self, topics: Iterable[str], *, without: Sequence[str] = ()) -> None:
@@ -38,17 +39,17 @@ class UlogWriter:
         self._fields = [name for name in self._fields if name not in without]
         for topic in topics:
             text = "".join(f"{self._field_type(name)} {name};" for name in self._fields) + "uint8_t[3] _padding0;"
-            self._message("F", f"{topic}:{text}".encode())
+            self.put("F", f"{topic}:{text}".encode())
             self._defined.add(topic)
 
     def add(self, topic: str, message: VehicleLocalPosition, *, instance: int = 0, **raw: object) -> None:
         """Write one message; `raw` overrides fields with values that the model rejects."""
         if (topic, instance) not in self._ids:
             self._ids[topic, instance] = len(self._ids)
-            self._message("A", struct.pack("<BH", instance, self._ids[topic, instance]) + topic.encode())
+            self.put("A", struct.pack("<BH", instance, self._ids[topic, instance]) + topic.encode())
         values = downgrade(message, self._layout) | raw
         body = b"".join(self._pack(name, values[name]) for name in self._fields)
-        self._message("D", struct.pack("<H", self._ids[topic, instance]) + body)
+        self.put("D", struct.pack("<H", self._ids[topic, instance]) + body)
 
     def write(self, path: Path) -> Path:
         """Write the file."""
@@ -65,7 +66,8 @@ class UlogWriter:
             return struct.pack(f"<2{code}", *value)
         return struct.pack(f"<{'B' if code == '?' else code}", value)
 
-    def _message(self, kind: str, body: bytes) -> None:
+    def put(self, kind: str, body: bytes) -> None:
+        """Write one message of the format itself."""
         self.data += struct.pack("<HB", len(body), ord(kind)) + body
 
 

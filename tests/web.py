@@ -22,8 +22,8 @@ from nedbus.web import Where, serve_live
 from nedbus.web.fleet import Fleet, Line, Picture
 from nedbus.web.stream import Stream
 from nedbus.web.viewer import Viewer
-from nedbus_msgs import Address, Provenance, Selection
-from nedbus_msgs.arrays import to_array
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Provenance, Selection
+from nedbus_msgs.codecs.arrays import arrays_of
 from tests.messages import VALID, VLP, message
 from tests.waits import DEADLINE, repeating
 
@@ -44,7 +44,9 @@ class Sky:
         """Receive a message now."""
         stamp = round((self.time - NOON) * 1e6) + 1_000_000
         fields = {name: value for name, value in {**VALID, **fields}.items() if value is not None}
-        sample = Sample(message(stamp, **fields), address, round(self.time * 1e9))
+        other = BY_TOPIC[address.topic]
+        heard = message(stamp, **fields) if other is DEFAULT else other.model.model_validate({"timestamp": stamp})
+        sample = Sample(heard, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
         self.fleet.add(sample, self.time)
 
@@ -72,14 +74,17 @@ def sky() -> Sky:
 
 def write_flight(folder: Path, topics: Mapping[str, Callable[[float], Mapping[str, object]]], *, seconds: int) -> Path:
     """Record vehicle "wing" at 10 Hz, with the fields that each topic has then."""
-    file, messages, streams, stamps = folder / "flight.mcap", [], [], []
-    for time in range(0, seconds * 1_000_000, 100_000):  # µs
-        for topic, fields in topics.items():
-            messages.append(message(1_000_000 + time, **{**VALID, **fields(time / 1e6)}))
-            streams.append((Address("wing", topic), Provenance("sim")))
-            stamps.append(1_700_000_000_000_000_000 + 1000 * time)
+    file = folder / "flight.mcap"
     with RecordingWriter(file) as writer:
-        writer.write(to_array(messages), streams, logged=stamps, published=stamps)
+        for time in range(0, seconds * 1_000_000, 100_000):  # µs
+            stamps = [1_700_000_000_000_000_000 + 1000 * time]
+            for topic, fields in topics.items():
+                definition = BY_TOPIC[topic]
+                given = {**(VALID if definition is DEFAULT else {}), **fields(time / 1e6)}
+                array = arrays_of(definition).of([definition.model(timestamp=1_000_000 + time, **given)])
+                writer.write(
+                    array, definition, [(Address("wing", topic), Provenance("sim"))], logged=stamps, published=stamps
+                )
     return file
 
 

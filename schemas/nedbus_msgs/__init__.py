@@ -1,6 +1,9 @@
-"""The contract of nedbus: the message, its layouts, its topics and its wire format; no I/O, no Zenoh."""
+"""The contract of nedbus: the messages, their layouts, topics and wire format; no I/O, no Zenoh."""
 
-from .cdr import decode_cdr, encode_cdr
+from .codecs.cdr import decode_with, encode_with
+from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
+from .declaration import ALL, RELEASES, Layout, Topic
+from .definition import Definition, Row
 from .errors import (
     AddressError,
     DecodeError,
@@ -17,9 +20,11 @@ from .frames import (
     NoOrigin,
     Vector,
     enu_to_ned,
+    euler_to_quaternion,
     flu_to_frd,
     frd_to_flu,
     ned_to_enu,
+    quaternion_to_euler,
     to_global,
     to_local,
     variances_enu_to_ned,
@@ -28,33 +33,31 @@ from .frames import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from .layouts import (
-    CURRENT,
-    LAYOUTS,
-    WIRE_LAYOUTS,
-    Layout,
-    downgrade,
-    find_layout,
-    upgrade,
-    upgrade_fields,
-    upgraded_names,
+from .functions import (
+    DEFAULT,
+    decode,
+    definition_of,
+    encode,
 )
-from .position import Message, VehicleLocalPosition
-from .provenance import Provenance, encoding_of, provenance_of
+from .layouts import upgrade_fields, upgrade_with
+from .message import Message
+from .messages.vehicle_local_position import VehicleLocalPosition
+from .msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
+from .other import define
+from .provenance import Provenance, encoding_of, message_name_of, provenance_of
+from .px4_types import BASES, FieldType, field_type
+from .registry import BY_TOPIC, MESSAGES, TOPICS
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2_topics import ros2_topic_of, split_ros2_topic
-from .ros2_types import ROS2_TYPE, ROS2_TYPES, dds_type, layout_of_type_hash, message_definition, type_hash
-from .rows import FIELD_TYPES, Row, explain_unknown_field
-from .schema import json_schema, layout_table
+from .ros2_types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
+from .rules import UnitQuaternion
+from .schema import json_schema_of, layout_table_of, schema_of
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
     DEFAULT_TOPIC,
-    ENCODING,
-    TOPICS,
     Address,
     Selection,
-    Topic,
     ack_key,
     address_of_alive_key,
     address_of_rejected_key,
@@ -67,94 +70,21 @@ from .topics import (
     status_key,
     vehicle_name,
 )
-from .wire import PAYLOAD_LIMIT, PAYLOAD_SIZE, decode, decode_row, describe, encode, encode_fields, encode_row
 
 __all__ = [
-    "ANY",
-    "CURRENT",
-    "DEFAULT_PREFIX",
-    "DEFAULT_TOPIC",
-    "DOUBT_FLAGS",
-    "ENCODING",
-    "FIELD_TYPES",
-    "FLAGS",
-    "LAYOUTS",
-    "PAYLOAD_LIMIT",
-    "PAYLOAD_SIZE",
-    "RESET_COUNTERS",
-    "ROS2_TYPE",
-    "ROS2_TYPES",
-    "TOPICS",
-    "WIRE_LAYOUTS",
-    "Address",
-    "AddressError",
-    "Continuous",
-    "DecodeError",
-    "EncodeError",
-    "Flag",
-    "GlobalPosition",
-    "InvalidMessageError",
-    "Layout",
-    "LayoutError",
-    "MapProjection",
-    "Message",
-    "NedbusError",
-    "NoOrigin",
-    "Provenance",
-    "Quantity",
-    "ResetTracker",
-    "Row",
-    "Selection",
-    "Topic",
-    "UnknownLayoutError",
-    "Vector",
-    "VehicleLocalPosition",
-    "ack_key",
-    "address_of_alive_key",
-    "address_of_rejected_key",
-    "alive_key_expr",
-    "check_prefix",
-    "check_vehicle",
-    "dds_type",
-    "decode",
-    "decode_cdr",
-    "decode_row",
-    "describe",
-    "describe_flags",
-    "downgrade",
-    "encode",
-    "encode_cdr",
-    "encode_fields",
-    "encode_row",
-    "encoding_of",
-    "enu_to_ned",
-    "explain_unknown_field",
-    "find_layout",
-    "flu_to_frd",
-    "frd_to_flu",
-    "get_topic",
-    "json_schema",
-    "layout_of_type_hash",
-    "layout_table",
-    "message_definition",
-    "message_doubts",
-    "ned_to_enu",
-    "provenance_of",
-    "rejected_key_expr",
-    "ros2_topic_of",
-    "schema_key",
-    "split_ros2_topic",
-    "status_key",
-    "to_global",
-    "to_local",
-    "type_hash",
-    "upgrade",
-    "upgrade_fields",
-    "upgraded_names",
-    "variances_enu_to_ned",
-    "variances_ned_to_enu",
-    "vehicle_name",
-    "wrap",
-    "yaw_enu_to_ned",
+    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAGS",
+    "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address", "AddressError", "Codec",
+    "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType", "Flag", "GlobalPosition",
+    "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError", "NedbusError",
+    "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion",
+    "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",
+    "address_of_rejected_key", "alive_key_expr", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of",
+    "dds_type", "decode", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
+    "describe_flags", "encode", "encode_with", "encoding_of", "enu_to_ned", "euler_to_quaternion",
+    "field_type", "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "json_schema_of",
+    "layout_table_of", "message_doubts", "message_name_of", "message_of_type_hash", "ned_to_enu", "provenance_of",
+    "quaternion_to_euler", "read_msg", "rejected_key_expr", "ros2_topic_of", "ros2_type", "ros2_types",
+    "schema_key", "schema_of", "split_ros2_topic", "status_key", "to_global", "to_local", "upgrade_fields",
+    "upgrade_with", "variances_enu_to_ned", "variances_ned_to_enu", "vehicle_name", "wrap", "yaw_enu_to_ned",
     "yaw_ned_to_enu",
-]
+]  # fmt: skip

@@ -32,14 +32,14 @@ class AddressError(NedbusError, ValueError):
 
 
 class LayoutError(NedbusError, ValueError):
-    """Raised when a layout is unknown, or when field names are not those of a layout of VehicleLocalPosition."""
+    """Raised when a layout is unknown, or when field names are not those of a layout."""
 
 
 class DecodeError(NedbusError, ValueError):
-    """Raised when a payload is not a valid VehicleLocalPosition; `reason` is one line."""
+    """Raised when a payload is not a valid message, whose name is `message`; `reason` is one line."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"not a VehicleLocalPosition: {reason}")
+    def __init__(self, reason: str, message: str = "message") -> None:
+        super().__init__(f"not a {message}: {reason}")
         self.reason = reason
 
 
@@ -49,10 +49,10 @@ class UnknownLayoutError(DecodeError):
     `layout` is that number, `count` how many fields follow it, `known` the numbers that can be decoded.
     """
 
-    def __init__(self, layout: int, count: int, known: Sequence[int]) -> None:
+    def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
         readable = ", ".join(map(str, known))
         super().__init__(
-            f"layout {layout} with {count} fields; this reader knows layouts {readable}: update nedbus_msgs"
+            f"layout {layout} with {count} fields; this reader knows layouts {readable}: update nedbus_msgs", message
         )
         self.layout = layout
         self.count = count
@@ -66,9 +66,11 @@ class InvalidMessageError(NedbusError, ValueError):
     `violations` has the field and the rule of each, without the value; `index` is the message's in an array.
     """
 
-    def __init__(self, reason: str, violations: Sequence[tuple[str, str]], *, index: int | None = None) -> None:
+    def __init__(
+        self, reason: str, violations: Sequence[tuple[str, str]], *, message: str, index: int | None = None
+    ) -> None:
         where = "" if index is None else f" at index {index}"
-        super().__init__(f"not a valid VehicleLocalPosition{where}: {reason}")
+        super().__init__(f"not a valid {message}{where}: {reason}")
         self.reason = reason
         self.violations = tuple(violations)
         self.index = index
@@ -77,5 +79,5 @@ class InvalidMessageError(NedbusError, ValueError):
 class EncodeError(NedbusError, ValueError):
     """Raised when values do not fit the types of their fields, because validation was bypassed."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"this message cannot be encoded ({reason}): build it with VehicleLocalPosition(...)")
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(f"this message cannot be encoded ({reason}): build it with {message}(...)")

@@ -1,13 +1,13 @@
-"""The one table of the boolean flags of a message: what each promises, and how it is shown."""
+"""The one table of the boolean flags of a VehicleLocalPosition: what each promises, and how it is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
-if TYPE_CHECKING:
-    from .position import Message
+from .messages.vehicle_local_position import VehicleLocalPosition
+from .rules import FiniteWhile
 
 _PARTLY_BAD: Final = (1, 99)  # the percentages that a share between 0 and 1 is shown with
 
@@ -29,19 +29,20 @@ class Flag:
     inverted: bool = False
 
 
+_FINITE: Final = next(rule.flags for rule in VehicleLocalPosition.RULES if isinstance(rule, FiniteWhile))
+_ROWS: Final[tuple[tuple[str, Literal["estimate", "reference", "terrain"], str, bool], ...]] = (
+    ("xy_valid", "estimate", "xy", False),
+    ("z_valid", "estimate", "z", False),
+    ("v_xy_valid", "estimate", "vxy", False),
+    ("v_z_valid", "estimate", "vz", False),
+    ("heading_good_for_control", "estimate", "", False),
+    ("dead_reckoning", "estimate", "dead reckoning", True),
+    ("xy_global", "reference", "", False),
+    ("z_global", "reference", "", False),
+    ("dist_bottom_valid", "terrain", "", False),
+)
 FLAGS: Final[Mapping[str, Flag]] = {
-    flag.name: flag
-    for flag in (
-        Flag("xy_valid", ("x", "y"), "estimate", "xy"),
-        Flag("z_valid", ("z",), "estimate", "z"),
-        Flag("v_xy_valid", ("vx", "vy"), "estimate", "vxy"),
-        Flag("v_z_valid", ("vz",), "estimate", "vz"),
-        Flag("heading_good_for_control", ("heading",), "estimate"),
-        Flag("dead_reckoning", (), "estimate", "dead reckoning", inverted=True),
-        Flag("xy_global", ("ref_lat", "ref_lon"), "reference"),
-        Flag("z_global", ("ref_alt",), "reference"),
-        Flag("dist_bottom_valid", ("dist_bottom",), "terrain"),
-    )
+    name: Flag(name, tuple(_FINITE.get(name, ())), kind, label, inverted) for name, kind, label, inverted in _ROWS
 }
 """The flags by name: those of the estimate first, in PX4's order."""
 
@@ -70,6 +71,6 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     return ", ".join(grouped + others) or "ok"
 
 
-def message_doubts(message: Message) -> str:
+def message_doubts(message: VehicleLocalPosition) -> str:
     """Return which flags cast doubt on one message, "ok" if none does."""
     return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})

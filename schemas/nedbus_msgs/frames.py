@@ -8,10 +8,11 @@ Source: PX4's MapProjection (azimuthal equidistant, on a sphere), so that a posi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from .position import Message
+from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
 EARTH_RADIUS: Final = 6_371_000.0
 """Radius of PX4's sphere [m]."""
@@ -68,6 +69,27 @@ def variances_enu_to_ned(variances: Vector) -> Vector:
 def wrap(angle: float) -> float:
     """Return the same angle within [-pi, pi]."""
     return math.remainder(angle, math.tau) if math.isfinite(angle) else math.nan
+
+
+def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Return the rotation from body FRD to NED (w, x, y, z) of a roll, a pitch and a heading."""
+    (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw))
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def quaternion_to_euler(q: Sequence[float]) -> Vector:
+    """Return roll, pitch and heading of a rotation from body FRD to NED (w, x, y, z)."""
+    w, x, y, z = q
+    return (
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        math.asin(_clip(2 * (w * y - z * x))),
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,17 +9,18 @@ Almost all messages of a publisher have the same encoding, so both directions ar
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
+from .definition import Definition
 from .errors import AddressError
-from .rows import NAMES
-from .topics import ENCODING
 
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
-_MISSING = re.compile(r"[0-9a-f]{1,14}")
+_MISSING = re.compile(r"[0-9a-f]+")
+_ENCODING = re.compile(r"application/msgpack;px4_msgs/([A-Z][A-Za-z0-9]{0,63})(?:;.*)?")
 _CACHE_SIZE: Final = 1024
 
 
@@ -42,10 +43,11 @@ class Provenance:
 
 
 @lru_cache(_CACHE_SIZE)
-def encoding_of(source: str | None, provided: frozenset[str] | None = None) -> str:
+def encoding_of(definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None) -> str:
     """Return the Zenoh encoding of messages of a source that provides these fields; None stands for all fields."""
-    mask = 0 if provided is None else sum(1 << index for index, name in enumerate(NAMES) if name not in provided)
-    parts = [ENCODING]
+    names = definition.names
+    mask = 0 if provided is None else sum(1 << index for index, name in enumerate(names) if name not in provided)
+    parts = [f"application/msgpack;px4_msgs/{definition.name}"]
     if source is not None:
         parts.append(f"source={source}")
     if mask:
@@ -54,12 +56,20 @@ def encoding_of(source: str | None, provided: frozenset[str] | None = None) -> s
 
 
 @lru_cache(_CACHE_SIZE)
-def provenance_of(encoding: str) -> Provenance:
+def message_name_of(encoding: str) -> str | None:
+    """Return the name of the message that an encoding names; a payload of a known topic is decoded without it."""
+    found = _ENCODING.fullmatch(encoding)
+    return found[1] if found else None
+
+
+@lru_cache(_CACHE_SIZE)
+def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
     """Return the provenance in an encoding; unknown or invalid parts are ignored, as other programs publish too."""
     parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
     source, missing = parts.get("source", ""), parts.get("missing", "")
-    mask = int(missing, 16) if _MISSING.fullmatch(missing) else 0
+    fits = _MISSING.fullmatch(missing) and len(missing) <= math.ceil(len(definition.names) / 4)
+    mask = int(missing, 16) if fits else 0
     return Provenance(
         source if _SOURCE.fullmatch(source) else None,
-        frozenset(name for index, name in enumerate(NAMES) if mask >> index & 1),
+        frozenset(name for index, name in enumerate(definition.names) if mask >> index & 1),
     )

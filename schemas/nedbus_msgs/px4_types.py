@@ -1,23 +1,122 @@
-"""PX4's field types as annotations for Pydantic."""
+"""PX4's field types: one table of the base types, and each type as an annotation for Pydantic."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal
+import re
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Annotated, Any, Final, NamedTuple
 
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-TypeName = Literal["uint64", "uint8", "bool", "float32", "float32[2]", "float64"]
-
 NAN: Final = math.nan
+LONGEST_ARRAY: Final = 1024
+"""Elements of the longest array that a field may be; PX4's longest has 512."""
+
+
+class Base(NamedTuple):
+    """A base type: its format in a struct, its tag in msgpack, its number in a ROS 2 type description, its default."""
+
+    code: str
+    tag: int
+    ros2: int
+    absent: float
+
+
+BASES: Final[Mapping[str, Base]] = {
+    "bool": Base("?", 0xC2, 15, False),
+    "int8": Base("b", 0xD0, 2, 0),
+    "uint8": Base("B", 0xCC, 3, 0),
+    "int16": Base("h", 0xD1, 4, 0),
+    "uint16": Base("H", 0xCD, 5, 0),
+    "int32": Base("i", 0xD2, 6, 0),
+    "uint32": Base("I", 0xCE, 7, 0),
+    "int64": Base("q", 0xD3, 8, 0),
+    "uint64": Base("Q", 0xCF, 9, 0),
+    "float32": Base("f", 0xCA, 10, NAN),
+    "float64": Base("d", 0xCB, 11, NAN),
+}
+
+
+ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """PX4's type of a field, such as `float32[4]`; `length` is None for a single value.
+
+    Raises ValueError for a base type that PX4 does not have, and for an array of no or too many elements.
+    """
+
+    base: str
+    length: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.base not in BASES:
+            raise ValueError(f"{self.base!r} is no type: expected {', '.join(BASES)}, or an array of a fixed length")
+        if self.length is not None and not 0 < self.length <= LONGEST_ARRAY:
+            raise ValueError(f"an array of {self.length}: expected 1 to {LONGEST_ARRAY} elements")
+
+    def __str__(self) -> str:
+        return self.base if self.length is None else f"{self.base}[{self.length}]"
+
+    @cached_property
+    def count(self) -> int:
+        """How many values it has."""
+        return self.length or 1
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes of one value, and its alignment in CDR."""
+        return struct.calcsize("<" + BASES[self.base].code)
+
+    @cached_property
+    def is_float(self) -> bool:
+        """Whether its values may be NaN."""
+        return self.base.startswith("float")
+
+    @cached_property
+    def absent(self) -> object:
+        """What stands for a field that is not provided: NaN, false or 0, in each element of an array."""
+        absent = BASES[self.base].absent
+        return absent if self.length is None else (absent,) * self.length
+
+    @cached_property
+    def limits(self) -> tuple[int, int]:
+        """The least and the greatest integer that it holds."""
+        bits = 8 * self.size
+        return (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+
+    @cached_property
+    def annotation(self) -> Any:
+        """The annotation of a field of this type."""
+        if self.length is not None:
+            return Annotated[tuple[(FieldType(self.base).annotation,) * self.length], Px4Type(str(self))]  # type: ignore[misc] # as many as it has
+        if self.base == "bool":
+            return Annotated[bool, Px4Type(self.base)]
+        if self.is_float:
+            return Annotated[float, Px4Type(self.base)]
+        least, greatest = self.limits
+        return Annotated[int, Field(ge=least, le=greatest), Px4Type(self.base)]
+
+
+@cache
+def field_type(text: str) -> FieldType:
+    """Return a type by PX4's name of it; raise ValueError, as FieldType does, for another text."""
+    found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text)
+    if found is None:
+        raise ValueError(f"{text!r} is no type: expected one such as uint8 or float32[4]")
+    return FieldType(ALIASES.get(found[1], found[1]), None if found[2] is None else int(found[2]))
 
 
 class Px4Type:
     """Mark a field with PX4's name of its type; floats also read "NaN" and "Infinity" in JSON."""
 
-    def __init__(self, name: TypeName) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -31,20 +130,28 @@ class Px4Type:
         )
 
 
-Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1), Px4Type("uint64")]
-Uint8 = Annotated[int, Field(ge=0, le=2**8 - 1), Px4Type("uint8")]
 Bool = Annotated[bool, Px4Type("bool")]
+Int8 = Annotated[int, Field(ge=-(2**7), le=2**7 - 1), Px4Type("int8")]
+Int32 = Annotated[int, Field(ge=-(2**31), le=2**31 - 1), Px4Type("int32")]
+Int64 = Annotated[int, Field(ge=-(2**63), le=2**63 - 1), Px4Type("int64")]
+Uint8 = Annotated[int, Field(ge=0, le=2**8 - 1), Px4Type("uint8")]
+Uint16 = Annotated[int, Field(ge=0, le=2**16 - 1), Px4Type("uint16")]
+Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1), Px4Type("uint32")]
+Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1), Px4Type("uint64")]
 Float64 = Annotated[float, Px4Type("float64")]
 Float32 = Annotated[float, Px4Type("float32")]
 Float32x2 = Annotated[tuple[Float32, Float32], Px4Type("float32[2]")]
+Float32x3 = Annotated[tuple[Float32, Float32, Float32], Px4Type("float32[3]")]
+Float32x4 = Annotated[tuple[Float32, Float32, Float32, Float32], Px4Type("float32[4]")]
+Float32x14 = Annotated[
+    tuple[
+        Float32, Float32, Float32, Float32, Float32, Float32, Float32,
+        Float32, Float32, Float32, Float32, Float32, Float32, Float32,
+    ],
+    Px4Type("float32[14]"),
+]  # fmt: skip
 
 
-def type_name(annotation: Any) -> TypeName:
-    """Return PX4's name of one of these types."""
-    return next(mark.name for mark in reversed(annotation.__metadata__) if isinstance(mark, Px4Type))
-
-
-TYPES: Final[Mapping[TypeName, Any]] = {
-    type_name(each): each for each in (Uint64, Uint8, Bool, Float32, Float32x2, Float64)
-}
-"""The annotation of each type, by PX4's name of it."""
+def type_of_marks(marks: Iterable[object]) -> FieldType:
+    """Return the type that a field is marked with."""
+    return field_type(next(mark.name for mark in marks if isinstance(mark, Px4Type)))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from .frames import MapProjection, wrap
-from .position import Message
+from .messages.vehicle_local_position import VehicleLocalPosition as Message
 
 Quantity = Literal["xy", "z", "vxy", "vz", "heading", "dist_bottom"]
 

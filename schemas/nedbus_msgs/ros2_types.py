@@ -1,32 +1,30 @@
-"""The ROS 2 types of this message: their names, definitions and RIHS01 hashes, computed from the layouts."""
+"""The ROS 2 types of messages: their names, definitions and RIHS01 hashes, computed from the layouts."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import cache
 from hashlib import sha256
-from typing import Final
+from typing import Any, Final
 
-from .layouts import LAYOUTS, Layout, get_layout
-from .position import VehicleLocalPosition
-from .px4_types import TypeName
+from .declaration import Layout
+from .definition import Definition
+from .px4_types import BASES, FieldType
+from .registry import MESSAGES
 
-ROS2_TYPE: Final = "px4_msgs/msg/VehicleLocalPosition"
-"""The type of all four topics in ROS 2."""
+PACKAGE: Final = "px4_msgs/msg"
+ARRAY: Final = 48  # of type_description_interfaces/msg/FieldType, for an array of fixed size
+NESTED: Final = 1  # of the same, for a message
+Described = tuple[str, int, int, str]
+"""A field in a type description: name, type, length of its array, and the type of a message within the message."""
 
-_V0_TYPES: Final = ("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0")
-ROS2_TYPES: Final = (ROS2_TYPE, *_V0_TYPES)
-"""All types that hold this message; the last two are those of PX4's translation node for layout V0."""
+_RIHS01: Final = "RIHS01_"
 
-# type_description_interfaces/msg/FieldType: number and, for an array of fixed size, its capacity.
-_FIELD_TYPES: Final[Mapping[TypeName, tuple[int, int]]] = {
-    "uint8": (3, 0),
-    "uint64": (9, 0),
-    "float32": (10, 0),
-    "float64": (11, 0),
-    "bool": (15, 0),
-    "float32[2]": (48 + 10, 2),
-}
+
+def ros2_type(definition: Definition[Any]) -> str:
+    """Return the ROS 2 type of a message, such as px4_msgs/msg/VehicleAttitude."""
+    return f"{PACKAGE}/{definition.name}"
 
 
 def dds_type(name: str) -> str:
@@ -35,50 +33,62 @@ def dds_type(name: str) -> str:
     return f"{package}::{kind}::dds_::{type_name}_"
 
 
-def type_hash(layout: str, *, ros2_type: str = ROS2_TYPE) -> str:
-    """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016), `RIHS01_` and 64 hex digits.
-
-    Raises LayoutError for an unknown layout.
-    """
-    return _hash(get_layout(layout), ros2_type)
-
-
-def message_definition(layout: str) -> str:
-    """Return the .msg file of a layout, with unit and meaning of each field.
-
-    Raises LayoutError for an unknown layout.
-    """
-    described = VehicleLocalPosition.model_fields
-    lines = []
-    for name in get_layout(layout).fields:
-        meaning = described[name].description if name in described else "Greatest height above ground [m]"
-        lines.append(f"{get_layout(layout).type_of(name)} {name}  # {meaning}\n")
-    return "".join(lines)
+@cache
+def ros2_types() -> Mapping[str, Definition[Any]]:
+    """Return the message of each ROS 2 type that holds a known one; PX4's translation node has types of its own."""
+    types = {ros2_type(definition): definition for definition in MESSAGES.values()}
+    for definition in MESSAGES.values():
+        types |= {alias: definition for names in definition.aliases.values() for alias in names}
+    return types
 
 
-def layout_of_type_hash(text: str) -> str | None:
-    """Return the name of the layout whose type has this hash, with `RIHS01_` or without; None if it is unknown."""
-    return _LAYOUTS.get(text.removeprefix(_RIHS01).lower())
+def hash_of(layout: Layout, ros2_type: str) -> str:
+    """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016): `RIHS01_`, 64 hex digits."""
+    return type_hash(ros2_type, [described(name, kind) for name, kind in layout.types.items()])
 
 
-def _hash(layout: Layout, ros2_type: str) -> str:
-    fields = [_describe(name, layout.type_of(name)) for name in layout.fields]
-    description = {
-        "type_description": {"type_name": ros2_type, "fields": fields},
-        "referenced_type_descriptions": [],
+def type_hash(name: str, fields: Sequence[Described], within: Sequence[tuple[str, Sequence[Described]]] = ()) -> str:
+    """Return the RIHS01 hash of a type with these fields, and of the types within it, sorted by name."""
+    content = {
+        "type_description": _description(name, fields),
+        "referenced_type_descriptions": [_description(*each) for each in within],
     }
-    return _RIHS01 + sha256(json.dumps(description).encode()).hexdigest()
+    return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
 
 
-def _describe(name: str, kind: TypeName) -> dict[str, object]:
-    number, capacity = _FIELD_TYPES[kind]
-    type_description = {"type_id": number, "capacity": capacity, "string_capacity": 0, "nested_type_name": ""}
-    return {"name": name, "type": type_description}
+def described(name: str, kind: FieldType) -> Described:
+    """Return how a type description has a field."""
+    capacity = kind.length or 0
+    return name, BASES[kind.base].ros2 + (ARRAY if capacity else 0), capacity, ""
 
 
-_RIHS01 = "RIHS01_"
-_LAYOUTS: Final = {
-    _hash(layout, ros2_type).removeprefix(_RIHS01): layout.name
-    for layout in LAYOUTS.values()
-    for ros2_type in (ROS2_TYPES if layout.name == "V0" else (ROS2_TYPE,))
-}
+def _description(name: str, fields: Sequence[Described]) -> dict[str, object]:
+    listed = [
+        {
+            "name": field,
+            "type": {"type_id": kind, "capacity": capacity, "string_capacity": 0, "nested_type_name": nested},
+        }
+        for field, kind, capacity, nested in fields
+    ]
+    return {"type_name": name, "fields": listed}
+
+
+def definition_text(definition: Definition[Any], layout: Layout) -> str:
+    """Return the .msg file of a layout, with unit and meaning of each field."""
+    lines = ((f"{kind} {name}", definition.meaning(name)) for name, kind in layout.types.items())
+    return "".join(f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines)
+
+
+def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
+    """Return the message and the layout whose type has this hash, with `RIHS01_` or without; None if unknown."""
+    return _by_hash().get(text.removeprefix(_RIHS01).lower())
+
+
+@cache
+def _by_hash() -> Mapping[str, tuple[Definition[Any], Layout]]:
+    return {
+        hash_of(layout, name).removeprefix(_RIHS01): (definition, layout)
+        for definition in MESSAGES.values()
+        for layout in definition.layouts.values()
+        for name in (ros2_type(definition), *definition.aliases.get(layout.name, ()))
+    }

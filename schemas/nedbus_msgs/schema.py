@@ -1,27 +1,33 @@
-"""The schema of the contract: the JSON Schema of the message, and the layouts with their fields and types."""
+"""The schema of a message: its JSON Schema, and its layouts with their fields and types."""
 
 from __future__ import annotations
 
-from .layouts import LAYOUTS
-from .position import VehicleLocalPosition
+from typing import Any
+
+from .definition import Definition
 
 
-def json_schema() -> dict[str, object]:
+def schema_of(definition: Definition[Any]) -> dict[str, object]:
+    """Return what publishers answer to who asks for a message: its JSON Schema and its layouts."""
+    return {"json_schema": json_schema_of(definition), "layouts": layout_table_of(definition)}
+
+
+def json_schema_of(definition: Definition[Any]) -> dict[str, object]:
     """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
-    schema = VehicleLocalPosition.model_json_schema()
+    schema = definition.model.model_json_schema()
     # JSON has no NaN, and a writer should leave out what is not provided: defaults stay in the model.
     for field in schema["properties"].values():
         field.pop("default", None)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def layout_table() -> list[dict[str, object]]:
+def layout_table_of(definition: Definition[Any]) -> list[dict[str, object]]:
     """Return every layout as name, number on the wire (or None), and its fields in order, each with name and type."""
     return [
         {
             "name": layout.name,
             "wire": layout.wire,
-            "fields": [{"name": field, "type": layout.type_of(field)} for field in layout.fields],
+            "fields": [{"name": name, "type": str(kind)} for name, kind in layout.types.items()],
         }
-        for layout in LAYOUTS.values()
+        for layout in definition.layouts.values()
     ]

@@ -1,58 +1,36 @@
-"""The one table of the four topics, addresses and selections of them, and their key expressions."""
+"""Addresses and selections of streams, and their key expressions."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
 from typing import Final, cast
 
+from .declaration import Topic
 from .errors import AddressError
+from .registry import TOPICS
 
 ANY: Final = "*"
 DEFAULT_TOPIC: Final = "vehicle_local_position"
 DEFAULT_PREFIX: Final = "nedbus"
-ENCODING: Final = "application/msgpack;px4_msgs/VehicleLocalPosition"
-"""Zenoh encoding of a payload; a payload can be decoded without it."""
 
+_TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+_TOPIC_LENGTH: Final = 64
+_SIMILAR: Final = 0.9  # of two names from which one is taken for a misspelling of the other
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
 _RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is thinned
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One uORB topic.
-
-    `instances`: it has uORB instances, one per EKF.
-    `rate`: the nominal rate at which PX4 publishes or logs it [Hz].
-    `doc`: who publishes it.
-    """
-
-    name: str
-    instances: bool
-    rate: float
-    doc: str
-
-
-TOPICS: Final[Mapping[str, Topic]] = {
-    topic.name: topic
-    for topic in (
-        Topic("vehicle_local_position", False, 100.0, "EKF2, or the EKF2 selector of several"),
-        Topic("vehicle_local_position_groundtruth", False, 50.0, "simulators (SITL, HITL)"),
-        Topic("external_ins_local_position", False, 50.0, "an external INS driver (VectorNav, ...)"),
-        Topic("estimator_local_position", True, 2.0, "each EKF instance, when several run"),
-    )
-}
-
-
 @dataclass(frozen=True, slots=True, order=True)
 class Address:
-    """The address of a stream: vehicle, topic and, for estimator_local_position, the uORB instance.
+    """The address of a stream: vehicle, topic and, where the topic has instances, the uORB instance.
 
-    Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, an unknown topic, a missing instance
-    where the topic has instances, or an instance where it has none.
+    Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, a topic that `get_topic` rejects, a
+    missing instance where the topic has instances, or an instance where it has none.
     """
 
     vehicle: str
@@ -143,9 +121,10 @@ class Selection:
         """Return the Zenoh key expression that matches the keys of these addresses."""
         if self.topic == ANY:
             return f"{prefix}/{self.vehicle}/**"
-        if get_topic(self.topic).instances:
-            return f"{prefix}/{self.vehicle}/{self.topic}/{ANY if self.instance is None else self.instance}"
-        return f"{prefix}/{self.vehicle}/{self.topic}"
+        key, instances = f"{prefix}/{self.vehicle}/{self.topic}", get_topic(self.topic).instances
+        if self.instance is not None:
+            return f"{key}/{self.instance}"
+        return {True: f"{key}/{ANY}", False: key, None: f"{key}/**"}[instances]
 
     def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression that matches the liveliness tokens of these addresses."""
@@ -182,9 +161,9 @@ def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Addres
     return Address.from_key(f"{prefix}/{key.removeprefix(begin)}", prefix=prefix)
 
 
-def schema_key(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query for the JSON Schema and the layouts that a publisher knows."""
-    return f"{prefix}/@schema/VehicleLocalPosition"
+def schema_key(message: str, *, prefix: str = DEFAULT_PREFIX) -> str:
+    """Return the key to query for the JSON Schema and the layouts of a message that a publisher knows."""
+    return f"{prefix}/@schema/{message}"
 
 
 def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
@@ -198,10 +177,21 @@ def ack_key(key_expr: str) -> str:
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by its name; raise AddressError for an unknown one."""
-    if not isinstance(name, str) or name not in TOPICS:
-        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}")
-    return TOPICS[name]
+    """Return a topic by its name; one that has no file here may be any other of PX4's, with instances or without.
+
+    Raises AddressError for what is not lower_snake_case, and for a misspelling of a topic that has a file here.
+    """
+    known = TOPICS.get(name) if isinstance(name, str) else None
+    return known or _other_topic(name)
+
+
+@lru_cache(1024)
+def _other_topic(name: object) -> Topic:
+    if not isinstance(name, str) or not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
+        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}, or another of PX4's in lower_snake_case")
+    if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
+        raise AddressError("topic", name, f"one of {', '.join(meant)}, which it nearly is")
+    return Topic(name, 0.0, "another topic of PX4's", instances=None)
 
 
 def vehicle_name(vehicle: str | int) -> str:
@@ -221,7 +211,7 @@ def check_vehicle(vehicle: object) -> None:
 def _check_instance(topic: str, instance: int | None) -> None:
     if instance is None:
         return
-    if not get_topic(topic).instances:
+    if get_topic(topic).instances is False:
         raise AddressError("instance", instance, f"none: {topic} has no instances")
     if type(instance) is not int or not 0 <= instance < _INSTANCES:
         raise AddressError("instance", instance, f"0 to {_INSTANCES - 1} for {topic}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from nedbus_msgs import (
         ANY,
+        TOPICS,
         Address,
         Continuous,
         GlobalPosition,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
         ResetTracker,
         Row,
         Selection,
+        Topic,
         Vector,
         VehicleLocalPosition,
         enu_to_ned,
@@ -39,7 +41,8 @@ if TYPE_CHECKING:
         yaw_enu_to_ned,
         yaw_ned_to_enu,
     )
-    from nedbus_msgs.arrays import DTYPE, MessageArray, to_array, to_message
+    from nedbus_msgs.arrays import DTYPE, MessageArray, dtype_of, to_array, to_message
+    from nedbus_msgs.messages import *  # noqa: F403 - each by its name
 
     from .client import (
         AsyncBus,
@@ -80,93 +83,34 @@ if TYPE_CHECKING:
         SourceError,
         UnknownLayoutError,
     )
-    from .recording import addresses_of, missing_of, read
+    from .recording import UtcOffset, addresses_of, align, missing_of, read, utc_of
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "ANY",
-    "DTYPE",
-    "Address",
-    "AddressError",
-    "AddressInUseError",
-    "AsyncBus",
-    "AsyncPublisher",
-    "AsyncSubscription",
-    "Batch",
-    "Bus",
-    "ClosedError",
-    "ConfigError",
-    "ConnectError",
-    "Continuous",
-    "Counts",
-    "DecodeError",
-    "EncodeError",
-    "ForkError",
-    "GlobalPosition",
-    "Health",
-    "Histogram",
-    "InvalidMessageError",
-    "LayoutError",
-    "ListenError",
-    "MapProjection",
-    "Message",
-    "MessageArray",
-    "Mode",
-    "Monitor",
-    "NedbusError",
-    "NoDataError",
-    "NoOrigin",
-    "OutputError",
-    "PkiError",
-    "Provenance",
-    "Publisher",
-    "Quantity",
-    "RejectionReport",
-    "Rejections",
-    "ResetTracker",
-    "Row",
-    "Sample",
-    "Selection",
-    "Session",
-    "SourceError",
-    "StreamHealth",
-    "Subscription",
-    "Tls",
-    "UnknownLayoutError",
-    "Vector",
-    "VehicleLocalPosition",
-    "addresses_of",
-    "connect",
-    "connect_async",
-    "enu_to_ned",
-    "flu_to_frd",
-    "frd_to_flu",
-    "missing_of",
-    "ned_to_enu",
-    "read",
-    "to_array",
-    "to_global",
-    "to_local",
-    "to_message",
-    "variances_enu_to_ned",
-    "variances_ned_to_enu",
-    "yaw_enu_to_ned",
-    "yaw_ned_to_enu",
-]
+    "ANY", "DTYPE", "TOPICS", "Address", "AddressError", "AddressInUseError", "AsyncBus", "AsyncPublisher",
+    "AsyncSubscription", "Batch", "Bus", "ClosedError", "ConfigError", "ConnectError", "Continuous", "Counts",
+    "DecodeError", "EncodeError", "ForkError", "GlobalPosition", "Health", "Histogram", "InvalidMessageError",
+    "LayoutError", "ListenError", "MapProjection", "Message", "MessageArray", "Mode", "Monitor", "NedbusError",
+    "NoDataError", "NoOrigin", "OutputError", "PkiError", "Provenance", "Publisher", "Quantity", "RejectionReport",
+    "Rejections", "ResetTracker", "Row", "Sample", "Selection", "Session", "SourceError", "StreamHealth",
+    "Subscription", "Tls", "Topic", "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition",
+    "addresses_of", "align", "connect", "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd", "frd_to_flu",
+    "missing_of", "ned_to_enu", "read", "to_array", "to_global", "to_local", "to_message", "utc_of",
+    "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
+]  # fmt: skip
 
 # `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.
 _MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client")
 _WITH_NUMPY = {
     "DTYPE": "nedbus_msgs.arrays",
     "MessageArray": "nedbus_msgs.arrays",
+    "dtype_of": "nedbus_msgs.arrays",
     "to_array": "nedbus_msgs.arrays",
     "to_message": "nedbus_msgs.arrays",
     "Batch": "nedbus.client",
-    "addresses_of": "nedbus.recording",
-    "missing_of": "nedbus.recording",
-    "read": "nedbus.recording",
+    **dict.fromkeys(("UtcOffset", "addresses_of", "align", "missing_of", "read", "utc_of"), "nedbus.recording"),
 }
 
 
@@ -179,6 +123,8 @@ if not TYPE_CHECKING:  # else type checkers would accept any name
 
     def __getattr__(name: str) -> object:
         """Import what a public name needs when it is first used."""
+        if name not in __all__ and name in _import_module("nedbus_msgs").MESSAGES:
+            return getattr(_import_module("nedbus_msgs.messages"), name)
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         if name in _WITH_NUMPY:

@@ -48,6 +48,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "published": Event("a live stream is published"),
     "back": Event("a stale stream is published again"),
     "stale": Event("nothing arrived of a live stream for 3 s: it is no longer published"),
+    "silent": Event("a vehicle announces a topic, and nothing of it arrives while others do"),
     "rejected": Event("what arrived is not published: it is no message, or violates a rule"),
     "duplicate": Event("another process publishes the same stream"),
     "rebooted": Event("a vehicle rebooted"),
@@ -56,6 +57,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     # a reader
     "invalid": Event("what arrived, a message or an answer, cannot be read"),
     "newer-layout": Event("messages have a layout that is newer than this reader"),
+    "described": Event("a message that has no file here is read as its publisher describes it"),
     "dropped": Event("a reader is slower than the data: messages are dropped"),
     "incomplete": Event("not all vehicles are known, or not all answers kept"),
     "slow-reader": Event("a lossless publisher waits for a reader, or gives it up"),

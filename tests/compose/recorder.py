@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import nedbus
 from nedbus.sources import SourceMessage
-from nedbus_msgs import Address, VehicleLocalPosition, upgrade
+from nedbus_msgs import BY_TOPIC, Address, Message, upgrade_with
 from tests.replays import open_replay
 from tests.waits import DEADLINE, wait_for
 
@@ -54,10 +54,10 @@ class Flight:
 
     def __init__(self, source: str = "sim:") -> None:
         self._messages: Iterator[SourceMessage] = open_replay(source).messages
-        self._known: dict[tuple[Address, int], tuple[int, VehicleLocalPosition]] = {}
+        self._known: dict[tuple[Address, int], tuple[int, Message]] = {}
         self._counts: dict[Address, int] = {}
 
-    def indices(self, arrived: Iterable[tuple[Address, VehicleLocalPosition]]) -> dict[Address, list[int]]:
+    def indices(self, arrived: Iterable[tuple[Address, Message]]) -> dict[Address, list[int]]:
         """Return, for each address, the indices of its messages in the order of their arrival; all must be right."""
         indices: dict[Address, list[int]] = {}
         for address, message in arrived:
@@ -66,15 +66,16 @@ class Flight:
             indices.setdefault(address, []).append(index)
         return indices
 
-    def last(self, address: Address) -> VehicleLocalPosition:
+    def last(self, address: Address) -> Message:
         """Return the last message of an address; the flight must have an end."""
         *_, last = (each for each in self._messages if each.address == address)
-        return upgrade(last.fields)
+        message: Message = upgrade_with(BY_TOPIC[address.topic], last.fields)
+        return message
 
-    def _find(self, address: Address, timestamp: int) -> tuple[int, VehicleLocalPosition]:
+    def _find(self, address: Address, timestamp: int) -> tuple[int, Message]:
         while (address, timestamp) not in self._known:
             published = next(self._messages)
-            message = upgrade(published.fields)
+            message = upgrade_with(BY_TOPIC[published.address.topic], published.fields)
             index = self._counts.get(published.address, 0)
             self._counts[published.address] = index + 1
             self._known[published.address, message.timestamp] = index, message

@@ -9,7 +9,7 @@ import pytest
 
 import nedbus
 from nedbus import Mode
-from nedbus_msgs import TOPICS, Address, VehicleLocalPosition
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Message
 from tests.messages import VLP
 from tests.waits import DEADLINE, wait_for
 
@@ -18,17 +18,17 @@ from .recorder import Flight, is_whole
 
 pytestmark = [pytest.mark.compose, pytest.mark.timeout(600)]
 
-STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in TOPICS.items()}
-COUNT = 1500  # samples: about 7 s of all streams
+STREAMS = {Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()}
+COUNT = 2000  # samples: about 7 s of all streams
 
 
-def parse(output: str) -> list[tuple[Address, VehicleLocalPosition]]:
+def parse(output: str) -> list[tuple[Address, Message]]:
     """Return what `nedbus echo --json` printed."""
     rows = [json.loads(line) for line in output.splitlines()]
     return [
         (
             Address(row["vehicle"], row["topic"], row["instance"]),
-            VehicleLocalPosition.model_validate_json(json.dumps(row["message"])),
+            BY_TOPIC[row["topic"]].model.model_validate_json(json.dumps(row["message"])),
         )
         for row in rows
     ]
@@ -42,7 +42,7 @@ def parse(output: str) -> list[tuple[Address, VehicleLocalPosition]]:
     ],
 )
 def test_host_and_container_read_everything(make_stack: StartStack, file: str, networks: dict[str, list[str]]) -> None:
-    """Every sample of all four topics, with the right values; `compose stop` ends the service with exit code 0.
+    """Every sample of all topics, with the right values; `compose stop` ends the service with exit code 0.
 
     Beside the service, and behind a second router, on a network that the service is not on; the host through that one.
     """

@@ -10,8 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import PAYLOAD_SIZE, DecodeError, Row, VehicleLocalPosition, decode_row, encode_cdr, encode_row
-from nedbus_msgs.arrays import DTYPE, decode_array, decode_cdr_array, encode_array, to_array, to_row, valid_mask
+from nedbus_msgs import DecodeError, VehicleLocalPosition
+from nedbus_msgs.arrays import DTYPE, to_array
+from tests.first_message import (
+    PAYLOAD_SIZE,
+    decode_array,
+    decode_cdr_array,
+    decode_row,
+    encode_array,
+    encode_cdr,
+    encode_row,
+    to_row,
+    valid_mask,
+)
 
 from .strategies import BREAKING, BROKEN, FLIGHTS, KEEPING, REAL, messages, pack_full_width
 
@@ -21,7 +32,7 @@ Case = tuple[VehicleLocalPosition, list[tuple[str, object]]]  # a message, and w
 CASES = st.lists(st.tuples(messages(), st.lists(BROKEN, max_size=2)), min_size=1, max_size=4)
 
 
-def row_or_none(payload: bytes) -> Row | None:
+def row_or_none(payload: bytes) -> VehicleLocalPosition | None:
     try:
         return decode_row(payload)
     except DecodeError:

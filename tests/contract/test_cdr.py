@@ -14,16 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from nedbus_msgs import (
-    LAYOUTS,
-    DecodeError,
-    EncodeError,
-    LayoutError,
-    VehicleLocalPosition,
-    decode_cdr,
-    downgrade,
-    encode_cdr,
-)
+from nedbus_msgs import DecodeError, EncodeError, LayoutError, VehicleLocalPosition
+from tests.first_message import LAYOUTS, decode_cdr, downgrade, encode_cdr
 
 from .strategies import DATA, messages
 
@@ -37,7 +29,7 @@ def rosbags_type(layout: str) -> str:
     """Return the name under which rosbags knows this layout."""
     name = f"oracle/msg/L{layout.replace('.', '')}"
     if name not in STORE.types:
-        lines = [f"{LAYOUTS[layout].type_of(field)} {field}\n" for field in LAYOUTS[layout].fields]
+        lines = [f"{LAYOUTS[layout].types[field]!s} {field}\n" for field in LAYOUTS[layout].fields]
         STORE.register(get_types_from_msg("".join(lines), name))
     return name
 
@@ -117,7 +109,7 @@ def test_padding_may_hold_anything(layout: str, size: int) -> None:
     """ROS leaves garbage of its memory in the padding: it is ignored."""
     # No byte of these is 0, so that each 0 is padding.
     filled = {"bool": True, "uint8": 255, "uint64": 2**64 - 1, "float32": 0.1, "float64": 0.1}
-    values = {name: filled.get(LAYOUTS[layout].type_of(name), (0.1, 0.1)) for name in LAYOUTS[layout].fields}
+    values = {name: filled.get(str(LAYOUTS[layout].types[name]), (0.1, 0.1)) for name in LAYOUTS[layout].fields}
     payload = encode_cdr(values, layout=layout)
     head, data = payload[:4], payload[4:]
     dirty = head + bytes(byte or 255 - index % 200 for index, byte in enumerate(data))

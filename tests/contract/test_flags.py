@@ -6,16 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import (
-    DOUBT_FLAGS,
-    FIELD_TYPES,
-    FLAGS,
-    Message,
-    Row,
-    VehicleLocalPosition,
-    describe_flags,
-    message_doubts,
-)
+from nedbus_msgs import DOUBT_FLAGS, FLAGS, VehicleLocalPosition, describe_flags, message_doubts
+from tests.first_message import FIELD_TYPES, row_of
 
 from .strategies import FLAG_FIELDS, messages
 
@@ -62,6 +54,6 @@ def test_shares_are_described(shares: dict[str, float], text: str) -> None:
 @given(messages(), st.booleans())
 def test_doubts_have_no_percentage_in_one_message(message: VehicleLocalPosition, as_row: bool) -> None:
     """A message, or a row, is described by its own flags: it either has a doubt or not."""
-    either: Message = Row._make(message.__dict__.values()) if as_row else message
+    either = row_of(message) if as_row else message
     assert message_doubts(either) == describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
     assert "%" not in message_doubts(either)

@@ -14,7 +14,6 @@ from nedbus_msgs import (
     GlobalPosition,
     MapProjection,
     NoOrigin,
-    Row,
     VehicleLocalPosition,
     enu_to_ned,
     flu_to_frd,
@@ -28,6 +27,7 @@ from nedbus_msgs import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
+from tests.first_message import row_of
 from tests.ulogs import LOGS
 
 RADIUS = 6_371_000.0
@@ -64,7 +64,7 @@ def test_local_position_is_global_as_px4_has_it() -> None:
 def test_row_has_a_global_position_too() -> None:
     """The functions accept rows and models alike."""
     message = with_origin(x=0.5, y=1.0, z=-2.0)
-    assert to_global(Row._make(tuple(message.__dict__.values()))) == to_global(message)
+    assert to_global(row_of(message)) == to_global(message)
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,8 @@ import pytest
 from hypothesis import given
 from pydantic import ValidationError
 
-from nedbus_msgs import (
-    CURRENT,
-    FIELD_TYPES,
-    LAYOUTS,
-    WIRE_LAYOUTS,
-    LayoutError,
-    VehicleLocalPosition,
-    downgrade,
-    find_layout,
-    layout_table,
-    upgrade,
-)
+from nedbus_msgs import DEFAULT, LayoutError, VehicleLocalPosition
+from tests.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 
 from .strategies import DATA, bits, messages
 
@@ -34,7 +24,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "seeds"
 def test_layout_is_the_documents(name: str) -> None:
     """Names, order and types of each document's message definition are those of the table."""
     layout = LAYOUTS[name]
-    assert [[field, layout.type_of(field)] for field in layout.fields] == SEEDS[name]["fields"]
+    assert [[field, str(kind)] for field, kind in layout.types.items()] == SEEDS[name]["fields"]
 
 
 @pytest.mark.parametrize("name", SEEDS)
@@ -55,7 +45,7 @@ def test_table_has_px4s_layouts() -> None:
     assert [(row["name"], row["wire"], len(row["fields"])) for row in table] == [
         ("1.13", None, 45), ("1.14", None, 46), ("1.15", None, 49), ("V0", 0, 52), ("1.16", 1, 53),
     ]  # fmt: skip
-    assert {number: layout.name for number, layout in WIRE_LAYOUTS.items()} == {0: "V0", 1: "1.16"}
+    assert {number: layout.name for number, layout in DEFAULT.wire_layouts.items()} == {0: "V0", 1: "1.16"}
     assert [row["name"] for row in table] == list(LAYOUTS)
     assert CURRENT.fields == tuple(FIELD_TYPES)
     assert all(len(set(layout.fields)) == len(layout.fields) for layout in LAYOUTS.values())

@@ -10,7 +10,8 @@ from typing import cast
 
 import pytest
 
-from nedbus_msgs import Continuous, MapProjection, ResetTracker, VehicleLocalPosition, upgrade
+from nedbus_msgs import Continuous, MapProjection, ResetTracker, VehicleLocalPosition
+from tests.first_message import upgrade
 from tests.messages import VLP
 from tests.replays import open_replay
 from tests.ulogs import LOGS

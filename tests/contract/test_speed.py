@@ -16,8 +16,12 @@ PROGRAM = """
 import json, sys, time, timeit
 import msgpack
 from pydantic import ConfigDict, create_model
-from nedbus_msgs import VehicleLocalPosition, decode, decode_row, encode, encode_fields, encode_row
-from nedbus_msgs.arrays import decode_array, encode_array, to_array, valid_mask
+from nedbus_msgs import DEFAULT, VehicleLocalPosition, codec_of
+from nedbus_msgs.arrays import arrays_of, to_array
+codec, arrays = codec_of(DEFAULT), arrays_of(DEFAULT)
+decode, decode_row = codec.decode, codec.decode_row
+encode, encode_fields, encode_row = codec.encode, codec.encode_fields, codec.encode_row
+decode_array, encode_array, valid_mask = arrays.decode, arrays.encode, arrays.valid_mask
 
 cases = {}
 for flight, content in json.load(open(sys.argv[1])).items():

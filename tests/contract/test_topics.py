@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from nedbus_msgs import (
     ANY,
+    DEFAULT,
     DEFAULT_TOPIC,
     TOPICS,
     Address,
@@ -35,12 +36,13 @@ def addresses(draw: st.DrawFn) -> Address:
     return Address(draw(CHUNK), topic.name, instance)
 
 
-def test_topics_are_px4s_four() -> None:
+def test_topics_of_the_first_message_are_px4s_four() -> None:
     """The four uORB topics of VehicleLocalPosition; only the estimators' has instances; EKF2's is the default."""
     assert DEFAULT_TOPIC == "vehicle_local_position"
     alone = ("vehicle_local_position", "vehicle_local_position_groundtruth", "external_ins_local_position")
     instances = {**dict.fromkeys(alone, False), "estimator_local_position": True}
-    assert {name: topic.instances for name, topic in TOPICS.items()} == instances
+    assert {name: topic.instances for name, topic in DEFAULT.topics.items()} == instances
+    assert list(TOPICS)[:4] == list(instances)
 
 
 def test_keys_are_as_documented() -> None:
@@ -53,9 +55,21 @@ def test_keys_are_as_documented() -> None:
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
     assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
     assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
-    assert schema_key() == "nedbus/@schema/VehicleLocalPosition"
+    assert schema_key("VehicleLocalPosition") == "nedbus/@schema/VehicleLocalPosition"
     assert status_key("a-1") == "nedbus/@service/a-1/status"
     assert ack_key(Selection("vehicle_local_position").key_expr()) == "nedbus/*/vehicle_local_position/@ack"
+
+
+def test_topic_without_a_file_has_instances_or_not() -> None:
+    """Any topic of PX4 has keys; a selection of one that is not known matches it with an instance and without."""
+    alone, second = Address("7", "wheel_encoders"), Address("7", "wheel_encoders", 1)
+    assert (alone.key(), second.key()) == ("nedbus/7/wheel_encoders", "nedbus/7/wheel_encoders/1")
+    selection = Selection("wheel_encoders")
+    key_expr = zenoh.KeyExpr(selection.key_expr())
+    for address in (alone, second):
+        assert Address.from_key(address.key()) == address
+        assert selection.matches(address)
+        assert key_expr.includes(address.key())
 
 
 @given(addresses(), PREFIXES)
@@ -112,7 +126,11 @@ def test_selection_does_not_include_other_keys(address: Address, prefix: str) ->
     ("vehicle", "topic", "instance", "what"),
     [
         *((vehicle, "vehicle_local_position", None, "vehicle") for vehicle in ("", "a/b", "@alive", "*", "x" * 65)),
-        ("7", "vehicle_attitude", None, "topic"),
+        ("7", "vehicle_attitud", None, "topic"),
+        ("7", "Attitude", None, "topic"),
+        ("7", "a" * 65, None, "topic"),
+        ("7", "vehicle_attitude", 0, "instance"),
+        ("7", "wheel_encoders", 256, "instance"),
         ("7", "vehicle_local_position", 0, "instance"),
         *(("7", "estimator_local_position", instance, "instance") for instance in (None, 256, -1)),
     ],

@@ -11,20 +11,16 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from nedbus_msgs import (
-    FIELD_TYPES,
     PAYLOAD_LIMIT,
-    PAYLOAD_SIZE,
     DecodeError,
     EncodeError,
     UnknownLayoutError,
     VehicleLocalPosition,
     decode,
-    decode_row,
-    downgrade,
     encode,
-    encode_row,
 )
-from nedbus_msgs.arrays import decode_array, to_message
+from nedbus_msgs.arrays import to_message
+from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE, decode_array, decode_row, downgrade, encode_row
 
 from .strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
 

@@ -14,7 +14,6 @@ from nedbus import Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, pending_queue, writer_proxy
 from nedbus.client.receiving.writer_proxy import WriterProxy
 from nedbus.transport import RawSample
-from nedbus_msgs import decode
 
 from .raw_samples import INVALID, name_of, raw
 
@@ -68,7 +67,7 @@ class QueueAccount(PendingQueue):
 
     def __init__(self, setting: Setting) -> None:
         self._begins, self._now = setting.begins, 0.0
-        decoder = Decoder(LayoutLookup(dict), prefix="nedbus")
+        decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._now)
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
         self._patience = mock.patch.object(writer_proxy, "_PATIENCE", 1e6)
@@ -105,7 +104,7 @@ class QueueAccount(PendingQueue):
         if batch:
             found = self.pop_batch()
             return None if found is None else (found.messages["timestamp"].tolist(), found.lost)
-        sample = self.pop(decode)
+        sample = self.pop(rows=False)
         return None if sample is None else ([sample.message.timestamp], sample.lost)
 
 

@@ -14,7 +14,8 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.transport import RawSample
-from nedbus_msgs import decode, encode, encoding_of
+from nedbus_msgs import encode
+from tests.first_message import encoding_of
 from tests.messages import message
 
 KEY = "nedbus/1/vehicle_local_position"
@@ -73,7 +74,7 @@ def junk(payload: bytes, key: str = KEY) -> RawSample:
 
 def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> PendingQueue:
     """Return an empty queue."""
-    return PendingQueue(mode, Decoder(LayoutLookup(dict), prefix="nedbus"), name="queue", clock=clock)
+    return PendingQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), name="queue", clock=clock)
 
 
 def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
@@ -84,7 +85,7 @@ def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed
 
 def drain(pending_queue: PendingQueue) -> list[nedbus.Sample]:
     """Take all that is queued."""
-    return list(iter(partial(pending_queue.pop, decode), None))
+    return list(iter(partial(pending_queue.pop, rows=False), None))
 
 
 def timestamps(pending_queue: PendingQueue) -> list[int]:

@@ -9,7 +9,6 @@ import pytest
 
 from nedbus.client.receiving.acknowledgements import MAX_PENDING, AckRequest
 from nedbus.transport import RawSample
-from nedbus_msgs import decode
 
 from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, raw
 
@@ -32,7 +31,7 @@ class Asked:
 
     def take(self, count: int) -> list[str]:
         """Read samples, and return what is answered so far."""
-        assert all(self.queue.pop(decode) for _ in range(count))
+        assert all(self.queue.pop(rows=False) for _ in range(count))
         return self.answered
 
     def put(self, *samples: RawSample) -> list[str]:
@@ -101,7 +100,7 @@ def test_queue_answers_when_the_script_takes_the_message(asked: Asked, payload: 
     asked.put(raw(2), raw(3))
     asked.ask(3, read=True)
     for answered in ([], ["1"]):
-        assert asked.queue.pop(decode) is not None
+        assert asked.queue.pop(rows=False) is not None
         assert asked.answered == answered
     assert asked.queue.pop_batch() is not None
     assert asked.answered == ["1", "3"]

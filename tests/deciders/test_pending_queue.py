@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import tracemalloc
 import weakref
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import suppress
 
 import msgpack
 import pytest
@@ -15,9 +16,11 @@ import nedbus
 from nedbus import Batch, Counts, Mode
 from nedbus.client.receiving import LayoutLookup, PendingQueue
 from nedbus.client.receiving import pending_queue as module
+from nedbus.client.receiving.layout_lookup import Schemas
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.transport import RawSample
-from nedbus_msgs import encoding_of
+from nedbus_msgs import DEFAULT, codec_of
+from tests.first_message import encoding_of
 from tests.waits import DEADLINE
 
 from .raw_samples import INVALID, OTHER_KEY, drain, junk, make_queue, put, raw, timestamps
@@ -97,35 +100,44 @@ def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch
     assert kept < 100_000
 
 
+def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
+    """Ask for what is not known of these, and wait for the answer."""
+    for payload in payloads:
+        with suppress(nedbus.DecodeError):
+            lookup.check(codec_of(DEFAULT), payload)
+    lookup.wait()
+
+
 def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
     """One question for all, not for every message, and not only once: their publishers may come later."""
     now, asked, payloads = 0.0, list[float](), [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
 
-    def find() -> dict[int, Sequence[str]]:
+    def find(_: Collection[str]) -> Schemas:
         asked.append(now)
         return {}
 
     lookup = LayoutLookup(find, now=lambda: now)
     while now < 250.0:
-        lookup.learn(payloads)
+        learn(lookup, payloads)
         now += 0.5
     assert asked == [0.0, 2.0, 7.0, 17.0, 47.0, 107.0, 167.0, 227.0]
 
 
 def test_only_layouts_that_are_needed_are_remembered() -> None:
     """An answer may explain thousands: what nobody sends does not keep a layout out that somebody does."""
-    known = dict.fromkeys(range(9, 2000), ("timestamp", "x"))
-    lookup = LayoutLookup(lambda: known)
+    known = {"VehicleLocalPosition": {number: {"timestamp": "uint64", "x": "float32"} for number in range(9, 2000)}}
+    lookup = LayoutLookup(lambda _: known)
     for layout in range(1500, 1520):
-        lookup.learn([msgpack.packb([layout, 1, 2.0])])
-    assert list(lookup.newer) == list(range(1500, 1516))
+        learn(lookup, [msgpack.packb([layout, 1, 2.0])])
+    assert list(lookup.newer(DEFAULT)) == list(range(1500, 1516))
 
 
 def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     """A layout with a name of 100,000 characters is one short line."""
-    LayoutLookup(lambda: {1500: ["timestamp", 100_000 * "x"]}).learn([msgpack.packb([1500, 1, 2])])
+    known = {"VehicleLocalPosition": {1500: {"timestamp": "uint64", 100_000 * "x": "float32"}}}
+    learn(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
     [line] = caplog.messages
-    assert line.startswith("layout 1500 is newer than this reader; not read: xxx")
+    assert line.startswith("layout 1500 of VehicleLocalPosition is newer than this reader; not read: xxx")
     assert len(line) < 1000
 
 
@@ -133,17 +145,37 @@ def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
     """A peer that never answers holds up nobody; the lookup is closed all the same."""
     answering = threading.Event()
 
-    def find() -> dict[int, Sequence[str]]:
+    def find(_: Collection[str]) -> Schemas:
         answering.wait(DEADLINE)
-        return {9: ("timestamp", "x")}
+        return {"VehicleLocalPosition": {9: {"timestamp": "uint64", "x": "float32"}}}
 
     lookup = LayoutLookup(find)
     with pytest.raises(nedbus.UnknownLayoutError):
-        lookup.check(msgpack.packb([9, 1, 2.0]))
-    assert not lookup.newer
+        lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
+    assert not lookup.newer(DEFAULT)
     answering.set()
     lookup.close()
-    lookup.check(msgpack.packb([9, 1, 2.0]))
+    lookup.check(codec_of(DEFAULT), msgpack.packb([9, 1, 2.0]))
+
+
+def test_what_arrives_while_a_question_is_open_is_asked_for_next() -> None:
+    """Whoever waits gets the answers to both: the second message is not rejected for having come a moment later."""
+    known: Schemas = {name: {1: {"timestamp": "uint64", "x": "float32"}} for name in ("First", "Second")}
+    answering, asked = threading.Event(), list[set[str]]()
+
+    def find(names: Collection[str]) -> Schemas:
+        asked.append(set(names))
+        answering.wait(DEADLINE)
+        return {name: known[name] for name in names}
+
+    lookup = LayoutLookup(find)
+    for name in known:
+        with pytest.raises(nedbus.DecodeError):
+            lookup.definition(name)
+    answering.set()
+    lookup.wait()
+    assert [lookup.definition(name).name for name in known] == ["First", "Second"]
+    assert asked == [{"First"}, {"Second"}]
 
 
 def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout() -> None:

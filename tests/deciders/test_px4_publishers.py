@@ -9,7 +9,8 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4_publishers import AlivePublishers
 from nedbus.sources.px4_streams import NotAcceptedError, Stream, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
-from nedbus_msgs import ROS2_TYPE, DecodeError, dds_type, type_hash
+from nedbus_msgs import DecodeError, dds_type
+from tests.first_message import ROS2_TYPE, type_hash
 from tests.messages import VLP
 
 GID = bytes.fromhex("aabbcc00000000000000000000000000")  # of every PX4 in SITL

@@ -25,7 +25,7 @@ THINNED = f"{KEY}/@rate/5"
 
 def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> ThinnedQueue:
     """Return an empty queue."""
-    return ThinnedQueue(mode, Decoder(LayoutLookup(dict), prefix="nedbus"), max_rate=max_rate, name="queue")
+    return ThinnedQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), max_rate=max_rate, name="queue")
 
 
 def at(

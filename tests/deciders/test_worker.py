@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
@@ -15,7 +15,8 @@ from nedbus.daemon.worker import Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
-from nedbus_msgs import Address, VehicleLocalPosition, decode, encode_fields
+from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition, decode
+from tests.first_message import encode_fields
 from tests.messages import VLP
 
 ONE, TWO = Address("1", VLP), Address("2", VLP)
@@ -57,7 +58,9 @@ class FakeRegistry:
     rejected: list[tuple[Address, Mapping[str, object]]] = field(default_factory=list)
     readers_at: float = 0.0
 
-    def publisher(self, address: Address, *, lossless: bool, source: str) -> SimpleNamespace:
+    def publisher(
+        self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool, source: str
+    ) -> SimpleNamespace:
         if address in self.open:
             raise AddressInUseError(address)
 
@@ -69,7 +72,7 @@ class FakeRegistry:
             self.log.append(f"{self.clock.seconds:g} -{address.vehicle}")
 
         self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
-        self.open[address] = SimpleNamespace(publish=publish, close=close)
+        self.open[address] = SimpleNamespace(publish=publish, close=close, definition=definition or DEFAULT)
         return self.open[address]
 
     def is_published(self, address: Address) -> bool:

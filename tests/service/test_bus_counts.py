@@ -216,7 +216,7 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
     assert subscription.counts.invalid > 0
     assert len(asked) == 1
     unread = [text for text in caplog.messages if "not read" in text]
-    assert unread == ["layout 9 is newer than this reader; not read: brand_new"]
+    assert unread == ["layout 9 of VehicleLocalPosition is newer than this reader; not read: brand_new"]
 
 
 @pytest.mark.parametrize(
@@ -272,7 +272,7 @@ def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None
     rejections = bus.rejections()
     wait_for_reader(raw, ADDRESS.rejected_key())
     for key, payload in (
-        ("nedbus/@rejected/7/nothing", b'{"reason": "no such topic"}'),
+        ("nedbus/@rejected/7/Nothing", b'{"reason": "no such topic"}'),
         (ADDRESS.rejected_key(), b"no JSON"),
         (Address("8", VLP).rejected_key(), b'["a list"]'),
         (ADDRESS.rejected_key(), b'{"reason": "%s"}' % (b"x" * 100_000)),

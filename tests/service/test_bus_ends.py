@@ -176,7 +176,7 @@ def test_collecting_garbage_never_closes() -> None:
             with lock:
                 closed.append(threading.current_thread())
 
-    queue = PendingQueue("latest", Decoder(LayoutLookup(dict), prefix="nedbus"))
+    queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
     subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, name="", owner=None)
     with lock:  # as a thread holds it that is in the midst of something
         del subscription

@@ -19,8 +19,9 @@ import zenoh
 
 import nedbus
 from nedbus.transport import Session, Uplinks, open_router
-from nedbus_msgs import ENCODING, FIELD_TYPES, LAYOUTS, Provenance, VehicleLocalPosition, provenance_of, upgrade
+from nedbus_msgs import Provenance, VehicleLocalPosition
 from tests.command_line import run_command
+from tests.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.processes import Process, Start
@@ -60,7 +61,7 @@ def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
     """Return what a log holds, by address, read here by the source itself (test_ulog.py proves that against pyulog)."""
     found: dict[str, list[list[str]]] = {}
-    for each in open_replay(f"ulog:{path}").messages:
+    for each in open_replay(f"ulog:{path}?topics=VehicleLocalPosition").messages:
         found.setdefault(str(each.address), []).append(row_of(upgrade(each.fields)))
     return found
 
@@ -74,27 +75,6 @@ def real_logs() -> list[Path]:
     return sorted(LOGS.glob("*.ulg")) or pytest.skip(f"the real logs are not here: {LOGS}")
 
 
-@pytest.mark.slow
-@pytest.mark.logs
-def test_all_real_logs_reach_another_process_whole(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Every message of every real log goes log -> daemon -> router -> reader: none lost, none rejected, to the bit."""
-    logs = {path.stem.replace(".", "_"): path for path in real_logs()}
-    sources = [f"--source=ulog:{path}?speed=max&wait=1&vehicle={vehicle}" for vehicle, path in logs.items()]
-    received: dict[str, list[list[str]]] = {}
-    with bus.subscribe("*", mode="every") as subscription:
-        service = run_nedbus("serve", "--connect", endpoint, "--until-done", *sources)
-        for _ in range(9457):
-            sample = subscription.receive(DEADLINE)
-            received.setdefault(str(sample.address), []).append(row_of(sample.message))
-        assert service.wait() == 0, service.err
-        assert (subscription.counts.lost, subscription.counts.invalid) == (0, 0)
-    for vehicle, path in logs.items():
-        for address, values in expected_rows(path).items():
-            assert received.pop(address.replace("1/", f"{vehicle}/", 1)) == values, (path, address)
-    assert not received
-    assert "rejected" not in service.err.replace("0 rejected", "")
-
-
 @pytest.mark.logs
 def test_plain_zenoh_and_msgpack_see_every_sample(run_nedbus: Start, endpoint: str) -> None:
     """A reader that knows nothing of nedbus, as it could be in any language, gets each message as a 54-element array.
@@ -105,7 +85,8 @@ def test_plain_zenoh_and_msgpack_see_every_sample(run_nedbus: Start, endpoint: s
     config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
     with zenoh.open(config) as session:
         subscriber = session.declare_subscriber("nedbus/**", zenoh.handlers.RingChannel(2000))
-        service = run_nedbus("serve", "-c", endpoint, "--until-done", "-s", f"ulog:{path}?speed=max&wait=1")
+        source = f"ulog:{path}?speed=max&wait=1&topics=VehicleLocalPosition"
+        service = run_nedbus("serve", "-c", endpoint, "--until-done", "-s", source)
         samples = take(subscriber.handler, 1871)
         assert service.wait() == 0, service.err
     encodings = {str(sample.encoding) for sample in samples}
@@ -422,14 +403,19 @@ def test_status_schema_and_last_values_are_on_the_network(run_nedbus: Start, raw
 
     A plain get on a key or a wildcard is answered with the last payload of each key, stamped.
     """
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?topics=VehicleLocalPosition")
     status_key = "nedbus/@service/*/status"
     wait_for(lambda: [s for each in ask(raw, status_key) for s in each["sources"] if s["published"]], what="messages")
     [status] = ask(raw, status_key)
     assert {"service", "host", "version", "started", "now", "role", "endpoints", "refused", "sources"} == set(status)
     assert (status["role"], status["endpoints"]) == ("client", [endpoint])
     [source] = status["sources"]
-    assert (source["source"], source["state"], source["rejected"], source["total"]) == ("sim:", "running", 0, None)
+    assert (source["source"], source["state"], source["rejected"], source["total"]) == (
+        "sim:?topics=VehicleLocalPosition",
+        "running",
+        0,
+        None,
+    )
     topics = (
         VLP,
         f"{VLP}_groundtruth",

@@ -31,6 +31,11 @@ def test_hint_needs_no_flag_that_it_lacks() -> None:
         assert what_to_type([endpoint]) == hint
 
 
+def wait_for_message(endpoint: str) -> None:
+    """Wait until a message is published there."""
+    wait_for(lambda: run_command("get", "--wait", "-c", endpoint).exit_code == 0, what=f"a message at {endpoint}")
+
+
 def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
     """This host gets a command with loopback, other hosts one with an address of this host, and both work."""
     port = free_port()
@@ -40,8 +45,7 @@ def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
     assert here == f"tcp/127.0.0.1:{port}"
     assert not re.search(r"/(0\.0\.0\.0|127\.|localhost)", elsewhere)
     for endpoint in (here, elsewhere):
-        listed = run_command("get", "--wait", "-c", endpoint)
-        assert listed.exit_code == 0, listed.err
+        wait_for_message(endpoint)
     assert " list  what" in what_to_type(["tcp/0.0.0.0:7447"])
     assert re.search(r"^  nedbus list -c tcp/\S+:7448$", what_to_type(["tcp/[::]:7448"]).splitlines()[-1])
     assert "On another host" not in what_to_type(["tcp/192.0.2.1:7447"])

@@ -26,9 +26,10 @@ from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
 from nedbus.settings import load_settings
 from nedbus.transport import NO_HASH, Certificate, Session, TopicKey, open_client, open_router, publisher_token
-from nedbus_msgs import ROS2_TYPE, dds_type, encode, status_key
+from nedbus_msgs import dds_type, encode, status_key
 from tests.certificates import files_of, pki, secure_endpoint, tls_of, write_config
 from tests.command_line import run_command
+from tests.first_message import ROS2_TYPE
 from tests.messages import VLP, message
 from tests.ports import free_endpoint, free_port
 from tests.processes import Start
@@ -139,7 +140,7 @@ def test_silent_vehicle(bus: nedbus.Bus, endpoint: str) -> None:
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
     findings = look(endpoint)
-    found(findings, "vehicle", "wrong", r"mute/.*silent for \d+ s: it has sent nothing yet")
+    found(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: it has sent nothing yet")
     found(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ s old")
     found(look(endpoint, vehicle="7"), "vehicle", "wrong", "7: it is not seen under nedbus/")
 
@@ -254,7 +255,7 @@ def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
     words = " ".join(doctor.out.split())
     assert "wrong source ulog:nowhere.ulg: retrying: nowhere.ulg: no such file or directory" in words
     assert max(map(len, doctor.out.splitlines())) <= 80
-    assert doctor.out.splitlines()[-1].endswith("1 wrong")
+    assert doctor.out.splitlines()[-1].endswith("1 wrong"), doctor.out
     told = run_command("doctor", "-c", endpoint, "--json")
     assert told.exit_code == 1
     report = json.loads(told.out)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
+from typing import cast
 
 import msgpack
 import numpy as np
@@ -14,8 +15,9 @@ import nedbus
 from nedbus import Batch
 from nedbus.client.publishing.flow_control import KEPT, WINDOW
 from nedbus.transport import Session, open_router
-from nedbus_msgs import LAYOUTS, Address, Row, VehicleLocalPosition, downgrade, encode
+from nedbus_msgs import Address, Row, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
+from tests.first_message import LAYOUTS, downgrade
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for, wait_for_reader
@@ -49,7 +51,7 @@ def test_rows_are_the_messages(subscription: nedbus.Subscription, bus: nedbus.Bu
     rows = subscription.rows()
     samples = [next(rows) for _ in sent]
     assert all(isinstance(sample.message, Row) for sample in samples)
-    assert [VehicleLocalPosition(**sample.message._asdict()) for sample in samples] == sent
+    assert [VehicleLocalPosition(**cast("Row", sample.message)._asdict()) for sample in samples] == sent
     assert {sample.address for sample in samples} == {Address("1", VLP)}
     assert subscription.counts == nedbus.Counts(received=len(sent))
 

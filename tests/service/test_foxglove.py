@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 import nedbus
 from nedbus import Sample
 from nedbus.bridges import FoxgloveServer
-from nedbus_msgs import CURRENT, ROS2_TYPE, Address, MapProjection, decode_cdr, message_definition, to_global, upgrade
+from nedbus.bridges.foxglove_messages import orientation_of
+from nedbus_msgs import Address, MapProjection, to_global
+from nedbus_msgs.messages.vehicle_attitude import VehicleAttitude
 from tests.command_line import run_command
+from tests.first_message import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
 from tests.messages import VLP, message
 from tests.ports import free_port
 from tests.processes import Start
 from tests.waits import DEADLINE, wait_for
 
 X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # before the doubles 1, 2 and 3 of a message of protobuf
+HALF = math.sqrt(0.5)
 ORIGIN = {"xy_global": True, "z_global": True, "ref_lat": 47.0, "ref_lon": 8.0, "ref_alt": 400.0}
 
 
@@ -127,6 +133,47 @@ def test_poses_and_locations(bus: nedbus.Bus) -> None:
         for tag, value in coordinates.items():
             assert tag + struct.pack("<d", value) in client.data[topic][1]
     assert b"2/local" in client.data["/tf"][1]
+
+
+@pytest.mark.parametrize(
+    ("q", "age", "heading", "forward", "left"),
+    [
+        ((1.0, 0.0, 0.0, 0.0), 0, math.nan, (0, 1, 0), (-1, 0, 0)),  # north, level
+        ((HALF, 0.0, 0.0, HALF), 500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # east
+        ((-HALF, 0.0, 0.0, -HALF), -500_000, 0.0, (1, 0, 0), (0, 1, 0)),  # the same
+        ((HALF, 0.0, HALF, 0.0), 0, 0.0, (0, 0, 1), (-1, 0, 0)),  # north, and the nose up
+        ((HALF, HALF, 0.0, 0.0), 0, 0.0, (0, 1, 0), (0, 0, 1)),  # north, and the right wing down
+        ((HALF, HALF, 0.0, 0.0), 500_001, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # too old: the heading
+        ((math.nan,) * 4, 0, math.pi / 2, (1, 0, 0), (0, 1, 0)),
+    ],
+)
+def test_orientation_is_the_attitude_while_it_is_fresh(
+    q: tuple[float, ...], age: int, heading: float, forward: tuple[int, ...], left: tuple[int, ...]
+) -> None:
+    """Axes of the vehicle in ENU: q turns FRD to NED; it is used within 0.5 s of the position, else the heading is."""
+    attitude = VehicleAttitude.model_validate({"timestamp": 10_000_000 - age, "q": q})
+    x, y, z, w = orientation_of(message(10_000_000, heading=heading), attitude)
+    assert (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)) == pytest.approx(forward, abs=1e-6)
+    assert (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)) == pytest.approx(left, abs=1e-6)
+
+
+def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
+    """The pose turns with vehicle_attitude of its vehicle, and not with that of another or of the ground truth."""
+    level, rolled = (VehicleAttitude(timestamp=1, q=q) for q in ((1.0, 0.0, 0.0, 0.0), (HALF, HALF, 0.0, 0.0)))
+    with FoxgloveServer(bus, port=0) as server, connected(server.url) as client:
+        server.show(Sample(rolled, Address("1", "vehicle_attitude"), received=1))
+        for other in (Address("2", "vehicle_attitude"), Address("1", "vehicle_attitude_groundtruth")):
+            server.show(Sample(level, other, received=1))
+        sample = Sample(message(1, x=1.0, y=2.0, z=3.0), Address("1", VLP), received=1)
+        server.show(sample)
+        client.until(lambda: "/1/pose" in client.topics)
+        client.subscribe("/1/pose")
+        while "/1/pose" not in client.data:
+            server.show(sample)
+            client.receive_soon()
+    x, y, z, _ = orientation_of(sample.message, rolled)
+    assert (x, y, z) == pytest.approx((0.5, 0.5, 0.5))
+    assert all(tag + struct.pack("<d", each) in client.data["/1/pose"][1] for tag, each in ((X, x), (Y, y), (Z, z)))
 
 
 def test_port_in_use_is_reported(bus: nedbus.Bus, endpoint: str) -> None:

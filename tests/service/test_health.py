@@ -60,6 +60,30 @@ def test_silence_has_no_rate() -> None:
     assert set(health.resets.values()) == {0}
 
 
+@pytest.mark.parametrize(
+    ("topic", "silence", "state"),
+    [
+        ("home_position", 3600.0, "ok"),
+        ("vehicle_status", 4.0, "stale"),
+        ("vehicle_status", 2.0, "ok"),
+        ("battery_status", 2.0, "slow"),
+    ],
+)
+def test_what_comes_on_change_has_no_usual_rate(topic: str, silence: float, state: str) -> None:
+    """Many messages in the first seconds, then one a second, then none: only silence below its least rate is a fault.
+
+    Nor has it gaps, and what is no position has neither flags nor resets.
+    """
+    stream = StreamHealth(topic)
+    times = [index / 50 for index in range(500)] + [10.0 + index for index in range(3)]
+    for seconds in times:
+        stream.add({"timestamp": round(seconds * 1e6)}, received=round(seconds * SECOND))
+    health = stream.snapshot(round((times[-1] + silence) * SECOND))
+    assert stream_state(health).name == state
+    assert (health.gaps > 0) == (topic == "battery_status")
+    assert (health.flags, health.resets) == (None, {})
+
+
 def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
     """A step of more than three usual ones is a gap, whenever it arrives, and does not become the usual one."""
     clock = [index * 0.1 for index in range(20)]

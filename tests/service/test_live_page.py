@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus.transport import open_client
-from nedbus_msgs import LAYOUTS, ROS2_TYPE, type_hash
+from tests.first_message import LAYOUTS, ROS2_TYPE, type_hash
 from tests.messages import VLP
 from tests.ports import free_endpoint
 from tests.processes import Start
@@ -28,6 +28,7 @@ __all__ = ["fly", "peer", "port"]  # fixtures
 PAGE = (Path(__file__).parents[2] / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [line.partition("#")[0].strip() for block in BLOCKS for line in block.splitlines()]
+COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # test_px4_real.py has definitions of PX4
 SERVES, ROS2 = ([each for each in COMMANDS if each.startswith(f"nedbus {name}")] for name in ("serve", "ros2"))
 
 

@@ -3,24 +3,45 @@
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, OutOfOrderError, Vehicle, request_rates
+from nedbus.sources import Rejection, SourceMessage
+from nedbus.sources.mavlink_fields import SAID
+from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, Vehicle, request_rates
+from nedbus.sources.options import MavlinkOptions
+from nedbus_msgs import TOPICS, quaternion_to_euler
+from tests.messages import VLP
+
+NEEDED = (32, 230, 33, 141, 331)  # for vehicle_local_position
+
+
+def new_vehicle(topics: str) -> Vehicle:
+    return Vehicle("9", MavlinkOptions.model_validate({"topics": topics}))
 
 
 @pytest.fixture
 def vehicle() -> Vehicle:
     """Return a vehicle that has sent nothing, at 30 positions a second over a telemetry radio."""
-    return Vehicle(30.0, 57600)
+    return new_vehicle(VLP)
+
+
+def handle(vehicle: Vehicle, message: Any, now: float) -> SourceMessage:
+    """Return what a message makes, which is not rejected."""
+    said = vehicle.handle(message, now)
+    assert isinstance(said, SourceMessage)
+    return said
+
+
+def position(ms: int) -> Any:
+    return dialect.MAVLink_local_position_ned_message(ms, 0, 0, 0, 0, 0, 0)
 
 
 def estimate(vehicle: Vehicle, ms: int, now: float) -> dict[str, object]:
     """Return what a position at this time since boot [ms] makes."""
-    fields = vehicle.handle(dialect.MAVLink_local_position_ned_message(ms, 0, 0, 0, 0, 0, 0), now)
-    assert fields is not None
-    return fields
+    return dict(handle(vehicle, position(ms), now).fields)
 
 
 @pytest.mark.parametrize(
@@ -40,17 +61,66 @@ def test_constant_position_mode_is_no_sign_of_rest(vehicle: Vehicle, flags: int,
 
 
 @pytest.mark.parametrize(
-    ("rate", "baud", "status"),
-    [(30.0, 57600, 13.04), (20.0, 57600, 20.0), (45.0, 57600, 2.0), (50.0, 115200, 50.0), (0.5, 57600, 2.0)],
+    ("rate", "baud", "status", "odometry"),
+    [
+        (30.0, 57600, 13.04, 10.0),
+        (20.0, 57600, 20.0, 10.0),
+        (45.0, 57600, 8.86, 8.86),
+        (50.0, 115200, 50.0, 10.0),
+        (0.5, 57600, 2.0, 10.0),
+    ],
 )
-def test_flags_are_requested_as_often_as_the_link_carries(rate: float, baud: int, status: float) -> None:
+def test_flags_are_requested_as_often_as_the_link_carries(
+    rate: float, baud: int, status: float, odometry: float
+) -> None:
     """ESTIMATOR_STATUS comes with each position where there is room for it, else with what room there is."""
-    rates = request_rates(rate, baud)
-    assert rates.keys() == STREAMS.keys()
-    assert (rates[32], rates[331]) == (rate, 10.0)
+    rates = request_rates(rate, baud, [VLP])
+    assert [*rates] == [*NEEDED]
+    assert rates[32] == rate
+    assert rates[331] == pytest.approx(odometry, abs=0.01)
     assert rates[230] == pytest.approx(status, abs=0.01)
-    if status > 2:
-        assert sum(STREAMS[number] * hertz for number, hertz in rates.items()) <= 0.9 * baud / 10 + 0.01
+
+
+@pytest.mark.parametrize("topics", [[*TOPICS], ["vehicle_attitude"], ["sensor_gps", "home_position"], [VLP], ["x"]])
+@pytest.mark.parametrize("rate", [0.5, 30.0, 100.0])
+def test_only_what_is_needed_is_requested_and_as_the_link_carries(topics: list[str], rate: float) -> None:
+    """Nothing is requested for topics that were not chosen; a full link has all at 2 Hz, or what it wants, at least."""
+    rates = request_rates(rate, 57600, topics)
+    needed = [number for number, (_, _, of) in STREAMS.items() if {*of.split()} & {*topics}]
+    assert [*rates] == needed
+    assert rates or topics == ["x"]
+    for number, hertz in rates.items():
+        assert min(2.0, STREAMS[number][1] or rate) <= hertz <= max(2.0, STREAMS[number][1] or rate)
+    load = sum(STREAMS[number][0] * hertz for number, hertz in rates.items())
+    assert load <= 0.9 * 57600 / 10 + 0.01 or max(hertz for number, hertz in rates.items() if number != 32) <= 2.0
+
+
+def test_each_topic_of_mavlink_has_a_message_that_is_requested() -> None:
+    """A topic that a MAVLink vehicle says has a row in STREAMS, with the topic's name as it is."""
+    needed = {topic for _, _, topics in STREAMS.values() for topic in topics.split()}
+    assert needed == {topic for topic, _ in SAID.values()} <= TOPICS.keys()
+
+
+def test_euler_angles_replace_a_quaternion_that_is_not_sent() -> None:
+    """ATTITUDE is the attitude of a vehicle that sends no ATTITUDE_QUATERNION, and of no other."""
+    vehicle = new_vehicle("vehicle_attitude")
+    said = handle(vehicle, dialect.MAVLink_attitude_message(1000, 0.1, -0.2, 3.0, 0, 0, 0), 100.0)
+    assert quaternion_to_euler(cast("tuple[float, ...]", said.fields["q"])) == pytest.approx((0.1, -0.2, 3.0))
+    assert vehicle.handle(dialect.MAVLink_attitude_quaternion_message(1010, 1, 0, 0, 0, 0, 0, 0), 100.1)
+    assert vehicle.handle(dialect.MAVLink_attitude_message(1020, 0, 0, 0, 0, 0, 0), 100.2) is None
+    assert vehicle.handle(dialect.MAVLink_attitude_message(4000, 0, 0, 0, 0, 0, 0), 103.0)
+
+
+def test_each_topic_has_an_order_of_its_own() -> None:
+    """Messages of other topics may be later; only one that is older than the last of its own is out of order."""
+    vehicle = new_vehicle("*")
+    odometry = [1, 1, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [math.nan] * 21, [math.nan] * 21]
+    assert estimate(vehicle, 2000, 100.0)
+    assert vehicle.handle(dialect.MAVLink_odometry_message(1_900_000, *odometry), 100.0)
+    late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
+    assert isinstance(late, Rejection)
+    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order: time_boot_ms 1800 after 1900")
+    assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
 
 
 def test_requests_are_repeated_five_times(vehicle: Vehicle) -> None:
@@ -60,7 +130,7 @@ def test_requests_are_repeated_five_times(vehicle: Vehicle) -> None:
         now = 100.0 + tick / 2
         vehicle.track_sequence(1, tick % 256, now)
         requested += [number for number, _ in vehicle.requests(now)]
-    for number in STREAMS:
+    for number in NEEDED:
         assert requested.count(number) == 5
     assert requested.count(ORIGIN) > 10
 
@@ -78,7 +148,7 @@ def test_answer_ends_a_request(vehicle: Vehicle) -> None:
         if tick == 10:
             origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
             assert vehicle.handle(origin, now) is None
-    assert [number for number, _ in requested[:6]] == [*STREAMS, ORIGIN]
+    assert [number for number, _ in requested[:6]] == [*NEEDED, ORIGIN]
     assert requested[0] == (32, 30.0)
     assert len(requested) < 9
     assert vehicle.acknowledge(1000.0) is None
@@ -109,8 +179,8 @@ def test_positions_that_stop_are_requested_again(vehicle: Vehicle) -> None:
 def test_time_goes_on_when_its_counter_wraps(vehicle: Vehicle) -> None:
     """time_boot_ms overflows after 49.7 days; the timestamp does not."""
     for ms in range(2**32 - 500, 2**32 + 500, 100):
-        assert estimate(vehicle, ms % 2**32, 100.0)["timestamp"] == 1000 * ms
-    assert not vehicle.rebooted
+        said = handle(vehicle, position(ms % 2**32), 100.0)
+        assert (said.fields["timestamp"], said.rebooted) == (1000 * ms, False)
 
 
 def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
@@ -122,10 +192,9 @@ def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:
     assert "heading" not in later
     assert later["ref_lat"] == 47.3977418
     assert "ref_timestamp" not in later
-    assert "ref_lat" not in estimate(vehicle, 500, 105.0)
-    assert vehicle.rebooted
-    with pytest.raises(OutOfOrderError):
-        estimate(vehicle, 499, 105.0)
+    back = handle(vehicle, position(500), 105.0)
+    assert ("ref_lat" in back.fields, back.rebooted) == (False, True)
+    assert isinstance(vehicle.handle(position(499), 105.0), Rejection)
 
 
 def test_yaw_of_the_attitude_replaces_the_heading(vehicle: Vehicle) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
@@ -86,8 +87,8 @@ def test_pages_of_a_service(serve: Serve, pages: Pages) -> None:
     assert [source["source"] for source in status["sources"]] == ["sim:?vehicle=7"]
     (published,) = pages.values("nedbus_messages_published_total", **of_stream)
     assert published >= status["sources"][0]["streams"][0]["health"]["messages"] > 0
-    assert pages.values("nedbus_streams") == [5]
-    assert pages.values("nedbus_source_addresses") == [5]
+    assert pages.values("nedbus_streams") == [12]
+    assert pages.values("nedbus_source_addresses") == [12]
     assert pages.values("nedbus_source_state", state="running") == [1]
     assert sum(pages.values("nedbus_source_state")) == 1
     assert pages.values("nedbus_source_rejected_total") == [0]
@@ -174,7 +175,7 @@ def test_source_from_which_nothing_comes_is_not_ready(serve: Serve, pages: Pages
     failed = f"{missing}: retrying: {tmp_path / 'missing.ulg'}: no such file or directory\n"
     wait_for(lambda: pages.ask("/readyz") == (503, f"{failed}{silent}: nothing arrives\n"), what="all three")
     assert pages.ask("/healthz")[0] == 200
-    assert sorted(pages.values("nedbus_source_addresses")) == [0, 0, 5]
+    assert sorted(pages.values("nedbus_source_addresses")) == [0, 0, 12]
     assert pages.values("nedbus_source_state", state="waiting") == [0, 1, 1]
 
 
@@ -234,12 +235,12 @@ def test_address_that_others_reach_is_warned_of(caplog: pytest.LogCaptureFixture
             assert caplog.text.count(f"whoever reaches {where} can read them") == count
 
 
-def streams(count: int) -> list[Stream]:
+def streams(count: int, topic: str = VLP) -> list[Stream]:
     """Return streams of two sources in turn, of three messages each."""
-    health = StreamHealth(VLP)
+    health = StreamHealth(topic)
     for each in range(3):
         health.add(message(each), received=each, lost=each)
-    return [Stream(f"v{number}", VLP, f"source {number % 2}", health.snapshot(3)) for number in range(count)]
+    return [Stream(f"v{number}", topic, f"source {number % 2}", health.snapshot(3)) for number in range(count)]
 
 
 def test_number_of_streams_is_bounded() -> None:
@@ -254,6 +255,17 @@ def test_number_of_streams_is_bounded() -> None:
     assert sum(messages.values()) == 3 * count
     assert sum(sample.value for sample in families["nedbus_messages_lost"].samples) == 3 * count
     assert len(families["nedbus_stream_age_seconds"].samples) == MAX_STREAMS
+
+
+def test_positions_have_labels_before_others() -> None:
+    """Alerts are about positions; of what has no rate there is no age, which an alert would take for silence."""
+    many = [*streams(2, "home_position"), *streams(MAX_STREAMS, "battery_status"), *streams(3)]
+    families = {each.name: each for each in stream_families(many, messages=("nedbus_messages", "Messages"))}
+    topics = Counter(sample.labels["topic"] for sample in families["nedbus_messages"].samples)
+    assert topics == {VLP: 3, "home_position": 2, "battery_status": MAX_STREAMS - 5, "other": 2}
+    ages = {sample.labels["topic"] for sample in families["nedbus_stream_age_seconds"].samples}
+    assert ages == {VLP, "battery_status"}
+    assert {sample.labels["topic"] for sample in families["nedbus_resets"].samples} == {VLP}
 
 
 def test_text_is_that_of_the_official_client() -> None:
@@ -350,7 +362,7 @@ def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.M
     running = threading.Thread(target=daemon.run)
     running.start()
     try:
-        wait_for(lambda: [len(source.streams) for source in daemon.measures] == [5], what="a message of each stream")
+        wait_for(lambda: [len(source.streams) for source in daemon.measures] == [12], what="a message of each stream")
         looks: list[StreamHealth] = []
         original = StreamHealth.snapshot
 
@@ -360,7 +372,7 @@ def test_a_scrape_looks_at_each_stream_once(endpoint: str, monkeypatch: pytest.M
 
         monkeypatch.setattr(StreamHealth, "snapshot", look)
         assert service_pages(daemon)["/metrics"]().status == 200
-        assert len(looks) == len(set(looks)) == 5
+        assert len(looks) == len(set(looks)) == 12
     finally:
         daemon.stop()
         running.join()

@@ -7,7 +7,8 @@ import pytest
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4_streams import NotAcceptedError, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, TopicKey
-from nedbus_msgs import ROS2_TYPE, DecodeError, dds_type, type_hash
+from nedbus_msgs import DecodeError, dds_type
+from tests.first_message import ROS2_TYPE, type_hash
 from tests.messages import VLP
 
 GID = bytes(range(16))

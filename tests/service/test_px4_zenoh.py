@@ -16,24 +16,17 @@ import zenoh
 from zenoh_ros2_sdk.discovery import _parse_liveliness_keyexpr
 
 import nedbus
-from nedbus.sources import SourceMessage
-from nedbus.transport import NO_HASH, Attachment, Session
-from nedbus_msgs import (
-    ANY,
-    LAYOUTS,
-    ROS2_TYPE,
-    VehicleLocalPosition,
-    dds_type,
-    downgrade,
-    encode_cdr,
-    type_hash,
-    upgrade,
-)
+from nedbus.errors import ConfigError
+from nedbus.sources import SourceMessage, parse_source
+from nedbus.transport import NO_HASH, Attachment, Session, TopicKey, publisher_token
+from nedbus_msgs import ANY, VehicleLocalPosition, dds_type, define_msg, encode_with, hash_of, ros2_type
+from tests.command_line import run_command
+from tests.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode_cdr, message_definition, type_hash, upgrade
 from tests.listening import Listener, status_of_source
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.processes import Process, Start
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 
 from .test_ros2 import Peer, flight, peer, plain_session
 
@@ -214,6 +207,109 @@ def test_type_hash_not_supported(listen: Listen, raw: Session) -> None:
     first.turn_until(lambda: first.rejections, what="the rejection")
     assert "name the layout, as in px4-zenoh:?layout=1.14" in first.rejections[0].reason
     assert times(second.receive()) == [1]
+
+
+WHEELS = "uint64 timestamp\nfloat32[2] wheel_speed  # [rad/s] @range 0, 500\nuint8 COUNT = 2\n"
+
+
+def test_message_without_a_file_is_read_by_its_definition(
+    run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus, tmp_path: Path
+) -> None:
+    """With msg= it is carried, range-checked as it is annotated, and readable without that file; else it is listed."""
+    (tmp_path / "WheelEncoders.msg").write_text(WHEELS)
+    definition = define_msg("WheelEncoders", WHEELS)
+    name = ros2_type(definition)
+    key = f"0/fmu/out/wheel_encoders/{dds_type(name)}/{hash_of(definition.current, name)}"
+    service = run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
+    wait_for_reader(raw, key)
+    token = raw.liveliness().declare_token(publisher_token(TopicKey.parse(key), "px4", "px4", 1))
+    raw.put(key, b"")
+    wait_for(lambda: status_of_source(bus).get("not_carried") == ["WheelEncoders"], what="the list")
+    assert status_of_source(bus)["rejected"] == 0
+    assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
+    token.undeclare()
+    wait_for(lambda: status_of_source(bus)["not_carried"] == [], what="the list to be empty")
+    service.kill()
+    run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
+    wait_for_reader(raw, key)
+
+    def put(speed: float) -> None:
+        fields = {"timestamp": 1, "wheel_speed": (speed, 2.0)}
+        raw.put(key, encode_with(definition, fields, definition.current) + bytes(8))
+
+    with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
+        assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
+    put(501.0)
+    wait_for(lambda: status_of_source(bus)["rejected"] == 1, what="the message out of range")
+
+
+def test_newer_layout_is_read_by_its_definition(
+    listen: Listen, raw: Session, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A 54th field is named once; without msg= the rejection says what to do, and another definition is named too."""
+    caplog.set_level("WARNING")
+    text = message_definition("1.16") + "bool altitude_good_for_lock\n"
+    (tmp_path / "VehicleLocalPosition.msg").write_text(text)
+    newer = define_msg("VehicleLocalPosition", text)
+    px4 = Px4(raw)
+    px4.type_hash = hash_of(newer.current, ROS2_TYPE)
+    without, given, other = listen(), listen(f"?msg={tmp_path}/VehicleLocalPosition.msg"), listen(f"?msg={tmp_path}")
+    fields = {**downgrade(message(1, x=0.5), "1.16"), "altitude_good_for_lock": True}
+    for _ in range(2):
+        px4.raw(encode_with(newer, fields, newer.current))
+    assert [upgrade(each.fields).x for each in given.receive(2)] == [0.5, 0.5]
+    assert caplog.text.count("altitude_good_for_lock") == 1
+    without.turn_until(lambda: without.rejections, what="the rejection")
+    for word in ("VehicleLocalPosition", px4.type_hash, "px4-zenoh:?msg=VehicleLocalPosition.msg"):
+        assert word in without.rejections[0].reason
+    own, px4.type_hash = px4.type_hash, "RIHS01_" + 64 * "0"
+    px4.raw(b"", topic=f"{VLP}_groundtruth")
+    other.turn_until(lambda: other.rejections, what="the rejection")
+    assert own in other.rejections[0].reason
+    assert px4.type_hash in other.rejections[0].reason
+
+
+def test_topics_that_are_chosen(listen: Listen, raw: Session) -> None:
+    """Others are ignored without a word; a topic that is named and whose message is unknown is rejected with a hint."""
+    listener = listen("?topics=vehicle_local_position,wheel_encoders")
+    px4 = Px4(raw)
+    px4.put(1, topic="estimator_local_position")
+    raw.put(f"0/fmu/out/wheel_encoders/{dds_type('px4_msgs/msg/WheelEncoders')}/{px4.type_hash}", b"")
+    raw.put(f"0/fmu/out/tecs_status/{dds_type('px4_msgs/msg/TecsStatus')}/{px4.type_hash}", b"")
+    px4.put(2)
+    assert [str(each.address) for each in listener.receive()] == [f"1/{VLP}"]
+    assert [each.count for each in listener.rejections] == [1]
+    assert "px4-zenoh:?msg=WheelEncoders.msg" in listener.rejections[0].reason
+    assert listener.absence.not_carried == ()
+
+
+def test_message_of_another_type_is_rejected(listener: Listener, raw: Session) -> None:
+    """A position on the topic of attitudes is not taken for an attitude."""
+    px4 = Px4(raw)
+    px4.put(1, topic="vehicle_attitude")
+    listener.turn_until(lambda: listener.rejections, what="the rejection")
+    assert "vehicle_attitude has messages of type VehicleAttitude" in listener.rejections[0].reason
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "reason"),
+    [
+        ("uint64 timestamp\n  float33 x\n", "line 2, column 3", "'float33' is no type"),
+        ("uint64 timestamp\nfloat32[] x\n", "line 2, column 1", "is no type"),
+        ("uint64 timestamp\nEscReport[8] esc\n", "line 2, column 1", "'EscReport' is no type"),
+        ("uint64 timestamp\nfloat32\n", "line 2, column 1", "expected a field"),
+        ("float32 x\n", "line 1, column 1", "timestamp"),
+    ],
+)
+def test_definition_that_is_none_is_refused(tmp_path: Path, text: str, where: str, reason: str) -> None:
+    """The error names file, line and column; in a folder such a file is left out, and one that is missing is said."""
+    file = tmp_path / "EscStatus.msg"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=rf"{file}: {where}: .*{reason}"):
+        parse_source(f"px4-zenoh:?msg={file}").open_source(vehicle="1")
+    parse_source(f"px4-zenoh:?msg={tmp_path}").open_source(vehicle="1")
+    with pytest.raises(ConfigError, match=r"other\.msg: No such file"):
+        parse_source(f"px4-zenoh:?msg={tmp_path},{tmp_path}/other.msg").open_source(vehicle="1")
 
 
 def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:

@@ -134,8 +134,14 @@ def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: ned
             publish_next()
         router = open_router(listen=(near,), connect=(endpoint,))
         got: dict[str, list[int]] = {vehicle: [] for vehicle in vehicles}
+        again = time.monotonic() + 5
 
         def take_all() -> bool:
+            nonlocal router, again
+            if not any(got.values()) and time.monotonic() > again:
+                # About one link in a thousand between routers of Zenoh 1.10.2 carries messages, but never a query.
+                router.close()
+                router, again = open_router(listen=(near,), connect=(endpoint,)), again + 5
             publish_next()
             with suppress(nedbus.NoDataError):
                 while True:

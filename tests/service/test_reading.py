@@ -16,12 +16,15 @@ import nedbus
 from nedbus import recording
 from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus.recording import RecordingWriter
-from nedbus_msgs import FIELD_TYPES, Address, MapProjection, Provenance, VehicleLocalPosition, upgrade
+from nedbus_msgs import DEFAULT, Address, MapProjection, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.command_line import run_command
+from tests.first_message import FIELD_TYPES, upgrade
 from tests.messages import VLP, message
 from tests.replays import convert_replay, open_replay
-from tests.ulogs import LOGS, UlogWriter
+from tests.ulogs import UlogWriter
+
+from .test_alignment import array_of, write
 
 # pandas, polars and matplotlib take a second, which only these tests need: they are imported there.
 
@@ -54,20 +57,6 @@ def test_recording_is_an_array(flight: Path) -> None:
     assert nedbus.read(flight, vehicle=1).tobytes() == array.tobytes()
 
 
-@pytest.mark.slow
-@pytest.mark.logs
-@pytest.mark.parametrize("log", sorted(LOGS.glob("*.ulg")), ids=lambda path: path.stem)
-def test_real_log_is_an_array(log: Path) -> None:
-    """Each stream of a real log has the messages that a replay of it has, to the bit."""
-    expected: dict[Address, list[VehicleLocalPosition]] = {}
-    for each in open_replay(f"ulog:{log}").messages:
-        expected.setdefault(each.address, []).append(upgrade(each.fields))
-    assert nedbus.addresses_of(log) == sorted(expected)
-    for address, messages in expected.items():
-        array = nedbus.read(log, address.topic, instance=address.instance)
-        assert array.tobytes() == to_array(messages).tobytes()
-
-
 def test_frames_have_named_columns(flight: Path) -> None:
     """A data frame of either package has all columns, with the same values and types."""
     pd, pl = pytest.importorskip("pandas"), pytest.importorskip("polars")
@@ -88,7 +77,7 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     """A selection that matches several streams or none is an error that names the available ones."""
     with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: name instance too, of 1/"):
         nedbus.read(flight, "estimator_local_position")
-    has = f"which has 1/estimator_local_position/0, .*1/{VLP}"
+    has = f"which has 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
     with pytest.raises(AddressError, match=f"^vehicle '2' is not valid: expected one that is in {flight}, {has}"):
         nedbus.read(flight, vehicle="2")
     with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one of est.* in {flight}, {has}"):
@@ -104,7 +93,9 @@ def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
     addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
     with RecordingWriter(path) as writer:
         rows = to_array([message(1)] * len(addresses))
-        writer.write(rows, ((address, Provenance()) for address in addresses), logged=repeat(1), published=repeat(1))
+        writer.write(
+            rows, DEFAULT, ((address, Provenance()) for address in addresses), logged=repeat(1), published=repeat(1)
+        )
     with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: .*name vehicle too, of 1/.* and 3 more$"):
         nedbus.read(path)
     with pytest.raises(AddressError, match="name topic and vehicle and instance too"):
@@ -129,7 +120,9 @@ def test_large_recording_is_not_loaded_whole(tmp_path: Path) -> None:
             times = list(range(1000))
             for vehicle in ("1", "2"):
                 rows = noise if vehicle == "1" else noise[:10]
-                writer.write(rows, repeat((Address(vehicle, VLP), Provenance())), logged=times, published=times)
+                writer.write(
+                    rows, DEFAULT, repeat((Address(vehicle, VLP), Provenance())), logged=times, published=times
+                )
             writer.flush()
     assert path.stat().st_size > 1_300_000
     nedbus.read(path, vehicle="2")
@@ -279,7 +272,7 @@ def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
     without = Provenance("mavlink", frozenset({"dead_reckoning", "delta_xy", "eph"}))
     with RecordingWriter(path) as writer:
         for row, provenance in zip((array[:1], array[1:]), (Provenance("sim"), without), strict=True):
-            writer.write(row, [(Address("1", VLP), provenance)], logged=[1], published=[1])
+            writer.write(row, DEFAULT, [(Address("1", VLP), provenance)], logged=[1], published=[1])
     assert nedbus.missing_of(nedbus.read(path)) == without.missing
     assert nedbus.read(path, dataframe="pandas")["dead_reckoning"].isna().tolist() == [False, True]
     bear = nedbus.read(path, dataframe="polars")
@@ -294,6 +287,11 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     names |= set(re.findall(r"`(\w+_to_\w+)`", data))
     assert len(names) > 15
     assert names <= set(nedbus.__all__)
+    others = ("vehicle_attitude", "home_position", "battery_status/0", "sensor_gps/0")
+    streams = {name: array_of(name.partition("/")[0], {"timestamp": 1}) for name in others}
+    streams |= nedbus.read(flight, ["*"])
+    flight.unlink()
+    write(flight, streams)
     log = UlogWriter(layout="1.13")
     log.define(["estimator_local_position", VLP])
     log.add(VLP, message(1, x=2.5))
@@ -328,7 +326,7 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with RecordingWriter(tmp_path / "flight.mcap") as writer:
         for topic, messages in streams.items():
             addresses = repeat((Address("1", topic), Provenance()))
-            writer.write(to_array(messages), addresses, logged=repeat(1), published=repeat(1))
+            writer.write(to_array(messages), DEFAULT, addresses, logged=repeat(1), published=repeat(1))
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "recordings.md").read_text(), re.DOTALL)
     [recipe] = [block for block in blocks if "rms" in block]
@@ -340,7 +338,11 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "reason"),
     [
-        ("flight.mcap -v 9", 2, "vehicle '9' is not valid: expected one that is in flight.mcap, which has 1/est"),
+        (
+            "flight.mcap -v 9",
+            2,
+            "vehicle '9' is not valid: expected one that is in flight.mcap, which has 1/battery_status/0, 1/est",
+        ),
         ("flight.mcap -o a.foo", 2, "a.foo: expected a picture: a file that ends with .png or .svg or .pdf"),
         ("flight.mcap -o /dev/full", 2, "/dev/full: expected a picture: a file that ends with .png or .svg or .pdf"),
         ("flight.mcap -o /nowhere/a.png", 1, "cannot be written"),
@@ -352,7 +354,7 @@ def test_plot_that_cannot_be_drawn_is_an_error(flight: Path, arguments: str, exi
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True
     with RecordingWriter(flight.with_name("invalid.mcap")) as writer:
-        writer.write(array, repeat((Address("1", VLP), Provenance())), logged=[1, 2], published=[1, 2])
+        writer.write(array, DEFAULT, repeat((Address("1", VLP), Provenance())), logged=[1, 2], published=[1, 2])
     plot = run_command("plot", *arguments.split())
     assert plot.exit_code == exit_code
     assert reason in plot.err

@@ -20,7 +20,8 @@ from nedbus.client.receiving import Receiver, pending_queue, retransmission, wri
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import take_all
 from nedbus.transport import KeptAnswers, Session, ask_kept, open_client, open_router
-from nedbus_msgs import encode, encoding_of
+from nedbus_msgs import encode
+from tests.first_message import encoding_of
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for, wait_for_reader

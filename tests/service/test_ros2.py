@@ -23,27 +23,28 @@ from nedbus.errors import NedbusError
 from nedbus.transport import Attachment, Session, TopicKey, gid_of_token, open_client, open_router, publisher_token
 from nedbus_msgs import (
     ANY,
-    LAYOUTS,
-    ROS2_TYPE,
+    BY_TOPIC,
     Address,
     Selection,
     VehicleLocalPosition,
     dds_type,
-    decode_cdr,
-    downgrade,
     encode,
-    type_hash,
-    upgrade,
+    split_ros2_topic,
+    upgrade_with,
 )
+from tests.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, type_hash, upgrade
 from tests.listening import Listener
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.processes import Process, Start
 from tests.replays import open_replay
+from tests.ulogs import LOGS
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
 PEER = str(Path(__file__).with_name("ros2_peer.py"))
 KEY = f"0/fmu/out/{VLP}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}"
+
+TWELVE = LOGS.parent / "px4" / "twelve_messages.ulg"
 
 Peer = Callable[..., Process]
 RunBridge = Callable[..., None]
@@ -57,7 +58,7 @@ def flight() -> list[VehicleLocalPosition]:
 
 def definition(layout: str) -> str:
     """Return the message definition as a .msg file of px4_msgs has it."""
-    return "".join(f"{LAYOUTS[layout].type_of(name)} {name}\n" for name in LAYOUTS[layout].fields)
+    return "".join(f"{LAYOUTS[layout].types[name]!s} {name}\n" for name in LAYOUTS[layout].fields)
 
 
 @pytest.fixture
@@ -162,6 +163,48 @@ def test_bridge_writes_what_px4_writes(run_bridge: RunBridge, bus: nedbus.Bus, r
     (token,) = tokens(raw, "MP")
     assert first.gid == gid_of_token(token), "what `ros2 topic info -v` shows"
     assert len(tokens(raw, "NN")) == 1
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not TWELVE.exists(), reason=f"no log of a PX4: {TWELVE} is not there")
+@pytest.mark.parametrize("release", ["1.13", "1.15", "main"])
+def test_every_message_has_its_layout_of_the_release(
+    run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture, release: str
+) -> None:
+    """Of all that a real PX4 logged: the key has the hash of that release, and the CDR the fields; names are PX4's.
+
+    What the release does not have is said once. Of what has no rate the last one is published, however old it is.
+    """
+    last = {each.address: each.fields for each in open_replay(f"ulog:{TWELVE}").messages}
+    messages = {each: upgrade_with(BY_TOPIC[each.topic], fields) for each, fields in last.items()}
+    publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in messages]
+    for publisher, each in zip(publishers, messages.values(), strict=True):
+        publisher.publish(each)
+    wait_for(lambda: len(bus.latest(ANY)) == len(messages), what="the last values")
+    subscriber = raw.declare_subscriber("0/fmu/out/**", zenoh.handlers.FifoChannel(1000))
+    run_bridge(layout=release)
+    missing = {each for each in messages if BY_TOPIC[each.topic].layout_of_release(release) is None}
+    wait_for(lambda: len(tokens(raw, "MP")) == len(messages) - len(missing), what="the bridge")
+    received = {str(subscriber.handler.recv().key_expr).split("/")[3]}
+    assert received == {"home_position"}
+    for publisher, each in zip(publishers, messages.values(), strict=True):
+        wait_for_reader(raw, publisher.key)
+        publisher.publish(each)
+    for _ in range(len(messages) - len(missing)):
+        sample = subscriber.handler.recv()
+        key = TopicKey.parse(str(sample.key_expr))
+        _, topic, instance = split_ros2_topic(key.topic)
+        sent = messages[Address("1", topic, instance)]
+        assert key.dds_type == dds_type(f"px4_msgs/msg/{type(sent).__name__}")
+        fields = decode_cdr(sample.payload.to_bytes(), layout=key.type_hash)
+        layout = BY_TOPIC[topic].layout_of_release(release)
+        assert layout is not None
+        assert repr(fields) == repr(BY_TOPIC[topic].downgrade(sent.__dict__, layout))
+        received.add(key.topic.rpartition("/")[2])
+    assert {"battery_status", "sensor_gps", "estimator_status_flags", "estimator_status_flags_1"} <= received
+    assert len(received) == len(messages) - len(missing)
+    for address in missing:
+        assert caplog.text.count(f"{address} is not published to ROS 2: PX4 {release} has no such message") == 1
 
 
 def test_last_value_does_not_reach_ros_2(
@@ -366,7 +409,7 @@ def test_router_that_hides_ros_2_is_named(monkeypatch: pytest.MonkeyPatch, tmp_p
     ("arguments", "exit_code", "text"),
     [
         (["--to", "tcp/127.0.0.1:1"], 1, "nothing answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
-        (["--layout", "1.12"], 2, "no layout '1.12': choose from 1.13, 1.14, 1.15, V0, 1.16"),
+        (["--layout", "1.12"], 2, "no layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0"),
         (["--namespace", "1:7up"], 2, "namespace '7up' is not valid"),
         (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),
     ],

@@ -8,7 +8,7 @@ import signal
 import stat
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +19,7 @@ import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
 from nedbus.transport import Session, open_client, open_router, write_access_rules
-from nedbus_msgs import Address, encode
+from nedbus_msgs import Address, define, encode, field_type
 from nedbus_msgs.arrays import to_array
 from tests.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
 from tests.command_line import run_command
@@ -31,7 +31,7 @@ from tests.processes import Process, Start
 from tests.service.publishing import take
 from tests.service.test_max_rate import Clock, clock, publish, wait_for_demand
 from tests.service.test_px4_zenoh import Px4
-from tests.waits import DEADLINE, wait_for
+from tests.waits import DEADLINE, wait_for, wait_for_reader
 from tests.zenohd import EITHER, start_zenohd
 
 __all__ = ["clock", "pki"]
@@ -104,6 +104,28 @@ def test_vehicle_learns_what_was_read(join: Join) -> None:
         sending.join(DEADLINE)
         assert publisher.flush()
         publisher.close()  # else it waits for the reader to come back
+
+
+def test_message_without_a_file_is_read(join: Join) -> None:
+    """Readers may ask vehicles what any message is, one that has no file here too; other topics need no rule."""
+    vehicle, reader = join("vehicle-1"), join("reader")
+    definition = define("WheelEncoders", {"timestamp": field_type("uint64"), "wheel_speed": field_type("float32[2]")})
+    encoders = vehicle._publishers.publisher(Address("1", "wheel_encoders"), definition)
+    attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
+    sent = definition.model.model_validate({"timestamp": 1, "wheel_speed": (0.5, 2.0)})
+    with reader.subscribe("*", mode="every") as subscription:
+        for key in (encoders.key, attitude.key):
+            wait_for_reader(vehicle._session, key)
+        attitude.publish({"timestamp": 1, "q": (1.0, 0.0, 0.0, 0.0)})
+        assert subscription.receive(DEADLINE).topic == "vehicle_attitude"
+
+        def is_read() -> bool:
+            encoders.publish(sent)
+            with suppress(nedbus.NoDataError):
+                return bool(subscription.receive(0.1).message.model_dump() == sent.model_dump())
+            return False
+
+        wait_for(is_read, what="a message that a vehicle has described")
 
 
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])

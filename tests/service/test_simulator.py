@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
+from typing import Any
 
 import pytest
 
+from nedbus.errors import SourceError
 from nedbus.sources import SourceMessage
-from nedbus_msgs import FIELD_TYPES, TOPICS, VehicleLocalPosition, encode, upgrade
+from nedbus_msgs import (
+    BY_TOPIC,
+    DEFAULT,
+    TOPICS,
+    VehicleLocalPosition,
+    encode,
+    quaternion_to_euler,
+    to_global,
+    upgrade_with,
+)
+from tests.first_message import FIELD_TYPES, upgrade
 from tests.messages import VLP
 from tests.replays import open_replay
 
@@ -21,36 +34,74 @@ def simulate(options: str) -> list[SourceMessage]:
 def streams() -> dict[str, list[VehicleLocalPosition]]:
     """Simulate more than one lap, validate everything, and group it by stream."""
     by_stream: dict[str, list[VehicleLocalPosition]] = defaultdict(list)
-    for each in simulate("?duration=140"):
+    for each in simulate("?duration=140&topics=VehicleLocalPosition"):
         assert set(each.fields) == set(FIELD_TYPES)
         by_stream[each.address.stream].append(upgrade(each.fields))
     return by_stream
 
 
+@pytest.fixture(scope="module")
+def others() -> dict[str, list[Any]]:
+    """Simulate what is said beside VehicleLocalPosition, validate everything, and group it by stream."""
+    topics = ",".join(TOPICS.keys() - DEFAULT.topics)
+    by_stream: dict[str, list[Any]] = defaultdict(list)
+    for each in simulate(f"?duration=140&topics={topics}"):
+        definition = BY_TOPIC[each.address.topic]
+        newest = definition.layout_of_release("main")
+        assert newest
+        assert each.fields.keys() == newest.types.keys()
+        by_stream[each.address.stream].append(upgrade_with(definition, each.fields))
+    return by_stream
+
+
+def encoded(options: str) -> list[tuple[float, str, bytes]]:
+    """Return all messages of a flight, in order."""
+    return [
+        (each.due, str(each.address), encode(upgrade_with(BY_TOPIC[each.address.topic], each.fields)))
+        for each in simulate(options)
+    ]
+
+
 def test_same_seed_same_bits() -> None:
     """The flight is a function of its seed."""
-    one, two, other = ([encode(upgrade(each.fields)) for each in simulate(f"?duration=3&seed={s}")] for s in (3, 3, 4))
+    one, two, other = (encoded(f"?duration=3&seed={seed}") for seed in (3, 3, 4))
     assert one == two
     assert one != other
 
 
+@pytest.mark.parametrize("topic", ["vehicle_local_position", "estimator_local_position", "vehicle_attitude", "*"])
+def test_what_is_chosen_is_the_same_flight(topic: str) -> None:
+    """A choice of topics has the messages that they have in the whole flight, to the bit."""
+    whole, chosen = encoded("?duration=18"), encoded(f"?duration=18&topics={topic}")
+    assert chosen == [each for each in whole if topic in ("*", each[1].split("/")[1])]
+
+
+def test_topic_that_no_simulated_vehicle_has_is_an_error() -> None:
+    """A choice of nothing is said, not flown."""
+    with pytest.raises(SourceError, match="does not have timesync_status"):
+        simulate("?duration=1&topics=timesync_status")
+
+
 def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
     """Each stream has its topic's nominal rate, evenly."""
-    assert set(streams) == {name for name, topic in TOPICS.items() if not topic.instances} | {
+    assert set(streams) == {name for name, topic in DEFAULT.topics.items() if not topic.instances} | {
         "estimator_local_position/0",
         "estimator_local_position/1",
     }
     for stream, messages in streams.items():
         steps = {after.timestamp - before.timestamp for before, after in itertools.pairwise(messages)}
-        assert steps == {round(1e6 / TOPICS[stream.split("/")[0]].rate)}
+        assert steps == {round(1e6 / DEFAULT.topics[stream.split("/")[0]].rate)}
 
 
-def test_messages_are_in_time_order_and_counted() -> None:
-    """A finite flight has as many messages as its total, in order of `due`."""
-    run = open_replay("sim:?duration=3.3")
-    due = [each.due for each in run.messages]
+@pytest.mark.parametrize("options", ["?duration=3.3", "?duration=0.5", "?duration=3.3&topics=home_position,SensorGps"])
+def test_messages_are_in_time_order_and_counted(options: str) -> None:
+    """A finite flight has as many messages as its total, in order of `due`, and those of all its addresses."""
+    run = open_replay(f"sim:{options}")
+    messages = list(run.messages)
+    due = [each.due for each in messages]
     assert due == sorted(due)
     assert len(due) == run.total
+    assert {each.address for each in messages} == set(run.addresses)
 
 
 def test_outage_is_dead_reckoning_with_growing_error(streams: dict[str, list[VehicleLocalPosition]]) -> None:
@@ -117,3 +168,84 @@ def test_seeds_have_different_directions() -> None:
     """Vehicles with different seeds fly apart, as soon as they have climbed."""
     ends = [upgrade(simulate(f"?duration=12&seed={seed}")[-1].fields) for seed in (0, 1)]
     assert abs(ends[0].x - ends[1].x) + abs(ends[0].y - ends[1].y) > 5
+
+
+def test_attitude_fits_the_flight(streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]) -> None:
+    """Its heading is that of the estimate, its reset too, and its thrust makes the acceleration."""
+    estimates = {message.timestamp: message for message in streams[VLP]}
+    attitudes = others["vehicle_attitude"]
+    assert len(attitudes) == 7000
+    for message in attitudes:
+        estimate = estimates[message.timestamp]
+        assert math.hypot(*message.q) == pytest.approx(1.0, abs=1e-6)
+        roll, pitch, heading = quaternion_to_euler(message.q)
+        assert math.remainder(heading - estimate.heading, math.tau) == pytest.approx(0.0, abs=1e-5)
+        assert message.quat_reset_counter == estimate.heading_reset_counter
+        assert 2 * math.atan2(message.delta_q_reset[3], message.delta_q_reset[0]) == pytest.approx(
+            estimate.delta_heading, abs=1e-5
+        )
+        thrust = math.hypot(estimate.ax, estimate.ay, estimate.az - 9.80665)
+        assert thrust * math.cos(roll) * math.cos(pitch) == pytest.approx(9.80665 - estimate.az, abs=1e-4)
+        if 26e6 < message.timestamp < 124e6:  # there is no error of the heading
+            along = estimate.ax * math.cos(heading) + estimate.ay * math.sin(heading)
+            assert -thrust * math.cos(roll) * math.sin(pitch) == pytest.approx(along, abs=1e-4)
+            across = estimate.ay * math.cos(heading) - estimate.ax * math.sin(heading)
+            assert thrust * math.sin(roll) == pytest.approx(across, abs=1e-4)
+
+
+def test_global_position_is_the_local_one(
+    streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
+) -> None:
+    """It is the estimate's position on the globe, valid while that is."""
+    estimates = {message.timestamp: message for message in streams[VLP]}
+    assert others["vehicle_global_position"][0].timestamp == 12_000_000  # the origin is known
+    for message in others["vehicle_global_position"]:
+        estimate = estimates[message.timestamp]
+        where = to_global(estimate)
+        assert where
+        assert (message.lat, message.lon) == pytest.approx((where.latitude, where.longitude), abs=1e-8)
+        assert message.alt == pytest.approx(where.altitude, abs=1e-4)
+        names = ("dead_reckoning", "eph", "epv")
+        assert [getattr(message, name) for name in names] == [getattr(estimate, name) for name in names]
+        assert message.lat_lon_valid == estimate.xy_valid
+
+
+def test_state_and_gps_fit_the_outage(
+    streams: dict[str, list[VehicleLocalPosition]], others: dict[str, list[Any]]
+) -> None:
+    """Without GPS the receiver has no fix; while the position is invalid a failsafe is in force."""
+    estimates = {message.timestamp: message for message in streams[VLP]}
+    for message in others["vehicle_status"]:
+        estimate = estimates[message.timestamp]
+        assert message.failsafe is not estimate.xy_valid
+        assert (message.nav_state == message.nav_state_user_intention) is estimate.xy_valid
+        assert message.arming_state == message.ARMING_STATE_ARMED
+    assert {message.nav_state for message in others["vehicle_status"]} == {17, 3, 1}
+    for message in others["sensor_gps/0"]:
+        seconds = message.timestamp / 1e6 - 10
+        has_fix = 2 <= seconds % 120 < 60 or seconds % 120 >= 75 or seconds >= 120
+        assert (message.fix_type == 3, message.satellites_used > 5, message.eph < 5) == (has_fix,) * 3
+        assert message.vel_ned_valid is has_fix
+        assert (message.time_utc_usec > 0) is (seconds >= 2)
+        if has_fix:
+            truth = to_global(estimates[message.timestamp])
+            assert truth
+            assert (message.latitude_deg, message.longitude_deg) == pytest.approx(
+                (truth.latitude, truth.longitude), abs=1e-4
+            )
+
+
+def test_battery_home_and_landing_fit_the_flight(others: dict[str, list[Any]]) -> None:
+    """The battery gets emptier, home is said at the start and with the origin, and the vehicle takes off once."""
+    batteries = others["battery_status/0"]
+    assert all(after.remaining < before.remaining for before, after in itertools.pairwise(batteries))
+    assert all(0.8 < each.remaining <= 1 and 14 < each.voltage_v < 17 for each in batteries)
+    homes = others["home_position"]
+    assert [(each.timestamp, each.valid_hpos, each.update_count) for each in homes] == [
+        (10_000_000, False, 1),
+        (12_000_000, True, 2),
+    ]
+    landed = [each.landed for each in others["vehicle_land_detected"]]
+    assert landed[0]
+    assert landed == sorted(landed, reverse=True)
+    assert not landed[-1]

@@ -26,7 +26,7 @@ from nedbus.cli.lines import Lines
 from nedbus.cli.live_table import LiveTable
 from nedbus.cli.table import to_table
 from nedbus.transport import Session, open_router
-from nedbus_msgs import TOPICS
+from nedbus_msgs import DEFAULT
 from tests.command_line import fork_command, run_command
 from tests.hasty import start_hasty
 from tests.messages import VALID, VLP, message
@@ -92,7 +92,7 @@ def sample(address: nedbus.Address) -> nedbus.Sample:
     return nedbus.Sample(message(99_999_123_456, **position), address, 0, lost=3)
 
 
-ALL_TOPICS = [nedbus.Address("1", topic, 0 if topic.startswith("estimator") else None) for topic in TOPICS]
+ALL_TOPICS = [nedbus.Address("1", name, 0 if topic.instances else None) for name, topic in DEFAULT.topics.items()]
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_short_addresses_remain_different(lines: Callable[[int], Lines]) -> None
     for width in (1, 80, 85, 90):
         to_line = lines(width)
         shown = {to_line(sample(address)).splitlines()[-1].split()[0] for address in ALL_TOPICS}
-        assert len(shown) == len(TOPICS)
+        assert len(shown) == len(DEFAULT.topics)
         assert width > 1 or "1/veh…tion" in shown
 
 
@@ -346,7 +346,7 @@ def test_killed_service_is_gone(run_nedbus: Start, endpoint: str, bus: nedbus.Bu
 
 def test_ended_replay_is_stale(start: Start, run_nedbus: Start, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A replay that has ended, in a service that still runs, has no state "ok" in `list`, `info` and `hz`."""
-    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1")
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:?duration=0.5&wait=1&topics=VehicleLocalPosition")
     hz = start_hasty(
         start, {"nedbus.client.health.stream_health._STALE": 0.5}, "hz", "-c", endpoint, "--json", "-t", VLP
     )

@@ -169,6 +169,31 @@ def test_header_and_table_say_the_same(sky: Sky) -> None:
     assert page.marks["quad"]["north"] == 5.0
 
 
+def test_other_messages_have_a_row_and_no_place(sky: Sky) -> None:
+    """They are rows with their rate and age, without flags; who chooses one sees the plots of that vehicle's position.
+
+    A vehicle of which nothing else comes is on no map.
+    """
+    attitude, battery = Address("wing", "vehicle_attitude"), Address("far", "battery_status", 0)
+    sky.fly(3, WING, attitude, battery, x=4.0)
+    page = Page(sky)
+    rows = {row["topic"]: row for row in page.rows("what is wrong")}
+    assert set(rows) == {"local position", "vehicle attitude", "battery status 0"}
+    assert [rows["vehicle attitude"][name] for name in ("Hz", "age", "lost", "xy", "DR", "off truth")] == [
+        "10", "<1 s", "0", "", "", ""
+    ]  # fmt: skip
+    assert rows["local position"]["xy"] == "●"
+    assert set(page.marks) == {"wing"}
+    page.source("what is wrong").selected.indices = [list(rows).index("vehicle attitude")]
+    page.update()
+    assert page.chosen == attitude
+    assert f"<b>{WING}</b>" in page.text
+    assert len(page.source("climb").data["climb"]) > 20
+    sky.time += 5
+    page.look(alive=[battery])
+    assert page.states["far"] == "stale"
+
+
 def test_marker_stays_where_the_vehicle_was(sky: Sky) -> None:
     """The marker of a vehicle that is silent or invalid is open, grey or red, and where it was valid last."""
     sky.fly(3, WING, QUAD, x=4.0, y=2.0)

@@ -118,6 +118,7 @@ def test_browser_says_little_at_a_time(url: str) -> None:
         wait_for(is_closed, what="the end of the page")
 
 
+@pytest.mark.filterwarnings("ignore:There is no current event loop")  # of Bokeh's client
 def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
     """One page more than the limit, which is 1 here, says so instead of taking the memory of all."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)

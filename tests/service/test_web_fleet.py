@@ -110,6 +110,18 @@ def test_only_so_many_streams_are_shown(sky: Sky, monkeypatch: pytest.MonkeyPatc
     assert sky.line(names[0]).since == sky.time
 
 
+def test_positions_come_before_other_messages(sky: Sky, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that is full forgets other messages for a position, and nothing for them."""
+    monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
+    attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
+    sky.fly(2, attitude, battery)
+    assert [(line.address, line.condition) for line in sky.look().lines] == [(battery, "ok"), (attitude, "ok")]
+    sky.fly(2, WING, attitude, QUAD, battery)
+    picture = sky.look()
+    assert ([line.address for line in picture.lines], picture.left_out) == ([QUAD, WING], 2)
+    assert sky.stream().written
+
+
 def test_last_valid_place_is_told(sky: Sky) -> None:
     """Where a vehicle was last is where it was valid last; beside it its latitude and longitude, if it has them."""
     sky.fly(1, xy_valid=False, x=9.0)

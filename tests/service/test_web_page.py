@@ -91,7 +91,7 @@ def until_order(page: Tab, *vehicles: str) -> None:
 
 def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
     """Every element is filled from a flight: counts, rows, the map with its track, and the plots beside the truth."""
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?vehicle=wing")
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?vehicle=wing&topics=VehicleLocalPosition")
     page = tab()
     page.open(url)
     page.wait_for_text("1 vehicle")

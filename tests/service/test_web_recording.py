@@ -118,6 +118,19 @@ def test_any_speed_of_a_browser_is_survived(recording: Recording, clock: SimpleN
     assert 0 <= float(slider.value) <= 180
 
 
+def test_of_other_messages_only_the_time_is_kept(tmp_path: Path, clock: SimpleNamespace) -> None:
+    """A recording with them shows their rate and age, and reads no more of them than PX4's time."""
+    file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)
+    opened = Recording(file)
+    wait_for(lambda: opened.length > 19.8, what="the recording")
+    assert {type(payload) for address, payload in opened.entries if address.topic != VLP} == {int}
+    player = Player(opened)
+    run(player, clock, 10)
+    line = next(line for line in player.fleet.picture.lines if line.address.topic == "vehicle_attitude")
+    assert line.health.rate == pytest.approx(10, rel=0.1)
+    assert (line.condition, line.stream.written, line.health.messages) == ("ok", 0, 100)
+
+
 def test_damaged_recording_is_an_error(tmp_path: Path) -> None:
     """A file that is no recording is said to be none before a page is served."""
     file = tmp_path / "flight.ulg"

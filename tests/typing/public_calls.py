@@ -5,7 +5,7 @@ An ignore that is not needed is an error of mypy's, so a mistake that slips thro
 
 from __future__ import annotations
 
-from typing import assert_type
+from typing import Any, assert_type
 
 import numpy as np
 import pandas as pd
@@ -21,22 +21,34 @@ def subscribe(bus: nedbus.Bus) -> None:
             assert_type(sample.message.x, float)
             sample.message.model_dump()
         for row in subscription.rows():
-            assert_type(row, nedbus.Sample[nedbus.Row])
+            assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
             assert_type(row.message.delta_xy, tuple[float, float])
-            row.message._asdict()
-            row.message.model_dump()  # type: ignore[attr-defined] # a row is a tuple
             row.message.y_valid  # type: ignore[attr-defined] # no such field
         for batch in subscription.batches():
             assert_type(batch, nedbus.Batch)
             assert_type(batch.of(nedbus.Address("7", "vehicle_local_position")), nedbus.MessageArray)
         assert_type(subscription.receive(1.0), nedbus.Sample)
     assert_type(bus.subscribe(max_rate=5), nedbus.Subscription)
-    bus.subscribe(max_rate="5")  # type: ignore[arg-type] # a number
-    bus.subscribe(mode="newest")  # type: ignore[arg-type] # latest or every
-    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-arg] # the vehicle by name only
+    bus.subscribe(max_rate="5")  # type: ignore[call-overload] # a number
+    bus.subscribe(mode="newest")  # type: ignore[call-overload] # latest or every
+    bus.subscribe("vehicle_local_position", "7")  # type: ignore[call-overload] # the vehicle by name only
 
 
-def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.Row]) -> None:
+def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
+    """The topic decides which message it is; of one that is not known, or of all, it may be any."""
+    for sample in bus.subscribe("vehicle_attitude"):
+        assert_type(sample, nedbus.Sample[nedbus.VehicleAttitude])
+        assert_type(sample.message.q, tuple[float, float, float, float])
+        sample.message.x  # type: ignore[attr-defined] # an attitude has no position
+    assert_type(bus.subscribe("sensor_gps", mode="every").receive().message.fix_type, int)
+    assert_type(bus.subscribe("vehicle_gps_position"), nedbus.Subscription[nedbus.SensorGps])
+    assert_type(bus.subscribe("*"), nedbus.Subscription[Any])
+    assert_type(bus.subscribe(any_topic), nedbus.Subscription[Any])
+    assert_type(bus.latest("home_position")[0].message.alt, float)
+    assert_type(bus.latest(), list[nedbus.Sample[nedbus.VehicleLocalPosition]])
+
+
+def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
     """What takes a message takes a row as well."""
     assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | nedbus.NoOrigin)
     assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | nedbus.NoOrigin)
@@ -65,7 +77,7 @@ async def read_and_publish() -> None:
         async for sample in bus.subscribe():
             assert_type(sample, nedbus.Sample[nedbus.VehicleLocalPosition])
         async for row in bus.subscribe().rows():
-            assert_type(row, nedbus.Sample[nedbus.Row])
+            assert_type(row, nedbus.Sample[nedbus.VehicleLocalPosition])
         assert_type(bus.subscribe(max_rate=0.5), nedbus.AsyncSubscription)
         for sample in bus.subscribe():  # type: ignore[attr-defined] # async for
             pass
@@ -80,6 +92,11 @@ def read() -> None:
     """An array, or a frame of the library that is asked for."""
     assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)
     assert_type(nedbus.read("flight.ulg", dataframe="pandas"), pd.DataFrame)
+    assert_type(nedbus.read("flight.ulg", ["home_position"]), dict[str, nedbus.MessageArray])
+    assert_type(nedbus.read("flight.ulg", ["*"], dataframe="pandas"), dict[str, pd.DataFrame])
+    assert_type(nedbus.align("flight.ulg", on=50.0, method="linear"), nedbus.MessageArray)
+    assert_type(nedbus.align({}, on=[1, 2], utc=True, dataframe="pandas"), pd.DataFrame)
+    assert_type(nedbus.utc_of("flight.ulg"), nedbus.UtcOffset | None)
     nedbus.read("flight.ulg", dataframe="arrow")  # type: ignore[call-overload] # pandas or polars
     nedbus.connect(tls_ca="ca.crt")  # type: ignore[call-arg] # tls=Tls(...)
     nedbus.raed  # type: ignore[attr-defined] # no such name

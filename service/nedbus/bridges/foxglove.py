@@ -1,7 +1,7 @@
 """Serve live vehicles to Foxglove: all fields for plots, poses and frames for the 3D view, positions for the map.
 
-    /<vehicle>/<topic>     px4_msgs/msg/VehicleLocalPosition, every field
-    /<vehicle>/pose        foxglove.PoseInFrame, ENU and FLU, of vehicle_local_position
+    /<vehicle>/<topic>     px4_msgs/msg/..., every field
+    /<vehicle>/pose        foxglove.PoseInFrame, ENU and FLU, of vehicle_local_position and vehicle_attitude
     /<vehicle>/location    foxglove.LocationFix, while the position is valid and has a global origin
     /tf                    foxglove.FrameTransforms: map -> <vehicle>/local -> <vehicle>
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from typing import Final
+from typing import Any, Final
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
@@ -21,20 +21,20 @@ from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseIn
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
 from nedbus_msgs import (
-    CURRENT,
     DEFAULT_TOPIC,
-    ROS2_TYPE,
     Address,
+    Message,
     Selection,
     VehicleLocalPosition,
-    downgrade,
-    encode_cdr,
-    message_definition,
+    definition_text,
+    encode_with,
+    ros2_type,
 )
 
 from . import FOXGLOVE_PORT
-from .foxglove_messages import MapFrame, has_position, to_location, to_pose, to_transforms
+from .foxglove_messages import MapFrame, has_position, orientation_of, to_location, to_pose, to_transforms
 
+_ATTITUDE: Final = "vehicle_attitude"
 _POLL: Final = 1.0  # s between two queries for the addresses that are published
 _HINT: Final = "choose another port with --port"
 
@@ -50,12 +50,10 @@ class FoxgloveServer:
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
-        self._schema = foxglove.Schema(
-            name=ROS2_TYPE, encoding="ros2msg", data=message_definition(CURRENT.name).encode()
-        )
         self._fields: dict[Address, foxglove.Channel] = {}
         self._poses: dict[str, PoseInFrameChannel] = {}
         self._locations: dict[str, LocationFixChannel] = {}
+        self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
         self._map = MapFrame()
         _require_free(host, port)
         try:
@@ -81,10 +79,12 @@ class FoxgloveServer:
                 except NoDataError:
                     continue
 
-    def show(self, sample: Sample) -> None:
+    def show(self, sample: Sample[Any]) -> None:
         """Show one sample on all channels of its address, and of its vehicle."""
         time_ns = sample.sent or sample.received
         self._show_fields(sample.address, sample.message, time_ns)
+        if sample.topic == _ATTITUDE:
+            self._attitudes[sample.vehicle] = sample.message
         if sample.topic == DEFAULT_TOPIC:
             self._open_channels(sample.vehicle)
             self._show_pose(sample.vehicle, sample.message, time_ns)
@@ -100,15 +100,17 @@ class FoxgloveServer:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _show_fields(self, address: Address, message: VehicleLocalPosition, time_ns: int) -> None:
+    def _show_fields(self, address: Address, message: Message, time_ns: int) -> None:
+        definition = message.DEFINITION
         channel = self._fields.get(address)
         if channel is None:
+            text = definition_text(definition, definition.current).encode()
+            schema = foxglove.Schema(name=ros2_type(definition), encoding="ros2msg", data=text)
             channel = self._fields[address] = foxglove.Channel(
-                f"/{address}", schema=self._schema, message_encoding="cdr", context=self._context
+                f"/{address}", schema=schema, message_encoding="cdr", context=self._context
             )
         if channel.has_sinks():
-            payload = encode_cdr(downgrade(message, CURRENT.name), layout=CURRENT.name)
-            channel.log(payload, log_time=time_ns)
+            channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
 
     def _open_channels(self, vehicle: str) -> None:
         if vehicle not in self._poses:
@@ -118,9 +120,10 @@ class FoxgloveServer:
     def _show_pose(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if not has_position(message):
             return
-        self._poses[vehicle].log(to_pose(vehicle, message, time_ns=time_ns), log_time=time_ns)
+        orientation = orientation_of(message, self._attitudes.get(vehicle))
+        self._poses[vehicle].log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
         local_in_map = self._map.locate(vehicle, message)
-        transforms = to_transforms(vehicle, message, local_in_map=local_in_map, time_ns=time_ns)
+        transforms = to_transforms(vehicle, message, orientation, local_in_map=local_in_map, time_ns=time_ns)
         self._transforms.log(transforms, log_time=time_ns)
 
     def _show_location(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
@@ -135,6 +138,8 @@ class FoxgloveServer:
             return  # without a link the answers are incomplete
         for address in self._fields.keys() - published:
             self._fields.pop(address).close()
+            if address.topic == _ATTITUDE:
+                self._attitudes.pop(address.vehicle, None)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
         for vehicle in self._poses.keys() - vehicles:
             self._poses.pop(vehicle).close()

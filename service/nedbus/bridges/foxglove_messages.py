@@ -1,9 +1,9 @@
-"""Convert a VehicleLocalPosition to Foxglove's messages: pose, transforms and location; no I/O and no clock."""
+"""Convert position and attitude to Foxglove's messages: pose, transforms and location; no I/O and no clock."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 from foxglove.messages import (
     FrameTransform,
@@ -20,6 +20,7 @@ from foxglove.messages import (
 from nedbus_msgs import MapProjection, VehicleLocalPosition, ned_to_enu, to_global, yaw_ned_to_enu
 
 _MAP: Final = "map"
+_FRESH: Final = 500_000  # us between a position and the attitude that goes with it
 
 
 class MapFrame:
@@ -57,14 +58,30 @@ def has_position(message: VehicleLocalPosition) -> bool:
     return math.isfinite(message.x + message.y + message.z)
 
 
-def to_pose(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) -> PoseInFrame:
-    """Return the pose of a vehicle in its local frame; without a heading it faces east."""
-    pose = Pose(position=_position(message), orientation=_orientation(message))
+def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
+    """Return the rotation from FLU to ENU as (x, y, z, w): of a VehicleAttitude of that time, else of the heading.
+
+    Without either the vehicle faces east.
+    """
+    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _FRESH:
+        w, x, y, z = (each * math.sqrt(0.5) for each in attitude.q)
+        if math.isfinite(w + x + y + z):  # from ENU to NED, q, and from FLU to FRD, multiplied out
+            return x + y, x - y, w - z, w + z
+    yaw = yaw_ned_to_enu(message.heading)
+    half = yaw / 2 if math.isfinite(yaw) else 0.0
+    return 0.0, 0.0, math.sin(half), math.cos(half)
+
+
+def to_pose(
+    vehicle: str, message: VehicleLocalPosition, orientation: tuple[float, ...], *, time_ns: int
+) -> PoseInFrame:
+    """Return the pose of a vehicle in its local frame."""
+    pose = Pose(position=_position(message), orientation=_quaternion(*orientation))
     return PoseInFrame(timestamp=_stamp(time_ns), frame_id=_local(vehicle), pose=pose)
 
 
 def to_transforms(
-    vehicle: str, message: VehicleLocalPosition, *, local_in_map: Vector3, time_ns: int
+    vehicle: str, message: VehicleLocalPosition, orientation: tuple[float, ...], *, local_in_map: Vector3, time_ns: int
 ) -> FrameTransforms:
     """Return where the local frame is in the map, and where the vehicle is in its local frame."""
     local = FrameTransform(
@@ -79,7 +96,7 @@ def to_transforms(
         parent_frame_id=_local(vehicle),
         child_frame_id=vehicle,
         translation=_position(message),
-        rotation=_orientation(message),
+        rotation=_quaternion(*orientation),
     )
     return FrameTransforms(transforms=[local, body])
 
@@ -112,10 +129,8 @@ def _position(message: VehicleLocalPosition) -> Vector3:
     return Vector3(x=east, y=north, z=up)
 
 
-def _orientation(message: VehicleLocalPosition) -> Quaternion:
-    yaw = yaw_ned_to_enu(message.heading)
-    half = yaw / 2 if math.isfinite(yaw) else 0.0
-    return Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+def _quaternion(x: float, y: float, z: float, w: float) -> Quaternion:
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _stamp(time_ns: int) -> Timestamp:

@@ -7,8 +7,9 @@ import os
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
@@ -18,28 +19,35 @@ from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
     NO_HASH,
+    PX4_TYPES,
     Attachment,
+    PublisherToken,
     Session,
     TopicKey,
     alive_keys,
     gid_of_token,
     node_token,
     publisher_token,
-    publishers_key_expr,
+    publishers_of_type_key_expr,
     while_open,
 )
 from nedbus_msgs import (
     ANY,
-    CURRENT,
-    LAYOUTS,
-    ROS2_TYPE,
+    BY_TOPIC,
+    DEFAULT,
+    RELEASES,
     Address,
+    DecodeError,
+    Definition,
+    Layout,
     LayoutError,
+    Message,
     Selection,
     dds_type,
-    downgrade,
-    encode_cdr,
-    type_hash,
+    encode_with,
+    get_topic,
+    hash_of,
+    ros2_type,
 )
 
 from .late_filter import LateFilter
@@ -49,6 +57,7 @@ _log = logging.getLogger(__name__)
 
 _POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
 _REMEMBERED: Final = 60.0  # s that a vehicle may be gone and still be recovered from; publishers keep 20 s
+_MAX_LEFT_OUT: Final = 1000  # addresses of which is said that they are left out
 _VISIBLE: Final = 5.0  # s after which what was announced is visible to others, or denied
 
 
@@ -58,7 +67,8 @@ class Ros2Bridge:
     `ros2 topic list` shows each topic for as long as its vehicle is published, as `/fmu/out/<topic>`, with a namespace
     before it for every vehicle but `plain`: that of `namespaces`, else the vehicle's name, or `px4_<name>` where ROS 2
     requires a leading letter.
-    Instances are `estimator_local_position_0`, `_1` and so on.
+    Instances are `estimator_local_position_0`, `_1` and so on; `battery_status` and others of PX4's default have none
+    for the first.
     A topic that another node publishes is left to that node: a PX4 that speaks Zenoh itself is not published twice.
     `selection` is what to publish, all addresses without it.
     `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
@@ -74,27 +84,29 @@ class Ros2Bridge:
         *,
         observer: Session | None = None,
         selection: Selection | None = None,
-        layout: str = CURRENT.name,
+        layout: str = RELEASES[-1],
         domain: int = 0,
         hashed: bool = True,
         plain: str = "1",
         namespaces: Mapping[str, str] | None = None,
     ) -> None:
-        if layout not in LAYOUTS:
-            raise LayoutError(f"no layout {layout!r}: choose from {', '.join(LAYOUTS)}")
+        known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
+        if layout not in known:
+            raise LayoutError(f"no layout {layout!r}: choose from {', '.join(known)}")
         self._bus = bus
         self._session = session
         self._observer = observer
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._hash = type_hash(layout) if hashed else NO_HASH
+        self._hashed = hashed
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
         self._late_filter = LateFilter()
         self._withdrawn: dict[Address, float] = {}  # since when; what is late of them is still known
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
+        self._left_out: set[Address] = set()
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
@@ -131,7 +143,7 @@ class Ros2Bridge:
                 )
             stop.wait(0.05)
 
-    def _forward(self, subscription: Subscription, stop: threading.Event) -> None:
+    def _forward(self, subscription: Subscription[Any], stop: threading.Event) -> None:
         next_poll = 0.0
         while not stop.is_set():
             if time.monotonic() >= next_poll:
@@ -141,9 +153,11 @@ class Ros2Bridge:
                 sample = subscription.receive(0.1)
             except NoDataError:
                 continue
-            if self._late_filter.admits(sample, arrived=time.monotonic_ns()) and self._arbiter.publishes(
-                sample.address
-            ):
+            # What has no rate holds until the next one comes, however old it is.
+            is_current = not get_topic(sample.topic).rate or self._late_filter.admits(
+                sample, arrived=time.monotonic_ns()
+            )
+            if is_current and self._arbiter.publishes(sample.address):
                 self._put(sample)
 
     def _poll(self) -> None:
@@ -156,25 +170,27 @@ class Ros2Bridge:
                 del self._withdrawn[address]
                 self._late_filter.forget(address)
         addresses = [
-            address
-            for addresses in self._bus.vehicles().values()
-            for address in addresses
-            if self._selection.matches(address)
+            address for addresses in self._bus.vehicles().values() for address in addresses if self._is_bridged(address)
         ]
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the answers are incomplete
-        nodes = {address: self._other_publisher(self._key(self._arbiter.topic_of(address))) for address in addresses}
-        others = {address: node for address, node in nodes.items() if node is not None}
+        nodes = self._other_nodes()
+        others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
             self._apply(decision)
 
     def _apply(self, decision: Decision) -> None:
         address, topic, other = decision.address, decision.topic, decision.other
         if decision.action == "publish":
-            self._open(address, topic)
+            self._open(address)
             self._withdrawn.pop(address, None)
             _log.info(
-                "%s -> /%s, %s of layout %s", address, topic, ROS2_TYPE, self._layout, extra=about("bridged", address)
+                "%s -> /%s, %s of layout %s",
+                address,
+                topic,
+                ros2_type(self._message(address)[0]),
+                self._message(address)[1].name,
+                extra=about("bridged", address),
             )
         elif decision.action == "conflict":
             _log.warning(
@@ -202,16 +218,18 @@ class Ros2Bridge:
                     "%s is no longer published: /%s is withdrawn", address, topic, extra=about("withdrawn", address)
                 )
 
-    def _other_publisher(self, key: TopicKey) -> str | None:
-        """Return the name of another node that publishes this topic."""
-        for token in alive_keys(self._session, publishers_key_expr(key), timeout=0.5):
-            _, _, session, *_, node = token.split("/")[:9]
-            if session != self._zid:
-                return node
-        return None
+    def _other_nodes(self) -> dict[TopicKey, str]:
+        """Return the name of another node for each topic that one publishes, by one query: there may be thousands."""
+        nodes, own = dict[TopicKey, str](), self._zid
+        for text in alive_keys(self._session, publishers_of_type_key_expr(self._domain, PX4_TYPES), timeout=0.5):
+            with suppress(DecodeError):
+                token = PublisherToken.parse(text)
+                if token.session != own:
+                    nodes.setdefault(token.key, token.node)
+        return nodes
 
-    def _open(self, address: Address, topic: str) -> None:
-        key = self._key(topic)
+    def _open(self, address: Address) -> None:
+        key = self._key(address)
         self._entities += 1
         token = publisher_token(key, self._zid, self._node, self._entities)
         with while_open():
@@ -223,16 +241,39 @@ class Ros2Bridge:
                 self._session.liveliness().declare_token(token),
             )
 
-    def _put(self, sample: Sample) -> None:
+    def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]
-        payload = encode_cdr(downgrade(sample.message, self._layout), layout=self._layout)
+        definition, layout = self._message(sample.address)
+        payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
         attachment = bytes(Attachment(publisher.sequence, time.time_ns(), publisher.gid))
         with while_open():
             publisher.publisher.put(payload, attachment=attachment)
 
-    def _key(self, topic: str) -> TopicKey:
-        return TopicKey(self._domain, topic, dds_type(ROS2_TYPE), self._hash)
+    def _key(self, address: Address) -> TopicKey:
+        definition, layout = self._message(address)
+        name = ros2_type(definition)
+        type_hash = hash_of(layout, name) if self._hashed else NO_HASH
+        return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(name), type_hash)
+
+    def _message(self, address: Address) -> tuple[Definition[Any], Layout]:
+        """Return the message of an address that is bridged, and its layout in the workspace."""
+        definition = BY_TOPIC[address.topic]
+        layout = definition.layout_of_release(self._layout)
+        return definition, layout or definition.current
+
+    def _is_bridged(self, address: Address) -> bool:
+        """Return whether ROS 2 can have an address: the workspace has its message."""
+        definition = BY_TOPIC.get(address.topic)
+        if definition and definition.layout_of_release(self._layout):
+            return self._selection.matches(address)
+        if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
+            self._left_out.add(address)
+            reason = (
+                f"PX4 {self._layout} has no such message" if definition else "nothing here says what it is in px4_msgs"
+            )
+            _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
+        return False
 
     @property
     def _zid(self) -> str:

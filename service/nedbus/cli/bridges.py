@@ -12,7 +12,7 @@ from nedbus import bridges
 from nedbus.bridges import FOXGLOVE_PORT
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, ConnectError, NedbusError
-from nedbus_msgs import ANY, CURRENT, LAYOUTS, Selection
+from nedbus_msgs import ANY, RELEASES, Selection
 
 from .options import InstanceOption, TopicArgument, TopicOption, VehicleOption, choose, on_bus, write_stderr
 from .run import run_until_stopped
@@ -28,8 +28,8 @@ def ros2(
     instance: InstanceOption = None,
     humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
     layout: Annotated[
-        str, typer.Option(help=f"Layout of px4_msgs in the ROS 2 workspace: {', '.join(LAYOUTS)} (to main)")
-    ] = CURRENT.name,
+        str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
+    ] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
     namespace: Annotated[
         list[str] | None,
@@ -37,7 +37,7 @@ def ros2(
     ] = None,
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
 ) -> None:
-    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs/msg/VehicleLocalPosition on /fmu/out/..."""
+    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
     for each in namespace or ():
         if ":" not in each:

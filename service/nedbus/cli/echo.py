@@ -6,11 +6,12 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
+from nedbus.errors import ConfigError
 from nedbus_msgs import ANY, Address
 
 from .follow import Link, follow
@@ -70,35 +71,43 @@ def echo(
     """Print messages as they arrive, a line each; a terminal that is too slow skips to the newest (see --every)."""
     require_one({"--full": full, "--json": json_output, "--csv": csv_output})
     require_one({"--once": once, "--count": count is not None})
-    fields = parse_fields(field)
     if max_rate is not None:
         check_max_rate(max_rate)
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    fields = parse_fields(field, selection)
     form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
-    show: Callable[[Sample], str] = partial(form, fields=fields)
+    show: Callable[[Sample[Any]], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
+    heads: list[str] = []  # of CSV
 
-    def print_one(sample: Sample) -> bool:
+    def print_one(sample: Sample[Any]) -> bool:
         if interval:
             now = time.monotonic()
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
+        if csv_output:
+            head = to_csv_head(sample, fields)
+            if head not in heads and heads:
+                raise ConfigError(
+                    "--csv", f"a table has one kind of message, and {sample.address} is another: name a topic"
+                )
+            if not heads:
+                heads.append(head)
+                write(head)
         write(show(sample))
         return True
 
     mode: Mode = "every" if every else "latest"
     with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
         try:
-            if csv_output:
-                write(to_csv_head(fields))
             follow(subscription, print_one, link=Link(bus), count=1 if once else count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
                 _write_counts(subscription)
 
 
-def _write_counts(subscription: Subscription) -> None:
+def _write_counts(subscription: Subscription[Any]) -> None:
     counts = subscription.counts
     if counts.lost or counts.dropped or counts.invalid or counts.discarded:
         discarded = f", {counts.discarded} discarded" if counts.discarded else ""

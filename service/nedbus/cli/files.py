@@ -17,7 +17,7 @@ from nedbus import recording
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.sources import LiveSource, parse_source, source_text_of_file
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection
+from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 from .follow import write_notice
 from .options import (
@@ -85,9 +85,13 @@ def convert(
     output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording to write", show_default=False)],
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of a log of one vehicle")] = None,
+    topics: Annotated[
+        str | None,
+        typer.Option("--topics", "-t", help='Topics or messages, separated by commas; "*" is all in the log'),
+    ] = None,
 ) -> None:
-    """Convert a flight log to a recording, validated, with all local position topics."""
-    spec = parse_source(source_text_of_file(source, vehicle))
+    """Convert a flight log to a recording, validated, with all topics whose messages nedbus knows."""
+    spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))
     replay = spec.open_source(vehicle="1")
     if isinstance(replay, LiveSource):
         raise ConfigError(str(source), "not a file")
@@ -114,15 +118,19 @@ def plot(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE.png", help="The picture (default: beside the flight)")
     ] = None,
-    topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')] = DEFAULT_TOPIC,
+    topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
 ) -> None:
     """Draw a flight: track, altitude, speed, flags, and resets of the estimator."""
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
+    if topic not in (ANY, *DEFAULT.topics):
+        table = f'nedbus.read("{source}", "{topic}", dataframe="pandas")'
+        raise ConfigError("--topic", f"{topic} has no track to draw, {', '.join(DEFAULT.topics)} have: see {table}")
     with recording.Flight(source) as flight:
-        selected = recording.matching(source, flight.addresses, selection)
+        found = recording.matching(source, flight.addresses, selection)
+        selected = [address for address in found if address.topic in DEFAULT.topics]
         if len(selected) > limit:
             hint = f"of which the first {limit} are drawn: choose with -v, -t, -i"
             write_stderr(f"{source}: {len(selected)} streams, {hint}")

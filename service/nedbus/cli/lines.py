@@ -6,14 +6,15 @@ import math
 import shutil
 from collections.abc import Sequence
 from itertools import zip_longest
-from typing import Final
+from typing import Any, Final
 
 from nedbus.client import Sample
-from nedbus_msgs import ANY, FIELD_TYPES, TOPICS, Selection
+from nedbus_msgs import ANY, TOPICS, Selection, get_topic
 
-from .format import to_line, to_state, to_value
+from .format import is_position, to_line, to_state, to_value
 from .table import terminal_width
 
+_SHARE: Final = 3  # of a line without columns: what its address gets at most
 _GAP: Final = "  "
 _STATE: Final = "STATE"
 _LEAST_PAGE: Final = 10  # lines between two headings, on the lowest terminal
@@ -21,7 +22,8 @@ _HEAD, _TAIL = 3, 4  # characters that are kept of a topic at least
 _DIGITS: Final = (3, 2)  # after the point, where there is room for them
 _OPTIONAL: Final = 3  # columns at the right that a narrow terminal leaves out: velocity, heading, eph
 # Characters of a value; a longer one widens its column.
-_FIELD_WIDTHS: Final = {"uint64": 12, "uint8": 3, "bool": 5, "float32": 13, "float32[2]": 13, "float64": 18}
+_FIELD_WIDTHS: Final = {"uint64": 12, "int64": 12, "uint8": 3, "int8": 3, "bool": 5, "float32": 13, "float64": 18}
+_OTHER_WIDTH: Final = 10
 
 
 class Lines:
@@ -32,8 +34,8 @@ class Lines:
     """
 
     def __init__(self, selection: Selection) -> None:
-        topics = TOPICS.values() if selection.topic == ANY else [TOPICS[selection.topic]]
-        self._stream = max(len(f"/{topic.name}{'/0' * topic.instances}") for topic in topics)
+        topics = TOPICS.values() if selection.topic == ANY else [get_topic(selection.topic)]
+        self._stream = max(len(f"/{topic.name}{'/0' * (topic.instances is not False)}") for topic in topics)
         self._address = self._least_address = 0
         self._widths: dict[int, list[int]] = {digits: [] for digits in _DIGITS}
         self._state = self._page_state = 0  # characters of the longest state: for which there is room, of this page
@@ -46,6 +48,11 @@ class Lines:
         if width is None:
             return to_line(sample, fields)
         address, state = str(sample.address), to_state(sample)
+        if not fields and not is_position(sample.message):  # it has no columns: all that fits into a line
+            self._left -= 1
+            room = min(max(self._stream + len(sample.vehicle), len(address)), width // _SHARE)
+            line = to_line(sample, address=f"{shorten_address(address, room):<{room}}")
+            return line if len(line) <= width else f"{line[: width - 1]}…"
         cells = {digits: _cells(sample, fields, digits) for digits in _DIGITS}
         if not self._left:
             self._state, self._page_state = self._page_state, 0
@@ -95,15 +102,20 @@ def _join(address: str, cells: Sequence[str], state: str, widths: Sequence[int])
     return _GAP.join([f"{address:<{widths[0]}}", *numbers, state])
 
 
-def _cells(sample: Sample, fields: Sequence[str], digits: int) -> list[str]:
+def _cells(sample: Sample[Any], fields: Sequence[str], digits: int) -> list[str]:
     """Return the columns of a sample: time, then these fields, or position, velocity, heading and eph; NED, degrees."""
     message = sample.message
     time = f"{message.timestamp / 1e6:{digits + 6}.{digits}f}"
     if fields:
-        return [time, *(f"{to_value(sample, name):>{_FIELD_WIDTHS[FIELD_TYPES[name]]}}" for name in fields)]
+        return [time, *(f"{to_value(sample, name):>{_width_of(sample, name)}}" for name in fields)]
     position = " ".join(f"{value:{digits + 5}.{digits}f}" for value in (message.x, message.y, message.z))
     velocity = " ".join(f"{value:{digits + 4}.{digits}f}" for value in (message.vx, message.vy, message.vz))
     return [time, position, velocity, f"{math.degrees(message.heading):.1f}", f"{message.eph:.2f}"]
+
+
+def _width_of(sample: Sample[Any], name: str) -> int:
+    kind = sample.message.DEFINITION.types.get(name)
+    return kind.count * (_FIELD_WIDTHS.get(kind.base, _OTHER_WIDTH) + 1) - 1 if kind else 1
 
 
 def _head(fields: Sequence[str], digits: int) -> list[str]:

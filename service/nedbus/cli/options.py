@@ -21,7 +21,7 @@ from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, 
 from nedbus.log_event import about
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
-from nedbus_msgs import ANY, DEFAULT_PREFIX, DEFAULT_TOPIC, FIELD_TYPES, TOPICS, Selection, explain_unknown_field
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
 
 from .format import MAX_TEXT, printable, to_text
 from .logs import logs_for_programs
@@ -52,7 +52,7 @@ PositionTopicOption = Annotated[
 ]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
-    int | None, typer.Option("--instance", "-i", help="Instance of estimator_local_position (default: all)")
+    int | None, typer.Option("--instance", "-i", help="Instance, of topics that have some (default: all)")
 ]
 FieldOption = Annotated[
     str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z; nedbus schema")
@@ -191,12 +191,14 @@ def require_one(flags: Mapping[str, bool]) -> None:
         raise ConfigError(given[1], f"cannot be combined with {given[0]}: remove one of the two")
 
 
-def parse_fields(text: str | None) -> list[str]:
-    """Return the names in `x,y,z`; raise ConfigError for one that no field has."""
+def parse_fields(text: str | None, selection: Selection) -> list[str]:
+    """Return the names in `x,y,z`; raise ConfigError for one that no field of the selected messages has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
+    known = list(MESSAGES.values()) if selection.topic == ANY else [BY_TOPIC.get(selection.topic)]
     for name in names:
-        if name not in FIELD_TYPES:
-            raise ConfigError("--field", explain_unknown_field(name))
+        first = known[0]  # what has no file here has any fields
+        if first is not None and not any(each and name in each.types for each in known):
+            raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 
 

@@ -4,13 +4,28 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Sequence
-from typing import Annotated, Final
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Final
 
 import typer
 
 from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
-from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table
+from nedbus.errors import AddressError, ConfigError, ConnectError
+from nedbus_msgs import (
+    ANY,
+    DEFAULT_TOPIC,
+    MESSAGES,
+    TOPICS,
+    Address,
+    Definition,
+    Message,
+    Selection,
+    definition_of,
+    get_topic,
+    json_schema_of,
+    layout_table_of,
+)
 
 from .format import to_fields, to_json, to_text
 from .options import (
@@ -21,19 +36,20 @@ from .options import (
     TopicArgument,
     VehicleOption,
     choose,
-    command,
+    lazily_on_bus,
     on_bus,
     parse_fields,
     write,
     write_stderr,
 )
-from .status import refused_of, sources_of, streams_of
+from .status import list_of, refused_of, sources_of, streams_of
 from .table import terminal_width, to_table
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
+_ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
 _MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
@@ -85,8 +101,8 @@ def get(
 
     What only a storage kept is shown as such.
     """
-    fields = parse_fields(field)
     selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
+    fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
         write(to_json(sample, fields) if json_output else to_fields(sample, fields))
@@ -115,8 +131,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [_source_row(source) for source in sources_of(service)]
         _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
-        if gone := [str(address) for source in sources_of(service) for address in _gone(source)]:
-            write(_fold_list("gone: ", to_text(", ".join(gone), _MAX_VEHICLES), width))
+        for what, head in _ABSENT.items():
+            if absent := [str(each) for source in sources_of(service) for each in list_of(source, what)]:
+                write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
         if refused := refused_of(service):
             write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
         streams = [_stream_row(source, refused, *each) for source in sources_of(service) for each in streams_of(source)]
@@ -127,12 +144,37 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write_stderr("no nedbus service answers here")
 
 
-@command
+@lazily_on_bus
 def schema(
-    *, layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False
+    open_bus: Callable[[], Bus],
+    message: Annotated[
+        str, typer.Argument(help="A message, such as VehicleAttitude, or one of its topics")
+    ] = DEFAULT_TOPIC,
+    *,
+    layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False,
 ) -> None:
-    """Print the JSON Schema of a message, or the layouts that can be read."""
-    write(json.dumps(layout_table() if layouts else json_schema(), indent=2))
+    """Print the JSON Schema of a message, or the layouts that can be read.
+
+    Of a topic whose message has no file here it is what its publisher says.
+    """
+    try:
+        definition: Definition[Any] = definition_of(message)
+    except KeyError:
+        definition = _ask_publisher(open_bus, message)
+    write(json.dumps((layout_table_of if layouts else json_schema_of)(definition), indent=2))
+
+
+def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
+    with suppress(AddressError, ConnectError):
+        get_topic(topic)  # "*" is none
+        with open_bus() as bus:
+            for sample in bus.latest(topic):
+                message: Message = sample.message
+                return message.DEFINITION
+    known = ", ".join(MESSAGES)
+    raise ConfigError(
+        "message", f"there is no file for {topic!r}, nor is it a topic that is published: {known} are known"
+    )
 
 
 def _chunks(address: Address) -> dict[str, object]:
@@ -148,17 +190,11 @@ def _write_rows(table: str, rows: Sequence[object]) -> None:
 
 def _source_row(source: dict[str, object]) -> list[str]:
     keys = ("source", "state", "published", "rejected", "lost", "reboots", "retries")
-    gone = len(_gone(source))
+    gone = len(list_of(source, "stale"))
     return [
         *(to_text(source.get(key, "-")) for key in keys),
         to_text(source.get("error") or (f"{gone} gone" if gone else "-")),
     ]
-
-
-def _gone(source: dict[str, object]) -> list[object]:
-    """Return the addresses of a source that were withdrawn as nothing arrived: `stale` in the status, then gone."""
-    stale = source.get("stale")
-    return stale if isinstance(stale, list) else []
 
 
 def _fold_list(head: str, text: str, width: int | None) -> str:
@@ -171,11 +207,12 @@ def _stream_row(source: dict[str, object], refused: Sequence[str], address: str,
     addresses = source.get("addresses")
     alive = address in addresses if isinstance(addresses, list) else None
     is_refused = address.partition("/")[0] in refused
+    suffix = ", by PX4's definition" if TOPICS.keys().isdisjoint(address.split("/")) else ""
     return [
         to_text(address),
         "-" if health.rate is None else f"{health.rate:.1f}",
-        f"{health.nominal:g}",
+        f"{health.nominal:g}" if health.nominal else "-",
         "-" if health.age is None else to_age(health.age),
         str(health.messages),
-        "refused by the router" if is_refused else describe_stream(health, stream_state(health, alive=alive)),
+        "refused by the router" if is_refused else describe_stream(health, stream_state(health, alive=alive)) + suffix,
     ]

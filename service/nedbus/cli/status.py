@@ -21,18 +21,18 @@ _STREAM: Final[TypeAdapter[_Stream]] = TypeAdapter(_Stream)
 
 def sources_of(service: dict[str, object]) -> list[dict[str, object]]:
     """Return the sources in the status of a service."""
-    return [source for source in _list(service, "sources") if isinstance(source, dict)]
+    return [source for source in list_of(service, "sources") if isinstance(source, dict)]
 
 
 def refused_of(service: dict[str, object]) -> list[str]:
     """Return the vehicles of a service that its router refuses, as it says itself."""
-    return [vehicle for vehicle in _list(service, "refused") if isinstance(vehicle, str)]
+    return [vehicle for vehicle in list_of(service, "refused") if isinstance(vehicle, str)]
 
 
 def streams_of(source: dict[str, object]) -> list[tuple[str, Health]]:
     """Return address and health of each stream in the status of a source; what cannot be parsed is left out."""
     streams = []
-    for each in _list(source, "streams"):
+    for each in list_of(source, "streams"):
         try:
             stream = _STREAM.validate_python(each)
         except ValidationError:
@@ -41,6 +41,7 @@ def streams_of(source: dict[str, object]) -> list[tuple[str, Health]]:
     return streams
 
 
-def _list(status: dict[str, object], name: str) -> list[object]:
+def list_of(status: dict[str, object], name: str) -> list[object]:
+    """Return a list in a status; an empty one for anything else."""
     value = status.get(name)
     return value if isinstance(value, list) else []

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
@@ -15,6 +15,7 @@ from nedbus.transport import Tls
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Row, Selection, VehicleLocalPosition, vehicle_name
 
 from .bus import Bus, connect_with
+from .by_topic import by_topic_async, last_async
 from .discovery.services import Rejections
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import Mode, Sample
@@ -49,6 +50,7 @@ class AsyncBus:
         """The endpoints that it joins."""
         return self._opened().routers
 
+    @by_topic_async
     def subscribe(
         self,
         topic: str = DEFAULT_TOPIC,
@@ -57,23 +59,24 @@ class AsyncBus:
         instance: int | None = None,
         mode: Mode = "latest",
         max_rate: float | None = None,
-    ) -> AsyncSubscription:
+    ) -> AsyncSubscription[Any]:
         """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
         self._opened()
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
-    ) -> AsyncSubscription:
+    ) -> AsyncSubscription[Any]:
         """Subscribe to a selection of addresses, as `subscribe` does."""
         bus = self._opened()
         pending_queue = bus._make_queue(selection, mode, max_rate)
         name = selection.key_expr(prefix=bus.prefix)
         return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue, name=name)
 
+    @last_async
     async def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
-    ) -> list[Sample]:
+    ) -> list[Sample[Any]]:
         """Return the last sample of each key as `Bus.latest` does."""
         bus = self._opened()
         return await asyncio.to_thread(bus.latest, topic, vehicle=vehicle, instance=instance, timeout=timeout)

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs import PAYLOAD_SIZE, Address, Provenance, decode_row
-from nedbus_msgs.arrays import MessageArray, decode_array
+from nedbus_msgs import DEFAULT, Address, Definition, Message, Provenance, codec_of
+from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .receiving.decoder import Arrival, Decoder
 
 
 @dataclass(eq=False)
 class Batch:
-    """Valid messages that arrived together, in that order; get one from `subscription.batches()`.
+    """Valid messages of one kind that arrived together, in that order; get one from `subscription.batches()`.
 
-    `messages`: structured array of shape (n,) and dtype DTYPE, a column for each field: `messages["x"]`.
+    `messages`: structured array of shape (n,), a column for each field: `messages["x"]`; `message`: what they are.
     `addresses`: the addresses that occur; `address_index`: for each message, the index of its address among them.
     `received`: when they were read here, ns since the epoch.
     `lost`: messages that were lost in transit before these, all addresses together.
     """
 
     messages: MessageArray
+    message: type[Message]
     addresses: tuple[Address, ...]
     address_index: npt.NDArray[np.intp]
     received: int
@@ -64,12 +66,14 @@ class Batch:
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
     received = time.time_ns()
-    blank = bytes(PAYLOAD_SIZE)  # in the place of another layout, invalid, so that it is decoded by itself
-    payloads = [payload if len(payload) == PAYLOAD_SIZE else blank for _, payload, _, _ in arrivals]
-    messages, valid = decode_array(b"".join(payloads))
+    definition = _definition_of(arrivals[0]) or DEFAULT
+    size = codec_of(definition).size
+    blank = bytes(size)  # in the place of another layout, invalid, so that it is decoded by itself
+    payloads = [payload if len(payload) == size else blank for _, payload, _, _ in arrivals]
+    messages, valid = arrays_of(definition).decode(b"".join(payloads))
     if not valid.all():
         for index in np.flatnonzero(~valid).tolist():
-            sample = decoder.decode(arrivals[index], decode_row)
+            sample = decoder.decode(arrivals[index], rows=True)
             if sample is not None:
                 messages[index] = sample.message
                 valid[index] = True
@@ -79,4 +83,19 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     addresses = {stream.key: stream.address for stream, _, _, _ in arrivals}
     indices = {key: index for index, key in enumerate(addresses)}
     address_index = np.fromiter(map(indices.__getitem__, keys), np.intp, len(keys))
-    return Batch(messages, tuple(addresses.values()), address_index, received, lost, arrivals, decoder)
+    return Batch(
+        messages, definition.model, tuple(addresses.values()), address_index, received, lost, arrivals, decoder
+    )
+
+
+def by_message(arrivals: Iterable[Arrival], decoder: Decoder) -> list[list[Arrival]]:
+    """Return what arrived, grouped by message, as an array holds messages of one kind; each in order."""
+    groups: dict[int, list[Arrival]] = {}
+    for arrival in arrivals:
+        groups.setdefault(id(arrival[0].codec or decoder.resolve(arrival[0])), []).append(arrival)
+    return list(groups.values())
+
+
+def _definition_of(arrival: Arrival) -> Definition[Any] | None:
+    codec = arrival[0].codec
+    return codec.definition if codec else None

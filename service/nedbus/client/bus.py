@@ -8,15 +8,16 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.settings import Settings, load_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
-from nedbus_msgs import ANY, DEFAULT_TOPIC, PAYLOAD_SIZE, Address, Selection, decode, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
+from .by_topic import by_topic, last
 from .closing import Finalizer
-from .discovery.services import Rejections, find_layouts, find_services
+from .discovery.services import Rejections, find_schemas, find_services
 from .discovery.vehicle_directory import VehicleDirectory
 from .housekeeping import Housekeeping
 from .protocol import LIVE
@@ -45,7 +46,7 @@ class Bus:
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
         self._directory = VehicleDirectory(session, prefix=prefix)
-        self._layouts = LayoutLookup(partial(find_layouts, session, prefix=prefix))
+        self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         # In the reverse order: an open question for layouts ends with the session.
         closes = self._layouts.close, session.close, self._housekeeping.close, self._queries.close
@@ -57,6 +58,7 @@ class Bus:
         self._require_open()
         return bool(self._session.info.routers_zid())
 
+    @by_topic
     def subscribe(
         self,
         topic: str = DEFAULT_TOPIC,
@@ -65,9 +67,10 @@ class Bus:
         instance: int | None = None,
         mode: Mode = "latest",
         max_rate: float | None = None,
-    ) -> Subscription:
+    ) -> Subscription[Any]:
         """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
 
+        The messages are those of the topic: a VehicleAttitude of "vehicle_attitude"; of "*" they are of all kinds.
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
@@ -83,15 +86,16 @@ class Bus:
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
-    ) -> Subscription:
+    ) -> Subscription[Any]:
         """Subscribe to a selection of addresses, as `subscribe` does."""
         pending_queue = self._make_queue(selection, mode, max_rate)
         receiver = self._open_receiver(selection, pending_queue)
         return Subscription(receiver, pending_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
 
+    @last
     def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
-    ) -> list[Sample]:
+    ) -> list[Sample[Any]]:
         """Return the last sample of each key, sorted by address; `latency` is then its age.
 
         It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
@@ -100,12 +104,12 @@ class Bus:
         self._require_open()
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
-        samples: list[Sample] = []
+        samples: list[Sample[Any]] = []
         answers = query(self._session, key_expr, timeout=timeout, newest=False)
-        self._layouts.learn(raw.payload.to_bytes() for raw in answers if len(raw.payload) != PAYLOAD_SIZE)
+        decoder.learn(answers)
         for raw in answers:
             for arrival in decoder.admit([raw]):
-                sample = decoder.decode(arrival, decode)
+                sample = decoder.decode(arrival, rows=False)
                 if sample is not None:
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     samples.append(sample)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final, Generic, Literal
 
 from typing_extensions import TypeVar
 
-from nedbus_msgs import FIELD_TYPES, Address, Provenance, Row, VehicleLocalPosition
+from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition
 
 if TYPE_CHECKING:
     import zenoh
 
 Mode = Literal["latest", "every"]  # of each key a slow reader gets the newest message, or every message
-M_co = TypeVar("M_co", bound=VehicleLocalPosition | Row, default=VehicleLocalPosition, covariant=True)
+M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)
 
 _UNKNOWN: Final = Provenance()
 
@@ -22,7 +22,7 @@ _UNKNOWN: Final = Provenance()
 class Sample(Generic[M_co]):
     """One message that arrived.
 
-    `message`: the validated message; a Row, which has the same fields, from `rows()`.
+    `message`: the validated message; from `rows()` a Row, which has the same fields.
     `address`: vehicle, topic and instance, also as attributes of their own.
     `received`: when it was decoded here, ns since the epoch.
     `stamp`: Zenoh's timestamp, with the id of the clock; None without one, and in a copy.
@@ -57,7 +57,7 @@ class Sample(Generic[M_co]):
 
     @property
     def instance(self) -> int | None:
-        """The uORB instance, for estimator_local_position."""
+        """The uORB instance, where the topic has instances."""
         return self.address.instance
 
     @property
@@ -69,8 +69,8 @@ class Sample(Generic[M_co]):
     def missing(self) -> frozenset[str]:
         """The fields that the source did not provide; they hold NaN, false or 0."""
         message = self.message
-        if isinstance(message, VehicleLocalPosition):  # of an older layout perhaps, by another encoder
-            return self.provenance.missing | (FIELD_TYPES.keys() - message.model_fields_set)
+        if isinstance(message, Message):  # of an older layout perhaps, by another encoder
+            return self.provenance.missing | (message.DEFINITION.all_fields - message.model_fields_set)
         return self.provenance.missing
 
     @property
@@ -80,7 +80,7 @@ class Sample(Generic[M_co]):
         return None if sent is None else (self.received - sent) / 1e9
 
     def __eq__(self, other: object) -> bool:
-        """Compare everything; NaN equals NaN in a VehicleLocalPosition."""
+        """Compare everything; NaN equals NaN in a Message."""
         return self._state() == other._state() if isinstance(other, Sample) else NotImplemented
 
     def __hash__(self) -> int:

@@ -8,15 +8,16 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, Self
+
+from typing_extensions import TypeVar
 
 from nedbus.errors import ClosedError, NoDataError
 from nedbus.transport import require_unforked
-from nedbus_msgs import Row, VehicleLocalPosition, decode, decode_row
 
 from .closing import Finalizer
 from .receiving import PendingQueue, Receiver
-from .sample import Counts, Sample
+from .sample import Counts, M_co, Sample
 
 if TYPE_CHECKING:
     from .batch import Batch
@@ -25,14 +26,14 @@ _YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop ru
 _T = TypeVar("_T")
 
 
-class _SubscriptionBase:
+class _SubscriptionBase(Generic[M_co]):
     """What does not depend on how a reader waits: name, counts, and the forms of a message."""
 
     def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
         self.name = name
         self._queue = pending_queue
-        self._pop = partial(pending_queue.pop, decode)
-        self._pop_row = partial(pending_queue.pop, decode_row)
+        self._pop = partial(pending_queue.pop, rows=False)
+        self._pop_row = partial(pending_queue.pop, rows=True)
 
     @property
     def counts(self) -> Counts:
@@ -45,7 +46,7 @@ class _SubscriptionBase:
         return self._queue.waiting
 
 
-class Subscription(_SubscriptionBase):
+class Subscription(_SubscriptionBase[M_co]):
     """Iterate over the samples of a subscription; get one from `bus.subscribe(...)`.
 
     Iteration waits for the next sample and ends when the subscription or the bus is closed.
@@ -58,7 +59,7 @@ class Subscription(_SubscriptionBase):
         self._owner = owner  # the bus stays open for as long as somebody may read
         self._finalizer = Finalizer(self, receiver.close)
 
-    def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
+    def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it.
 
         Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
@@ -69,7 +70,7 @@ class Subscription(_SubscriptionBase):
         """Wait for at least one message, and return all that have arrived, as one array; errors as of `receive`."""
         return self._next(self._queue.pop_batch, timeout)
 
-    def rows(self) -> Iterator[Sample[Row]]:
+    def rows(self) -> Iterator[Sample[M_co]]:
         """Iterate over the same samples with a Row, a named tuple, as `message`: faster, with the same checks."""
         return self._each(self._pop_row)
 
@@ -81,10 +82,10 @@ class Subscription(_SubscriptionBase):
         """End the subscription; a second call does nothing."""
         self._finalizer.close_now()
 
-    def __iter__(self) -> Iterator[Sample[VehicleLocalPosition]]:
+    def __iter__(self) -> Iterator[Sample[M_co]]:
         return self
 
-    def __next__(self) -> Sample[VehicleLocalPosition]:
+    def __next__(self) -> Sample[M_co]:
         try:
             return self._next(self._pop)
         except ClosedError:
@@ -116,7 +117,7 @@ class Subscription(_SubscriptionBase):
                 yield self._next(pop)
 
 
-class AsyncSubscription(_SubscriptionBase):
+class AsyncSubscription(_SubscriptionBase[M_co]):
     """Iterate over the samples of a subscription from asyncio; get one from `bus.subscribe(...)`.
 
     The twin of Subscription, with `async for`, `await receive()` and `await close()`; it opens at its first use, and
@@ -131,7 +132,7 @@ class AsyncSubscription(_SubscriptionBase):
         self._arrival = asyncio.Event()
         self._taken = 0
 
-    async def receive(self, timeout: float | None = None) -> Sample[VehicleLocalPosition]:
+    async def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it; `timeout` and errors are those of `Subscription.receive`."""
         return await self._next(self._pop, timeout)
 
@@ -139,7 +140,7 @@ class AsyncSubscription(_SubscriptionBase):
         """Wait for at least one message, and return all, as `Subscription.receive_batch` does."""
         return await self._next(self._queue.pop_batch, timeout)
 
-    def rows(self) -> AsyncIterator[Sample[Row]]:
+    def rows(self) -> AsyncIterator[Sample[M_co]]:
         """Iterate over rows as `Subscription.rows` does."""
         return self._each(self._pop_row)
 
@@ -155,10 +156,10 @@ class AsyncSubscription(_SubscriptionBase):
         if self._finalizer is not None:
             await asyncio.to_thread(self._finalizer.close_now)
 
-    def __aiter__(self) -> AsyncIterator[Sample[VehicleLocalPosition]]:
+    def __aiter__(self) -> AsyncIterator[Sample[M_co]]:
         return self
 
-    async def __anext__(self) -> Sample[VehicleLocalPosition]:
+    async def __anext__(self) -> Sample[M_co]:
         try:
             return await self._next(self._pop)
         except ClosedError:

@@ -18,7 +18,7 @@ from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
 from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, router_max_sessions
-from nedbus_msgs import decode, provenance_of, status_key
+from nedbus_msgs import codec_of, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
 from .status import Role, ServiceStatus, SourceMeasures, SourceStatus
@@ -107,10 +107,16 @@ class Daemon:
     def newest(self) -> list[Sample]:
         """Return the last message of each address that was published."""
         publishers = self._registry.publishers if self._registry else []
-        last = [(publisher.address, *publisher.last) for publisher in publishers if publisher.last]
+        last = [(publisher, *publisher.last) for publisher in publishers if publisher.last]
         return [
-            Sample(decode(payload), address, time.time_ns(), stamp, provenance=provenance_of(encoding))
-            for address, payload, stamp, encoding in last
+            Sample(
+                codec_of(publisher.definition).decode(payload),
+                publisher.address,
+                time.time_ns(),
+                stamp,
+                provenance=provenance_of(publisher.definition, encoding),
+            )
+            for publisher, payload, stamp, encoding in last
         ]
 
     def stop(self) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from nedbus.sources import LiveSource, Rejection
+from nedbus.sources import Absence, LiveSource, Rejection
 from nedbus.transport import Session
 
 from .clock import Clock
@@ -44,6 +44,8 @@ def listen(
                 return
             if isinstance(item, Rejection):
                 output.reject(item)
+            elif isinstance(item, Absence):
+                output.note(item)
             elif item is not None:
                 output.publish_live(item)
                 on_state("running")

@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Final, cast
 
 from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.log_event import about
-from nedbus.sources import Rejection, SourceMessage
-from nedbus_msgs import Address, upgrade_fields
+from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
+from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
 from .clock import Clock
 from .status import StreamStatus
@@ -32,11 +33,12 @@ _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2,
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """One address: its publisher while it is published, its health, and when a live source heard it last."""
+    """One address: its publisher while it is published, its health, and when a live source heard it last, and what."""
 
     health: StreamHealth
     publisher: Publisher | None = None
     heard: float | None = None
+    last: SourceMessage | None = None
 
 
 class SourceOutput:
@@ -46,6 +48,8 @@ class SourceOutput:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
         """How many messages each rule rejected."""
+        self.absence = Absence()
+        """What vehicles publish and a live source does not deliver, now."""
         self.durations = Histogram(_DURATIONS)
         """How long it took to validate, encode and send a message [s]."""
         self._name = name
@@ -55,6 +59,7 @@ class SourceOutput:
         self._clock = clock
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
+        self._silent: set[str] = set()  # those that were logged
         self._invalid = self._live = 0
 
     @property
@@ -78,19 +83,19 @@ class SourceOutput:
         """Why something was rejected, once for each place that it came from."""
         return tuple(self._warnings.values())
 
-    def claim_all(self, addresses: Collection[Address], *, lossless: bool) -> None:
+    def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
         """Make sure that all of these have a publisher, or none: two sources must not keep each other from starting.
 
         Raises AddressInUseError if another source of ours has one of them.
         """
         own = set(self.addresses)
-        for address in addresses:
+        for address in run.addresses:
             if address not in own and self._registry.is_published(address):
                 raise AddressInUseError(address)
-        for address in addresses:
-            self.claim(address, lossless=lossless)
+        for address in run.addresses:
+            self.claim(address, run.definitions.get(address.topic), lossless=lossless)
 
-    def claim(self, address: Address, *, lossless: bool = False) -> None:
+    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
         """Make sure that an address has a publisher; raise AddressInUseError if another source of ours has it."""
         stream = self._streams.get(address)
         if stream is None:
@@ -104,7 +109,7 @@ class SourceOutput:
                 address,
                 extra=about("duplicate", address, source=self._name),
             )
-        stream.publisher = self._registry.publisher(address, lossless=lossless, source=self._kind)
+        stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
         """Close the publishers of all addresses but those to keep."""
@@ -124,7 +129,7 @@ class SourceOutput:
             return
         start = time.perf_counter()
         try:
-            fields = upgrade_fields(message.fields)
+            fields = upgrade_fields(stream.publisher.definition, message.fields)
             stream.publisher.publish(fields)
         except InvalidMessageError as exc:
             self._reject_invalid(message, _rule_of(exc), exc.reason)
@@ -145,24 +150,30 @@ class SourceOutput:
                 self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is left out"))
                 return
             try:
-                self.claim(address)
+                self.claim(address, message.definition)
             except AddressInUseError as exc:
                 self.reject(Rejection(str(address), str(exc)))
                 return
             self._live += not back
             event = "back" if back else "published"
             _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
-        self._streams[address].heard = self._clock.now()
+            self._bring_back(message)
+        self._streams[address].heard, self._streams[address].last = self._clock.now(), message
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses from which nothing arrived for 3 s; return whether any is left."""
+        """Stop publishing live addresses from which nothing arrived for 3 s; return whether any is left.
+
+        What has no rate is published for as long as anything else of its vehicle arrives.
+        """
         now = self._clock.now()
         fresh = {
             address
             for address, stream in self._streams.items()
             if stream.heard is not None and now - stream.heard < _STALE
         }
+        heard = {address.vehicle for address in fresh}
+        fresh |= {each for each in self._streams if each.vehicle in heard and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
                 _log.warning(
@@ -190,6 +201,28 @@ class SourceOutput:
             )
         if rejection.address is not None:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
+
+    def note(self, absence: Absence) -> None:
+        """Take note of what is not delivered now, and log what is silent, each address once."""
+        self.absence = absence
+        if new := [address for address in absence.silent if address not in self._silent]:
+            self._silent.update(new)
+            text = f"announced, and nothing arrives: {', '.join(new)}"
+            _log.warning(
+                "%s: %s; 'nedbus doctor' says more", self._name, text, extra=about("silent", source=self._name)
+            )
+
+    def _bring_back(self, message: SourceMessage) -> None:
+        """Publish again what has no rate of a vehicle that is back: it would not send it; not after a reboot."""
+        for address, stream in self._streams.items():
+            last = stream.last
+            if last is None or stream.publisher is not None or address.vehicle != message.address.vehicle:
+                continue
+            before, now = (cast("int", each.fields.get("timestamp", 0)) for each in (last, message))
+            if before <= now and not get_topic(address.topic).rate:
+                with suppress(AddressInUseError):
+                    self.claim(address, last.definition)
+                    self.publish(replace(last, lost=0))
 
     def _now(self) -> int:
         """Return monotonic ns: rates and ages do not follow the wall clock."""

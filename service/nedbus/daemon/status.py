@@ -27,6 +27,8 @@ class SourceStatus:
     `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
     `lost`: messages that were lost before they reached a live source, as far as it can count; `reboots` of vehicles.
     `stale`: addresses that a live source published, until nothing arrived for 3 s.
+    `not_carried`: messages that vehicles publish and this source has no definition of; `silent`: addresses that they
+    announce, and of which nothing arrives while others do.
     `rejections`: how many messages each rule rejected.
     `retries`: how often it failed and was started again; `error`: why it failed last.
     `streams`: the health of each stream that is published, of up to 100 of them.
@@ -48,6 +50,8 @@ class SourceStatus:
     warnings: tuple[str, ...]
     error: str | None
     streams: tuple[StreamStatus, ...]
+    not_carried: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
 
     @property
     def ended(self) -> bool:

@@ -96,6 +96,8 @@ class Worker:
             warnings=run.warnings if run else output.warnings,
             error=self._error,
             streams=streams,
+            not_carried=output.absence.not_carried,
+            silent=output.absence.silent,
         )
 
     def run(self) -> None:
@@ -171,7 +173,7 @@ class Worker:
         if source.wait and first:
             self._wait_for_reader(run)
         self._output.release(keep=run.addresses)
-        self._output.claim_all(run.addresses, lossless=source.speed is None)
+        self._output.claim_all(run, lossless=source.speed is None)
         self._set_state("running")
         replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
         self._error = run.damage

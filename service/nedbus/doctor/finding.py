@@ -56,10 +56,10 @@ def brief(value: object) -> str:
     return text if len(text) <= _MAX_NAME else f"{text[: _MAX_NAME - 3]}..."
 
 
-def list_names(names: Iterable[object]) -> str:
+def list_names(names: Iterable[object], limit: int = 5) -> str:
     """Return the first few of some names, and how many more there are."""
     every = [brief(name) for name in names]
-    return ", ".join(every[:5]) + (f" and {len(every) - 5} more" if len(every) > 5 else "")
+    return ", ".join(every[:limit]) + (f" and {len(every) - limit} more" if len(every) > limit else "")
 
 
 def format_seconds(seconds: float) -> str:

@@ -11,6 +11,7 @@ from itertools import islice
 from typing import Final
 
 from nedbus.transport import (
+    PX4_TYPES,
     PublisherToken,
     RawSample,
     RouterState,
@@ -24,13 +25,11 @@ from nedbus.transport import (
 from nedbus_msgs import (
     ANY,
     DEFAULT_TOPIC,
-    ROS2_TYPE,
     Address,
     AddressError,
     DecodeError,
     address_of_alive_key,
     alive_key_expr,
-    dds_type,
     status_key,
 )
 
@@ -176,7 +175,7 @@ def _alive(session: Session, prefix: str) -> list[Address]:
 def _ros2_publishers(session: Session) -> list[PublisherToken]:
     """Return the publishers of ROS 2's keys with this message, other than our own bridge."""
     found = []
-    for text in alive_keys(session, publishers_of_type_key_expr(None, dds_type(ROS2_TYPE)), timeout=_TIMEOUT):
+    for text in alive_keys(session, publishers_of_type_key_expr(None, PX4_TYPES), timeout=_TIMEOUT):
         try:
             token = PublisherToken.parse(text)
         except DecodeError:

@@ -22,7 +22,7 @@ def check_services(seen: Observation, *, version: str) -> Iterator[Finding]:
             yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {version}", advice)
         findings = [finding for source in sources for finding in _source(source)]
         yield from findings
-        if not findings:
+        if all(finding.state == "ok" for finding in findings):
             host = brief(service.text("host") or "an unknown host")
             yield Finding(
                 "service", name, "ok", f"nedbus {theirs} on {host}, its sources have no fault: {len(sources)}"
@@ -35,8 +35,7 @@ def check_services(seen: Observation, *, version: str) -> Iterator[Finding]:
 def reported(service: Service) -> Iterator[str]:
     """Yield the addresses that a service says it publishes."""
     for source in service.sources:
-        addresses = source.get("addresses")
-        yield from map(brief, addresses if isinstance(addresses, list) else ())
+        yield from map(brief, _list(source, "addresses"))
 
 
 def has_source(seen: Observation, kind: str) -> bool:
@@ -55,8 +54,16 @@ def _source(source: Mapping[str, object]) -> Iterator[Finding]:
     elif state in {"waiting", "starting"}:
         advice = "is its vehicle on, does it send here? for MAVLink see 'nedbus doctor --mavlink LINK' on its host"
         yield Finding("source", name, "warning", f"{state}: nothing has arrived yet", advice)
-    stale = source.get("stale")
-    if isinstance(stale, list) and stale:
+    stale, silent, not_carried = (_list(source, what) for what in ("stale", "silent", "not_carried"))
+    if silent:
+        advice = "if the vehicle has them, its PX4 loses them: no line of its zenoh/pub.csv may have rel=: docs/live.md"
+        seen = f"announced, and nothing arrives while other topics do: {list_names(silent, 20)}"
+        yield Finding("source", name, "warning", seen, advice)
+    if not_carried:
+        advice = "to carry them, give PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
+        seen = f"vehicles publish messages that it does not carry: {list_names(not_carried, 20)}"
+        yield Finding("source", name, "ok", seen, advice)
+    if stale := [address for address in stale if address not in silent]:
         advice = "is the vehicle on, is its link up? they come back by themselves"
         seen = f"nothing arrives any more of {list_names(stale)}"
         yield Finding("source", name, "warning", seen, advice)
@@ -65,3 +72,8 @@ def _source(source: Mapping[str, object]) -> Iterator[Finding]:
         why = f": {list_names(rules)}" if isinstance(rules, dict) and rules else ""
         advice = "'nedbus echo' shows nothing of these; reasons are in the log of the service and on @rejected keys"
         yield Finding("source", name, "warning", f"{rejected} messages were rejected{why}", advice)
+
+
+def _list(source: Mapping[str, object], name: str) -> list[object]:
+    value = source.get(name)
+    return value if isinstance(value, list) else []

@@ -9,7 +9,7 @@ from typing import Final
 import zenoh
 
 from nedbus.transport import RawSample, Session, entity_name, while_open
-from nedbus_msgs import Address, AddressError, DecodeError, decode
+from nedbus_msgs import BY_TOPIC, Address, AddressError, DecodeError, codec_of
 
 _RING: Final = 16_384  # samples that may arrive until they are looked at
 _MAX_KEYS: Final = 2000
@@ -74,13 +74,15 @@ class Traffic:
         if info is not None and len(stream.publishers) < _MAX_PUBLISHERS:
             stream.publishers.add(entity_name(info.source_id))
         if stream.address is not None and sample.kind == zenoh.SampleKind.PUT:
-            stream.error = reason_against(sample) or stream.error
+            stream.error = reason_against(sample, stream.address) or stream.error
 
 
-def reason_against(sample: RawSample) -> str:
+def reason_against(sample: RawSample, address: Address) -> str:
     """Return why a payload cannot be decoded, "" if it can."""
     try:
-        decode(sample.payload.to_bytes())
+        definition = BY_TOPIC.get(address.topic)
+        if definition is not None:
+            codec_of(definition).decode(sample.payload.to_bytes())
     except DecodeError as exc:
         return str(exc)
     return ""

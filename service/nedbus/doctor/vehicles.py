@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
-from nedbus_msgs import Address
+from nedbus_msgs import Address, get_topic
 
-from .finding import Finding, format_seconds
+from .finding import Finding, State, format_seconds
 from .observation import Observation
 from .services import reported
+
+_PERIODS: Final = 3.0  # of a topic without a message, from which on it is silent
 
 
 def check_vehicles(seen: Observation, vehicle: str | None, *, writes_only: bool) -> Iterator[Finding]:
@@ -52,13 +55,14 @@ def _absent(seen: Observation, vehicle: str | None, *, blind: bool) -> Finding:
 def _judge(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
     name, key = str(address), address.key(prefix=seen.prefix)
     stream = seen.streams.get(key)
-    if not flows:
-        age = seen.ages.get(address)
+    age, rate = seen.ages.get(address), get_topic(address.topic).rate
+    if not flows and rate and (seen.listened if age is None else age) > _PERIODS / rate:
         last = "it has sent nothing yet" if address not in seen.ages else "its last message has no timestamp"
         if age is not None:
             last = f"its last message is {format_seconds(age)} old"
         advice = "its publisher runs: look at what it reads, the source of a service or the loop of a script"
-        yield Finding("vehicle", name, "wrong", f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
+        state: State = "wrong" if address in seen.ages else "warning"  # of a replay some begin later
+        yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
     if stream is not None and stream.error:
         advice = "who publishes this key, and is it nedbus? a newer layout needs a newer nedbus here"
         yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:300]}", advice)

@@ -10,19 +10,20 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from typing import Final
+from typing import Any, Final
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from nedbus.client import Bus, Health, Monitor, Sample
-from nedbus_msgs import Address, Row, Selection
+from nedbus_msgs import Address, Selection
 
 from .exposition import build_info, metrics_page
 from .families import MAX_STREAMS, Stream, is_switched_off, stream_families
 from .http_server import Page
 from .router_watch import RouterWatch
 
+_MAX_SOURCES: Final = 4 * MAX_STREAMS  # that are remembered
 _RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
 
 
@@ -35,7 +36,7 @@ class Exporter(Collector):
         selection: Selection,
         *,
         version: str,
-        watch: Callable[[Sample[Row]], object] = lambda _: None,
+        watch: Callable[[Sample[Any]], object] = lambda _: None,
     ) -> None:
         self._bus = bus
         self._watch = watch
@@ -127,7 +128,7 @@ class Exporter(Collector):
         for sample in self._subscription.rows():
             with self._lock:
                 self._monitor.add(sample)
-                if sample.address in self._sources or len(self._sources) < MAX_STREAMS:
+                if sample.address in self._sources or len(self._sources) < _MAX_SOURCES:
                     self._sources[sample.address] = sample.source or ""
             self._watch(sample)
 

@@ -16,7 +16,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from nedbus.client import Health, Histogram
 
 MAX_STREAMS: Final = 1000
-"""Streams with labels of their own; what the rest counts is added up as vehicle "other", topic "other"."""
+"""Streams with labels of their own, positions first; what the rest counts is added up as vehicle and topic "other"."""
 
 SWITCHED_OFF: Final = 3600.0
 """Seconds of silence after which a stream that nobody publishes any more is not active."""
@@ -59,6 +59,7 @@ def is_switched_off(health: Health) -> bool:
 
 def stream_families(streams: Sequence[Stream], *, messages: tuple[str, str]) -> Iterator[Metric]:
     """Yield the metrics of streams; `messages` is the name of the counter of messages, and what it counts."""
+    streams = sorted(streams, key=lambda stream: not stream.health.resets)  # which only positions have
     named, rest = streams[:MAX_STREAMS], streams[MAX_STREAMS:]
     for attribute, (name, text) in {"messages": messages, **_COUNTS}.items():
         counts = CounterMetricFamily(name, text, labels=_STREAM)
@@ -74,7 +75,8 @@ def stream_families(streams: Sequence[Stream], *, messages: tuple[str, str]) -> 
         measures = GaugeMetricFamily(name, text, labels=_STREAM)
         for stream in named:
             value = getattr(stream.health, attribute)
-            if value is not None and stream.active:
+            # Of what has no rate an age says nothing: alerts would take it for silence.
+            if value is not None and stream.active and (stream.health.nominal or attribute != "age"):
                 measures.add_metric([stream.vehicle, stream.topic, stream.source], value)
         yield measures
     yield from _flags(named)

@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .arrays import Flight, addresses_of, missing_of, read
+    from .alignment import align
+    from .arrays import Flight, addresses_of, missing_of, read, utc_of
     from .choice import matching
     from .conversion import convert
     from .formats import SUFFIXES, format_of
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
-    from .ulog import UlogColumns, UlogTopics, read_ulog
+    from .ulog import UlogColumns, UlogTopic, UlogTopics, read_ulog
+    from .utc import UtcOffset
     from .writer import RecordingWriter
 else:
     # No submodule has the name of an export: importing it would replace the export.
@@ -33,8 +35,11 @@ else:
             "RecordingReader": ("mcap", "reader"),
             "RecordingWriter": ("mcap", "writer"),
             "UlogColumns": ("", "ulog"),
+            "UlogTopic": ("", "ulog"),
             "UlogTopics": ("", "ulog"),
+            "UtcOffset": ("", "utc"),
             "addresses_of": ("", "arrays"),
+            "align": ("", "alignment"),
             "convert": ("mcap", "conversion"),
             "draw": ("plot", "plot"),
             "format_of": ("", "formats"),
@@ -42,6 +47,7 @@ else:
             "missing_of": ("", "arrays"),
             "read": ("", "arrays"),
             "read_ulog": ("", "ulog"),
+            "utc_of": ("", "arrays"),
         },
     )
 
@@ -55,8 +61,11 @@ __all__ = [
     "RecordingReader",
     "RecordingWriter",
     "UlogColumns",
+    "UlogTopic",
     "UlogTopics",
+    "UtcOffset",
     "addresses_of",
+    "align",
     "convert",
     "draw",
     "format_of",
@@ -64,4 +73,5 @@ __all__ = [
     "missing_of",
     "read",
     "read_ulog",
+    "utc_of",
 ]

@@ -1,39 +1,42 @@
-"""Load one topic of a log or a recording as a NumPy array or a data frame, with PX4's own types."""
+"""Load topics of a log or a recording as NumPy arrays or data frames, with PX4's own types."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus.errors import ConfigError, DecodeError, SourceError
+from nedbus.client import Sample
+from nedbus.errors import AddressError, ConfigError, DecodeError, SourceError
 from nedbus.extras import needs
 from nedbus.log_event import about
 from nedbus_msgs import (
     ANY,
-    CURRENT,
     DEFAULT_TOPIC,
-    FIELD_TYPES,
+    TOPICS,
     Address,
+    Definition,
+    Layout,
+    Message,
     Selection,
-    VehicleLocalPosition,
-    decode_cdr,
-    upgrade,
-    upgraded_names,
+    decode_with,
+    upgrade_with,
     vehicle_name,
 )
-from nedbus_msgs.arrays import DTYPE, MessageArray, decode_cdr_array, to_array, valid_mask
+from nedbus_msgs.arrays import MessageArray, arrays_of, to_array
 
-from .choice import the_one
+from .choice import matching, the_one
 from .formats import SUFFIXES
 from .ulog import UlogTopics, read_ulog
+from .utc import TELLING, UtcOffset, tell_utc
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,63 +47,127 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _CHUNK: Final = 8192  # messages of a recording that are converted together
-_NULLABLE: Final = {"bool": "boolean", "uint8": "UInt8", "uint64": "UInt64"}  # of pandas; its floats are NaN
+_NULLABLE: Final = {  # of pandas; its floats are NaN
+    "bool": "boolean",
+    **{f"{sign}int{bits}": f"{sign.upper()}Int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
 
 _Mask = npt.NDArray[np.bool_]
 Absent = Mapping[str, _Mask]
 """For each missing field, a mask of the messages that lack it."""
+Streams = dict[str, tuple[MessageArray, Absent]]
+"""The messages of streams, by topic or topic/instance."""
+
+
+Pandas = Literal["pandas"]
+Polars = Literal["polars"]
+Library = Literal["pandas", "polars"] | None
+
+
+class _Which(TypedDict, total=False):
+    vehicle: str | int
+    instance: int | None
 
 
 @overload
-def read(
-    path: str | Path, topic: str = ..., *, vehicle: str | int = ..., instance: int | None = ..., dataframe: None = None
-) -> MessageArray: ...
+def read(path: str | Path, topic: str = ..., *, dataframe: None = None, **which: Unpack[_Which]) -> MessageArray: ...
+@overload
+def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **which: Unpack[_Which]) -> pd.DataFrame: ...
+@overload
+def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **which: Unpack[_Which]) -> pl.DataFrame: ...
 @overload
 def read(
-    path: str | Path,
-    topic: str = ...,
-    *,
-    vehicle: str | int = ...,
-    instance: int | None = ...,
-    dataframe: Literal["pandas"],
-) -> pd.DataFrame: ...
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **which: Unpack[_Which]
+) -> dict[str, MessageArray]: ...
 @overload
 def read(
-    path: str | Path,
-    topic: str = ...,
-    *,
-    vehicle: str | int = ...,
-    instance: int | None = ...,
-    dataframe: Literal["polars"],
-) -> pl.DataFrame: ...
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **which: Unpack[_Which]
+) -> dict[str, pd.DataFrame]: ...
+@overload
+def read(
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **which: Unpack[_Which]
+) -> dict[str, pl.DataFrame]: ...
 def read(
     path: str | Path,
-    topic: str = DEFAULT_TOPIC,
+    topic: str | list[str] | tuple[str, ...] = DEFAULT_TOPIC,
     *,
     vehicle: str | int = ANY,
     instance: int | None = None,
-    dataframe: Literal["pandas", "polars"] | None = None,
+    dataframe: Library = None,
 ) -> Any:
     """Return one topic of a .ulg log or an .mcap recording as a structured array, one element a message.
 
-    Its columns are the fields of VehicleLocalPosition with PX4's types (`nedbus.DTYPE`).
+    Its columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
     Fields that a layout or a source lacks are NaN, false or 0, and `nedbus.missing_of` names them.
     Invalid messages are left out, and so is what is damaged; both are logged.
     With `dataframe` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
-    missing fields are null; that of pandas names them in `attrs["missing"]`.
+    missing fields are null; that of pandas names them in `attrs["missing"]`, and has in `attrs["utc"]` what `utc_of`
+    returns, as a dict, if the flight tells UTC.
+    A list of topics, or of streams such as "sensor_gps/1", is a dict of these by stream, of one vehicle; "*" in it is
+    all that the file has, messages that only the file describes included.
 
     Raises SourceError for a file that cannot be read, AddressError when no stream, or more than one, matches topic,
     vehicle and instance, ConfigError when the package that reads the file is not installed.
     """
-    if dataframe not in (None, "pandas", "polars"):
-        raise ConfigError("dataframe", f"{dataframe!r} is neither pandas nor polars")
-    path = Path(path).expanduser()
-    selection = Selection(topic, vehicle_name(vehicle), instance)
-    with Flight(path) as flight:
-        messages, absent = flight.read(the_one(path, flight.addresses, selection))
+    streams, utc = read_streams(path, topic, vehicle=vehicle, instance=instance, utc=dataframe == "pandas")
+    tables = {name: to_dataframe(messages, absent, dataframe, utc) for name, (messages, absent) in streams.items()}
+    return next(iter(tables.values())) if isinstance(topic, str) else tables
+
+
+def read_streams(
+    path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None, utc: bool
+) -> tuple[Streams, UtcOffset | None]:
+    """Return what `Flight.read` does for one stream, or each of several, by its name; with `utc`, that of the flight.
+
+    None is all, but of a log only what has a file here.
+    """
+    path, vehicle = Path(path).expanduser(), vehicle_name(vehicle)
+    chosen: dict[Address, None] = {}
+    names = [ANY] if topics is None else [topics] if isinstance(topics, str) else topics
+    wanted = {name.partition("/")[0] for name in names}
+    with Flight(path, topics=None if ANY in wanted and names is topics else wanted | TOPICS.keys()) as flight:
+        for name in names:
+            topic, _, number = name.rpartition("/")
+            parts = (topic, vehicle, int(number)) if number.isdecimal() else (name, vehicle, instance)
+            found = matching(path, flight.addresses, Selection(*parts))
+            chosen |= dict.fromkeys([the_one(path, found, Selection(*parts))] if isinstance(topics, str) else found)
+        owner = _one_vehicle(path, chosen or flight.addresses, vehicle)
+        streams = {address.stream: flight.read(address) for address in chosen}
+        offset = flight.utc(owner) if utc else None
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
-    return messages if dataframe is None else _to_dataframe(messages, absent, dataframe)
+    return streams, offset
+
+
+def utc_of(
+    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
+) -> UtcOffset | None:
+    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and who tells it; None if nobody does.
+
+    Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
+    `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
+
+    A GNSS receiver tells it if its `time_utc_usec` is not 0, and `timesync_status` the clock of a companion: that is
+    taken for UTC only if it has a date after 2000. Where messages disagree by more than a second there is none.
+
+    Raises AddressError for a file of several vehicles, without the name of one; other errors are those of `read`.
+    """
+    if isinstance(flight, Mapping):
+        return tell_utc(flight)
+    if not isinstance(flight, str | Path):
+        by_stream = {each.address.stream: each.message for each in flight if vehicle in (ANY, each.vehicle)}
+        return tell_utc({name: to_array([message]) for name, message in by_stream.items()})
+    path, vehicle = Path(flight).expanduser(), vehicle_name(vehicle)
+    with Flight(path) as opened:
+        return opened.utc(_one_vehicle(path, matching(path, opened.addresses, Selection(vehicle=vehicle)), vehicle))
+
+
+def _one_vehicle(path: Path, addresses: Iterable[Address], vehicle: str) -> str:
+    """Return the vehicle of all these addresses; raise AddressError if there are several."""
+    first, *others = sorted({address.vehicle for address in addresses})
+    if others:
+        raise AddressError("vehicle", vehicle, f"one of those in {path}: {', '.join([first, *others][:10])}")
+    return first
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
@@ -121,25 +188,27 @@ def addresses_of(path: str | Path) -> list[Address]:
 class Flight:
     """A .ulg log or an .mcap recording that is open for reading: `addresses`, and the messages of each.
 
+    `topics`: those that are read of a log, None for all; `definitions`: that of each address.
     `warnings`: what is damaged or left out, of what was read so far.
 
     Raises SourceError for a file that cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
         self.warnings: list[str] = []
         self._reader: RecordingReader | None = None
         self._log: UlogTopics | None = None
         if SUFFIXES.get(path.suffix) == "mcap":
             self._reader = needs("mcap", f"{__package__}.reader").RecordingReader(path, vehicle="1")
-            self.addresses = sorted({stream.address for stream in self._reader.counts})
-            if not self.addresses:
+            self.definitions = {stream.address: stream.definition for stream in self._reader.counts}
+            if not self.definitions:
                 self._reader.close()
-                raise SourceError(str(path), "no message of the local position topics is in this recording")
+                raise SourceError(str(path), "no message of PX4's topics is in this recording")
         else:
-            self._log = read_ulog(path)
+            self._log = read_ulog(path, topics=topics)
             self.warnings += self._log.warnings
-            self.addresses = sorted(address for address, _ in self._log.topics)
+            self.definitions = {topic.address: topic.definition for topic in self._log.topics}
+        self.addresses = sorted(self.definitions)
 
     def __enter__(self) -> Self:
         return self
@@ -159,73 +228,105 @@ class Flight:
         if self._reader is not None:
             self.warnings += (each for each in self._reader.warnings if each not in self.warnings)
         if not valid.all():
-            self.warnings.append(f"{np.sum(~valid)} of {len(valid)} messages violate the rules and are left out")
+            count = f"{np.sum(~valid)} of {len(valid)} messages"
+            self.warnings.append(f"{address.stream}: {count} violate the rules and are left out")
             messages, absent = messages[valid], {name: mask[valid] for name, mask in absent.items()}
         if absent:
-            types = [(name, DTYPE[name]) for name in FIELD_TYPES]
+            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
             messages = messages.view(np.dtype(types, metadata={"missing": tuple(absent)}))
         return messages, absent
 
+    def utc(self, vehicle: str) -> UtcOffset | None:
+        """Return the UTC that the messages of a vehicle tell, None if they do not."""
+        telling = (each for each in self.addresses if not self.definitions[each].types.keys().isdisjoint(TELLING))
+        return tell_utc({each.stream: self.read(each)[0] for each in telling if each.vehicle == vehicle})
+
     def _read_ulog(self, address: Address) -> tuple[MessageArray, _Mask, Absent]:
-        columns = dict(self._log.topics if self._log else ())[address]
-        messages = np.repeat(to_array([VehicleLocalPosition(timestamp=0)]), len(columns["timestamp"]))
-        names = upgraded_names(columns)
-        for name, old in names.items():
+        topic = next(topic for topic in (self._log.topics if self._log else ()) if topic.address == address)
+        definition, columns = topic.definition, topic.columns
+        arrays, plan = arrays_of(definition), definition.plan(topic.columns)
+        messages = arrays.absent(len(columns["timestamp"]))
+        for name, old in plan.names.items():
             messages[name] = columns[old]
-        valid = valid_mask(messages)
-        for name in columns:
-            if FIELD_TYPES.get(name) == "bool":
-                valid &= columns[name].astype(np.int64) >> 1 == 0  # a byte other than 0 and 1 is invalid
-        return messages, valid, {name: np.ones(len(messages), bool) for name in FIELD_TYPES if name not in names}
+        for name, (old, convert) in plan.converted.items():
+            messages[name] = [convert(value) for value in columns[old].tolist()]
+        for name, olds in plan.parts.items():
+            for index, part in enumerate(olds):
+                messages[name][:, index] = np.nan if part is None else columns[part]
+        valid = arrays.valid_mask(messages)
+        for name, column in columns.items():
+            if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
+                wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
+                valid &= ~wrong.reshape(len(messages), -1).any(axis=1)
+        lacking = (name for name in definition.types if name not in plan.provided)
+        return messages, valid, {name: np.ones(len(messages), bool) for name in lacking}
 
     def _read_mcap(self, address: Address) -> tuple[MessageArray, _Mask, Absent]:
         recorded = self._reader.messages(address) if self._reader else iter(())
-        chunks, masks = [np.empty(0, DTYPE)], [np.empty(0, bool)]
+        definition = self.definitions[address]
+        chunks, masks = [arrays_of(definition).absent(0)], [np.empty(0, bool)]
         lacking: list[frozenset[str]] = []  # of each message
         by_stream: dict[RecordedStream, frozenset[str]] = {}
         while chunk := list(islice(recorded, _CHUNK)):
-            messages, valid = _decode(chunk)
+            messages, valid = _decode(definition, chunk)
             chunks.append(messages)
             masks.append(valid)
             for stream in {each.stream for each in chunk} - by_stream.keys():
                 by_stream[stream] = stream.lacking
             lacking += [by_stream[each.stream] for each in chunk]
         fields = frozenset[str]().union(*by_stream.values())
-        absent = {name: np.array([name in each for each in lacking], bool) for name in FIELD_TYPES if name in fields}
+        absent = {
+            name: np.array([name in each for each in lacking], bool) for name in definition.types if name in fields
+        }
         return np.concatenate(chunks), np.concatenate(masks), absent
 
 
-def _decode(chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
+def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask]:
     """Return the messages, and a mask of those that are valid: all at once, and one by one what that cannot decide."""
-    is_current = [recorded.stream.layout == CURRENT.name for recorded in chunk]
-    payloads = [recorded.payload if current else b"" for recorded, current in zip(chunk, is_current, strict=True)]
-    array, valid = decode_cdr_array(payloads)
-    decoded: dict[int, VehicleLocalPosition] = {}
+    arrays = arrays_of(definition)
+    array, valid = arrays.absent(len(chunk)), np.zeros(len(chunk), bool)
+    layouts: dict[Layout, list[int]] = {}
+    for index, recorded in enumerate(chunk):
+        layouts.setdefault(recorded.stream.layout, []).append(index)
+    for layout, rows in layouts.items():
+        if layout.types.items() <= definition.types.items():
+            array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], layout)
+    decoded: dict[int, Message] = {}
     for index in np.flatnonzero(~valid).tolist():
-        stream = chunk[index].stream
         with suppress(DecodeError, ValidationError):
-            decoded[index] = upgrade(decode_cdr(chunk[index].payload, layout=stream.layout))
+            fields = decode_with(definition, chunk[index].payload, chunk[index].stream.layout)
+            decoded[index] = upgrade_with(definition, fields)
     if decoded:
-        rows = list(decoded)
-        array[rows] = to_array(list(decoded.values()))
-        valid[rows] = True
+        array[list(decoded)] = arrays.of(list(decoded.values()))
+        valid[list(decoded)] = True
     return array, valid
 
 
-def _to_dataframe(messages: MessageArray, absent: Absent, library: str) -> Any:
+def to_dataframe(messages: MessageArray, absent: Absent, library: Library, utc: UtcOffset | None = None) -> Any:
+    """Return a structured array as a data frame, with nulls where a field is absent; for None as it is."""
+    if library is None:
+        return messages
+    if library not in ("pandas", "polars"):
+        raise ConfigError("dataframe", f"{library!r} is neither pandas nor polars")
     package = needs(library, library)
     columns: dict[str, Any] = {}
-    for name, kind in FIELD_TYPES.items():
-        parts = [f"{name}[0]", f"{name}[1]"] if kind == "float32[2]" else [name]
-        for part, values in zip(parts, messages[name].reshape(len(messages), -1).T, strict=True):
-            column = np.ascontiguousarray(values)
-            if name not in absent:
+    for name in messages.dtype.names or ():
+        values = messages[name]
+        parts = [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
+        for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
+            column = np.ascontiguousarray(each)
+            if column.dtype.kind == "M":
+                series = package.Series(column).dt
+                columns[part] = series.tz_localize("UTC") if library == "pandas" else series.replace_time_zone("UTC")
+            elif name not in absent:
                 columns[part] = column
             elif library == "polars":
                 columns[part] = package.Series(column).scatter(np.flatnonzero(absent[name]), None)
             else:
-                columns[part] = package.Series(column, dtype=_NULLABLE.get(kind, column.dtype)).mask(absent[name])
+                kind = _NULLABLE.get(column.dtype.name, column.dtype)
+                columns[part] = package.Series(column, dtype=kind).mask(absent[name])
     data = package.DataFrame(columns)
     if library == "pandas":
-        data.attrs["missing"] = sorted(absent)
+        data.attrs["missing"] = sorted(missing_of(messages))
+        data.attrs |= {"utc": asdict(utc)} if utc else {}
     return data

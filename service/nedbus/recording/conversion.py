@@ -5,15 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from pydantic import ValidationError
 
 from nedbus.errors import OutputError
 from nedbus.log_event import about
 from nedbus.whole_file import whole_file
-from nedbus_msgs import Address, Provenance, VehicleLocalPosition, describe, upgrade
-from nedbus_msgs.arrays import to_array
+from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Provenance, describe, upgrade_with
+from nedbus_msgs.arrays import arrays_of
 
 from .formats import check_recording
 from .writer import RecordingWriter
@@ -38,6 +38,8 @@ class ConvertibleMessage(Protocol):
     def fields(self) -> Mapping[str, object]: ...  # noqa: D102
     @property
     def error(self) -> str | None: ...  # noqa: D102
+    @property
+    def definition(self) -> Definition[Any] | None: ...  # noqa: D102
 
 
 def convert(
@@ -68,34 +70,37 @@ def convert(
 def _write(
     messages: Iterable[ConvertibleMessage], path: Path, *, source: str, on_progress: Callable[[int], object]
 ) -> str:
-    pending: list[tuple[Address, Provenance, VehicleLocalPosition]] = []
-    logged: list[int] = []
-    rejected, start = 0, None
+    pending: dict[Definition[Any], list[tuple[Address, Provenance, Message, int]]] = {}
+    count, rejected, start = 0, 0, None
     with RecordingWriter(path, chunk_size=_CHUNK_SIZE) as writer:
 
         def write_pending() -> None:
-            streams = ((address, provenance) for address, provenance, _ in pending)
-            published = [min(message.timestamp * 1000, _MAX_TIME) for *_, message in pending]
-            writer.write(to_array([message for *_, message in pending]), streams, logged=logged, published=published)
+            for definition, waiting in pending.items():
+                addresses, provenances, written, logged = zip(*waiting, strict=True)
+                published = [min(message.timestamp * 1000, _MAX_TIME) for message in written]
+                streams = zip(addresses, provenances, strict=True)
+                array = arrays_of(definition).of(written)
+                writer.write(array, definition, streams, logged=logged, published=published)
             pending.clear()
-            logged.clear()
 
         for done, each in enumerate(messages, 1):
+            definition = each.definition or BY_TOPIC[each.address.topic]
             try:
-                message = upgrade(each.fields)
+                message = upgrade_with(definition, each.fields)
             except ValidationError as exc:
                 rejected += 1
                 if rejected <= _MAX_LOGGED:
-                    reason = each.error or describe(exc)
+                    reason = each.error or describe(exc, definition)
                     extra = about("rejected", each.address, source=source, reason=reason)
                     _log.warning("%s rejected: %s", each.address, reason, extra=extra)
                 continue
             if start is None:
                 start = min(message.timestamp * 1000, _MAX_START)
-            missing = frozenset(VehicleLocalPosition.model_fields.keys() - message.model_fields_set)
-            pending.append((each.address, Provenance(source, missing), message))
-            logged.append(start + round(each.due * 1e9))
-            if len(pending) >= _CHUNK:
+            provenance = Provenance(source, definition.all_fields - message.model_fields_set)
+            waiting = each.address, provenance, message, start + round(each.due * 1e9)
+            pending.setdefault(definition, []).append(waiting)
+            count += 1
+            if count % _CHUNK == 0:
                 write_pending()
                 on_progress(done)
         write_pending()

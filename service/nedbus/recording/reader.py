@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from mcap.records import Channel, Message, Schema
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import (
-    FIELD_TYPES,
-    LAYOUTS,
-    ROS2_TYPES,
-    Address,
-    find_layout,
-    split_ros2_topic,
-    upgraded_names,
-)
+from nedbus_msgs import Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
 
 from .chunks import ChunkFile
 from .records import READ_ERRORS, records_of
@@ -31,13 +22,14 @@ class RecordedStream:
     """One channel: its address, the layout of its messages, and the fields that its source did not provide."""
 
     address: Address
-    layout: str
+    definition: Definition[Any]
+    layout: Layout
     missing: frozenset[str]
 
     @property
     def lacking(self) -> frozenset[str]:
         """The fields of a message that its source or its layout lacks."""
-        return _lacking(self.layout) | self.missing
+        return self.definition.all_fields - self.definition.plan(self.layout.fields).provided | self.missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +56,7 @@ class RecordingReader:
         self._vehicle = vehicle
         self._file = ChunkFile(self.path)
         self._schemas: dict[int, Schema] = {}
+        self._described: dict[int, Definition[Any]] = {}  # by schema, of messages that have no file here
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         summary = self._file.summary
         if summary is not None:
@@ -104,7 +97,7 @@ class RecordingReader:
             self._counts = self._count()
 
     def messages(self, only: Address | None = None) -> Iterator[RecordedMessage]:
-        """Yield all messages of local position topics, or of one address, in the order of the file."""
+        """Yield all messages, or those of one address, in the order of the file."""
         for part in self._file.parts(self._channels(only)):
             try:
                 yield from self._messages_of(part, only)
@@ -135,7 +128,7 @@ class RecordingReader:
         self.close()
 
     def _channels(self, only: Address | None = None) -> list[int] | None:
-        """Return the channels of an address, or of all local position topics; None before all are known."""
+        """Return the channels of an address, or all that can be read; None before all are known."""
         if not self._all_known:
             return None
         return [
@@ -167,23 +160,32 @@ class RecordingReader:
         return self._streams[message.channel_id]
 
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
-        if schema is None or schema.name not in ROS2_TYPES:
+        if schema is None or not schema.name.startswith(("px4_msgs/", "px4_msgs_old/")):
             return None
         if channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
             self._file.warn(
                 f"{channel.topic} is left out: {channel.message_encoding} with {schema.encoding}, not cdr, ros2msg"
             )
             return None
-        layout = find_layout(_field_names(schema.data))
-        if layout is None:
-            self._file.warn(f"{channel.topic} is left out: no known layout has these fields")
-            return None
         try:
+            definition, layout = self._layout(schema)
             address = self._address(channel)
         except (AddressError, ValueError) as exc:
             self._file.warn(f"{channel.topic} is left out: {exc}")
             return None
-        return RecordedStream(address, layout.name, frozenset(channel.metadata.get("missing", "").split()))
+        return RecordedStream(address, definition, layout, frozenset(channel.metadata.get("missing", "").split()))
+
+    def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
+        """Return the message and the layout that a schema describes; raise ValueError if there is none."""
+        known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
+        if known is None:
+            if schema.id not in self._described:
+                self._described[schema.id] = define_msg(schema.name.rpartition("/")[2], text)
+            return self._described[schema.id], self._described[schema.id].current
+        layout = known.find_layout(field.name for field in read_msg(text))
+        if layout is None:
+            raise ValueError("no known layout has these fields")
+        return known, layout
 
     def _address(self, channel: Channel) -> Address:
         metadata = channel.metadata
@@ -192,15 +194,3 @@ class RecordingReader:
             return Address(metadata["vehicle"], metadata["topic"], None if instance is None else int(instance))
         namespace, topic, instance_number = split_ros2_topic(channel.topic)
         return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
-
-
-@cache
-def _lacking(layout: str) -> frozenset[str]:
-    return frozenset(FIELD_TYPES.keys() - upgraded_names(LAYOUTS[layout].fields).keys())
-
-
-def _field_names(definition: bytes) -> list[str]:
-    """Return the field names of a .msg definition, without constants."""
-    own = definition.decode(errors="replace").split("\n===")[0]
-    rows = (line.partition("#")[0].split() for line in own.splitlines())
-    return [row[1] for row in rows if len(row) == 2 and "=" not in row[1]]

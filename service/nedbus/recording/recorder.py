@@ -71,6 +71,7 @@ class Recorder:
         addresses = (batch.addresses[index] for index in batch.address_index.tolist())
         self._writer.write(
             batch.messages,
+            batch.message.DEFINITION,
             zip(addresses, batch.provenances, strict=True),
             logged=repeat(received),
             published=[time if time > 0 else received for time in batch.sent.tolist()],

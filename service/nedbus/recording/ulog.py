@@ -1,9 +1,10 @@
-"""Read the local position topics of a PX4 .ulg log as columns."""
+"""Read the topics of a PX4 .ulg log as columns."""
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from pyulog import ULogException
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import FIELD_TYPES, TOPICS, Address, get_topic
+from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, Definition, FieldType, define, field_type
 
 from .formats import open_flight
 
@@ -24,62 +25,120 @@ _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
 _READ_COST: Final = 4096  # of any read, in bytes, however short it is
 _BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside what its size makes plausible
-_DTYPES: Final = {"uint64": "<u8", "uint8": "u1", "bool": "i1", "float32": "<f4", "float64": "<f8"}  # of pyulog
-_ALWAYS: Final = {"timestamp", "x", "y", "z", "vx", "vy", "vz", "xy_valid", "z_valid", "v_xy_valid", "v_z_valid"}
+_NESTED: Final = 3  # levels of messages within messages; PX4 has one
+_INDEX = re.compile(r"\[(\d+)\]")
+_OLDEST: Final = 0x010D  # PX4 1.13, whose layouts are the oldest known
+_FLOATS: Final = {"float": "float32", "double": "float64"}  # of C, as a log has them; its integers end with _t
 _READ_ERRORS: Final = (ULogException, ValueError, TypeError, KeyError, IndexError, AttributeError, MemoryError)
 
 UlogColumns = Mapping[str, npt.NDArray[np.generic]]
-"""One topic of a log: PX4's field names, and the values of all messages; delta_xy and delta_vxy have two columns."""
+"""One topic of a log: PX4's field names, and the values of all messages, of arrays as one row each."""
+
+
+@dataclass(frozen=True, slots=True)
+class UlogTopic:
+    """One topic of a log, whose message is described by a file of ours, or by the log itself."""
+
+    address: Address
+    definition: Definition[Any]
+    columns: UlogColumns
+
+    @property
+    def is_described(self) -> bool:
+        """Whether only the log says what its message is."""
+        return self.address.topic not in BY_TOPIC
 
 
 @dataclass(slots=True)
 class UlogTopics:
-    """The local position topics of a log, each with its columns by PX4's field names.
+    """Topics of a log.
 
     `warnings`: what is damaged or left out; `damaged`: whether damage may have cost messages.
     A log has no checksums: damage inside the values of a message cannot be noticed.
     """
 
-    topics: list[tuple[Address, UlogColumns]]
+    topics: list[UlogTopic]
     warnings: list[str]
     damaged: bool
 
 
-def read_ulog(path: Path, *, vehicle: str | None = None, default_vehicle: str = "1") -> UlogTopics:
-    """Return each local position topic of a log.
+def read_ulog(
+    path: Path, *, topics: Collection[str] | None = TOPICS, vehicle: str | None = None, default_vehicle: str = "1"
+) -> UlogTopics:
+    """Return these topics of a log, all of it for None: of those without a file of ours its formats say what they are.
 
     `vehicle` is the log's MAV_SYS_ID unless it is given, and `default_vehicle` if the log has none.
 
     Raises SourceError when it is not a ULog file, or has none of the topics.
     """
-    log, damage = _load(path)
+    log, damage = _load(path, topics)
     found = UlogTopics([], damage, bool(damage))
     vehicle = vehicle or _system_id(log) or default_vehicle
+    several = {data.name for data in log.data_list if data.multi_id > 0}
+    release = log.msg_info_dict.get("ver_sw_release")
+    is_older = isinstance(release, int) and 0 < release >> 16 < _OLDEST
     seen: set[tuple[str, int]] = set()
     for data in log.data_list:
+        name = f"{data.name} [{data.multi_id}]"
         try:
-            address = Address(vehicle, data.name, data.multi_id if get_topic(data.name).instances else None)
-        except AddressError as exc:
+            definition = BY_TOPIC.get(data.name) or _describe(log, data.name)
+            instances = TOPICS[data.name].instances if data.name in TOPICS else data.name in several
+            address = Address(vehicle, data.name, data.multi_id if instances else None)
+        except (AddressError, ValueError) as exc:
             found.warnings.append(f"{data.name} is left out: {exc}")
-            found.damaged = True
+            found.damaged |= data.name in TOPICS or isinstance(exc, AddressError)
             continue
         columns = _by_field(data.data)
-        wrong = {name for name, column in columns.items() if not _has_type(name, column)}
-        lacking = _ALWAYS - columns.keys()
+        known = definition.known_types
+        if data.name not in BY_TOPIC:  # their types are the log's own, but pyulog reads char as int8
+            chars = [field for field, kind in definition.types.items() if kind.base == "uint8" and field in columns]
+            columns |= {field: columns[field].view(np.uint8) for field in chars}
+        wrong = {field for field, column in columns.items() if field in known and not _has_type(known[field], column)}
+        if wrong and is_older:
+            found.warnings.append(f"{name}: {', '.join(sorted(wrong))} left out: of another type before PX4 1.13")
+            columns = {field: column for field, column in columns.items() if field not in wrong}
+            wrong = set()
+        lacking = definition.always - columns.keys()
         if wrong or lacking:
             names = ", ".join(sorted(wrong | lacking))
-            found.warnings.append(f"{data.name} [{data.multi_id}]: the definition of {names} is damaged")
+            found.warnings.append(f"{name}: the definition of {names} is damaged")
             found.damaged = True
-        if any(address == other for other, _ in found.topics):
-            found.warnings.append(f"{data.name} [{data.multi_id}] is left out: a second one")
+        same = next((other for other in found.topics if address == other.address), None)
+        if same and not _equal(same.columns, columns):
+            found.warnings.append(f"{name} is left out: a second one")
             found.damaged |= (data.name, data.multi_id) in seen
-        elif not wrong and "timestamp" in columns:
-            found.topics.append((address, columns))
+        elif not same and not wrong and "timestamp" in columns:
+            found.topics.append(UlogTopic(address, definition, columns))
         seen.add((data.name, data.multi_id))
     if not found.topics:
-        reason = "no message of the local position topics is in this log"
+        wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
+        reason = f"no message of {wanted} is in this log"
         raise SourceError(str(path), "; ".join([reason, *found.warnings[:3]]))
     return found
+
+
+def _equal(one: UlogColumns, other: UlogColumns) -> bool:
+    """Return whether these are the same messages: PX4 can log a topic twice."""
+    return one.keys() == other.keys() and all(one[name].tobytes() == other[name].tobytes() for name in one)
+
+
+def _describe(log: Any, topic: str) -> Definition[Any]:
+    """Return what the formats of a log say of a message; those within it are made fields; ValueError if that fails."""
+    types = dict(_fields(log.message_formats, topic))
+    return define("".join(part.capitalize() for part in topic.split("_")), types)
+
+
+def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:
+    for kind, length, field in formats[name].fields:
+        if field.startswith("_padding"):
+            continue
+        if kind not in formats:
+            base = _FLOATS.get(kind, kind.removesuffix("_t"))
+            yield f"{prefix}{field}", field_type(f"{base}[{length}]" if length > 0 else base)
+        elif level < _NESTED:
+            for index in range(length) if length > 0 else [None]:
+                inner = f"{prefix}{field}_" if index is None else f"{prefix}{field}_{index}_"
+                yield from _fields(formats, kind, inner, level + 1)
 
 
 class _BoundedFile:
@@ -132,13 +191,13 @@ def _load_pyulog() -> ModuleType:
 _pyulog = _load_pyulog()
 
 
-def _load(path: Path) -> tuple[Any, list[str]]:
+def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
     """Return pyulog's ULog, and what is damaged."""
     _printed.lines = []
     try:
         with open_flight(path) as file:
             bounded = _BoundedFile(file, path.stat().st_size)
-            log = _pyulog.ULog(bounded, list(TOPICS))
+            log = _pyulog.ULog(bounded, None if topics is None else list(topics))
         end = None if log.has_data_appended else _find_damage(path)
     except OSError as exc:
         raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
@@ -167,10 +226,13 @@ def _find_damage(path: Path) -> int | None:
     return None
 
 
-def _has_type(name: str, column: npt.NDArray[np.generic]) -> bool:
-    """Return whether a column has PX4's type of the field, if it is one of ours: no release ever changed one."""
-    base, _, pair = FIELD_TYPES.get(name, "").partition("[")
-    return not base or (column.dtype == np.dtype(_DTYPES[base]) and column.shape[1:] == ((2,) if pair else ()))
+def _has_type(kinds: Iterable[FieldType], column: npt.NDArray[np.generic]) -> bool:
+    """Return whether a column has one of PX4's types of its field; pyulog reads a bool as int8."""
+    return any(
+        column.dtype == np.dtype("i1" if kind.base == "bool" else BASES[kind.base].code)
+        and column.shape[1:] == ((kind.length,) if kind.length else ())
+        for kind in kinds
+    )
 
 
 def _system_id(log: Any) -> str | None:
@@ -180,13 +242,14 @@ def _system_id(log: Any) -> str | None:
 
 
 def _by_field(data: Mapping[str, npt.NDArray[np.generic]]) -> dict[str, npt.NDArray[np.generic]]:
-    """Return the columns by PX4's field names: `delta_xy[0]` and `delta_xy[1]` become one column of pairs."""
-    columns: dict[str, npt.NDArray[np.generic]] = {}
+    """Return the columns by PX4's field names: `q[0]` to `q[3]` become one of four, `esc[0].rpm` is `esc_0_rpm`."""
+    parts: dict[str, list[npt.NDArray[np.generic]]] = {}
+    arrays: set[str] = set()
     for name, column in data.items():
-        base, bracket, index = name.partition("[")
-        if not bracket:
-            if not name.startswith("_padding"):
-                columns[name] = column
-        elif index == "0]" and f"{base}[1]" in data:
-            columns[base] = np.column_stack((column, data[f"{base}[1]"]))
-    return columns
+        *outer, last = name.split(".")
+        base, bracket, _ = last.partition("[")
+        field = "_".join([*(_INDEX.sub(r"_\1", part) for part in outer), base])
+        if not base.startswith("_padding"):
+            parts.setdefault(field, []).append(column)
+            arrays.update({field} if bracket else ())
+    return {name: np.column_stack(part) if name in arrays else part[0] for name, part in parts.items()}

@@ -13,14 +13,14 @@ from collections.abc import Iterable
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Final, Self, cast
+from typing import IO, Any, Final, Self, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from nedbus.errors import OutputError
-from nedbus_msgs import CURRENT, ROS2_TYPE, Address, Provenance, message_definition
-from nedbus_msgs.arrays import MessageArray, encode_cdr_array
+from nedbus_msgs import Address, Definition, Layout, Provenance, definition_text, ros2_type
+from nedbus_msgs.arrays import MessageArray, arrays_of
 
 _CHUNK: Final = 2**23  # bytes; a flush every second makes smaller ones
 _MAX_PENDING: Final = 2**24  # bytes that wait for a flush
@@ -32,7 +32,8 @@ _END: Final = (
 class RecordingWriter:
     """Write messages to a new MCAP file; a context manager that finishes it.
 
-    The file is in the layout of PX4 1.16 to main, one channel for each address and provenance.
+    There is one channel for each address and provenance, in the current layout of its message, or in that of PX4 which
+    has just the fields that its source provides, where no layout of PX4 has all.
     A chunk, of up to `chunk_size` bytes before compression, is what damage of one bit costs.
 
     Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written: then what was flushed
@@ -55,30 +56,32 @@ class RecordingWriter:
             self._file.close()
             self.path.unlink(missing_ok=True)
             raise
-        self._schema = self._writer.register_schema(ROS2_TYPE, "ros2msg", message_definition(CURRENT.name).encode())
-        self._channels: dict[tuple[Address, Provenance], int] = {}
+        self._schemas: dict[tuple[str, str], int] = {}  # by message and layout
+        self._channels: dict[tuple[Address, Provenance], tuple[int, Layout]] = {}
 
     def write(
         self,
         messages: MessageArray,
+        definition: Definition[Any],
         streams: Iterable[tuple[Address, Provenance]],
         *,
         logged: Iterable[int],
         published: Iterable[int],
         sequence: Iterable[int] = repeat(0),
     ) -> None:
-        """Write messages, each with its address and provenance, and when it was recorded and published [ns]."""
-        payloads = encode_cdr_array(messages)
-        size = payloads.itemsize
-        data = payloads.tobytes()
-        starts = range(0, len(data), size)
+        """Write messages of one kind, each with its address and provenance, when it was recorded and published [ns]."""
+        encoded: dict[Layout, tuple[int, bytes]] = {}  # size of a payload, and all payloads
         add = self._writer.add_message
         try:
-            for start, stream, log_time, time, number in zip(
-                starts, streams, logged, published, sequence, strict=False
+            for index, stream, log_time, time, number in zip(
+                range(len(messages)), streams, logged, published, sequence, strict=False
             ):
-                channel = self._channels.get(stream) or self._open_channel(*stream)
-                add(channel, log_time, data[start : start + size], time, max(0, number) % 2**32)
+                channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
+                if layout not in encoded:
+                    payloads = arrays_of(definition).encode_cdr(messages, layout)
+                    encoded[layout] = payloads.itemsize, payloads.tobytes()
+                size, data = encoded[layout]
+                add(channel, log_time, data[index * size : (index + 1) * size], time, max(0, number) % 2**32)
         except OSError as exc:
             raise OutputError(self.path, exc) from exc
         self.messages += len(messages)
@@ -114,7 +117,15 @@ class RecordingWriter:
         else:
             self.close()
 
-    def _open_channel(self, address: Address, provenance: Provenance) -> int:
+    def _open_channel(
+        self, definition: Definition[Any], address: Address, provenance: Provenance
+    ) -> tuple[int, Layout]:
+        layout = definition.recorded_layout(definition.all_fields - provenance.missing)
+        schema = self._schemas.get((definition.name, layout.name))
+        if schema is None:
+            text = definition_text(definition, layout).encode()
+            schema = self._writer.register_schema(ros2_type(definition), "ros2msg", text)
+            self._schemas[definition.name, layout.name] = schema
         # ROS 2 tools recognise their bags by the first key.
         metadata = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:
@@ -124,9 +135,9 @@ class RecordingWriter:
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
         topic = f"/{address}"
-        channel = self._writer.register_channel(topic, "cdr", self._schema, metadata)
-        self._channels[address, provenance] = channel
-        return channel
+        channel = self._writer.register_channel(topic, "cdr", schema, metadata)
+        self._channels[address, provenance] = channel, layout
+        return channel, layout
 
 
 class _AppendFile:

@@ -16,7 +16,7 @@ from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .mavlink_link import Link, Peer, check_link, open_link
-from .mavlink_vehicle import OutOfOrderError, Vehicle
+from .mavlink_vehicle import Vehicle
 from .options import MavlinkOptions
 from .source import Rejection, SourceContext, SourceMessage
 
@@ -34,7 +34,8 @@ _MAX_AUTOPILOTS: Final = 255  # with another component id
 class MavlinkSource:
     """A link with one or many vehicles.
 
-    What MAVLink does not transmit is not provided: resets, variances of heading and tilt, accelerations, limits.
+    What MAVLink does not transmit is not provided: of a position resets, variances of heading and tilt, accelerations,
+    limits; of the state the mode. Nothing is derived that a vehicle did not say.
     Validity is an approximation from ESTIMATOR_STATUS: LOCAL_POSITION_NED itself is sent whether valid or not.
     """
 
@@ -100,26 +101,20 @@ class _LinkSession:
         if not system or not self._is_autopilot(message, system, component):
             return None
         now = time.monotonic()
+        name = self._vehicle_of(system)
         vehicle = self._vehicles.get(system)
         if vehicle is None:
-            vehicle = self._vehicles[system] = Vehicle(self._options.rate, self._options.baud)
+            vehicle = self._vehicles[system] = Vehicle(name, self._options)
         self._peers[system] = peer
         vehicle.track_sequence(component, sequence, now)
-        address = Address(self._vehicle_of(system), DEFAULT_TOPIC)
+        address = Address(name, DEFAULT_TOPIC)
         if message.get_type() == "COMMAND_ACK":
             self._handle_ack(vehicle, message, address, now)
             return None
-        try:
-            fields = vehicle.handle(message, now)
-        except OutOfOrderError as exc:
-            return Rejection(str(address), f"out of order: {exc}", address)
-        if fields is None:
-            return None
-        lost, rebooted = vehicle.lost, vehicle.rebooted
-        vehicle.lost, vehicle.rebooted = 0, False
-        if rebooted:
+        said = vehicle.handle(message, now)
+        if isinstance(said, SourceMessage) and said.rebooted:
             _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
-        return SourceMessage(0.0, address, fields, lost, rebooted)
+        return said
 
     def _vehicle_of(self, system: int) -> str:
         configured = self._options.vehicles

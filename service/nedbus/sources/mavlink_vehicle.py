@@ -1,4 +1,4 @@
-"""The state of one MAVLink vehicle: messages in, the fields of an estimate and the next requests out; no I/O, no clock.
+"""The state of one MAVLink vehicle: messages in, those of PX4 and the next requests out; no I/O, no clock.
 
 Times are monotonic seconds of the caller's clock, if not stated otherwise.
 """
@@ -6,11 +6,15 @@ Times are monotonic seconds of the caller's clock, if not stated otherwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, cast
 
-from nedbus_msgs import FLAGS
+from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
+
+from .mavlink_fields import SAID, sensors_of
+from .options import MavlinkOptions
+from .source import Rejection, SourceMessage
 
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
@@ -21,6 +25,7 @@ _ACK_TIMEOUT: Final = 1.0  # s until a request is repeated
 _MAX_TRIES: Final = 5
 _RETRY_INTERVAL: Final = 5.0  # s until an unknown origin, or positions that do not arrive, are requested again
 _FULL_TURN: Final = 36000  # 0.01 deg, of `hdg`
+_LONG_AGO: Final = 2**48  # us, 9 years: what is more is Unix time, not the time since boot
 _UNKNOWN_HEADING: Final = 65535
 # Bits of ESTIMATOR_STATUS.flags.
 _VELOCITY_HORIZ, _VELOCITY_VERT = 2, 4
@@ -29,11 +34,23 @@ _CONST_POS_MODE: Final = 128
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
 _POSITION, _STATUS = 32, 230
-STREAMS: Final = {_POSITION: 40, _STATUS: 54, 33: 40, 141: 44, 331: 244}
-"""The messages that an estimate is made of, in the order of requests, and their bytes on a link: a PX4's, MAVLink 2."""
+STREAMS: Final = {
+    _POSITION: (40, 0.0, "vehicle_local_position"),
+    _STATUS: (54, 0.0, "vehicle_local_position vehicle_global_position"),
+    33: (40, 10.0, "vehicle_local_position vehicle_global_position"),
+    141: (44, 10.0, "vehicle_local_position"),
+    331: (244, 10.0, "vehicle_local_position vehicle_odometry"),
+    31: (44, 0.0, "vehicle_attitude"),
+    24: (64, 5.0, "sensor_gps"),
+    2: (24, 1.0, "sensor_gps"),
+    1: (55, 1.0, "vehicle_status"),
+    147: (66, 1.0, "battery_status"),
+    242: (72, 1.0, "home_position"),
+    245: (14, 1.0, "vehicle_land_detected"),
+}
+"""What to request, in that order: its bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), the topics in need."""
 
-_RATE: Final = 10.0  # Hz, of what is neither position nor status
-_MIN_STATUS_RATE: Final = 2.0  # Hz, on a link that is full without it
+_LEAST: Final = 2.0  # Hz, on a link that is full
 _USABLE: Final = 0.9  # of a link; the rest is for heartbeats and answers
 _BITS: Final = 10  # of a byte on a serial line, with start and stop
 
@@ -49,38 +66,49 @@ class _Expiring:
         return self.fields if self.fields and now <= self.until else {}
 
 
-class OutOfOrderError(Exception):
-    """Raised for a position that arrives after a newer one."""
+def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
+    """Return the rates to request [Hz] for these topics: positions at `rate`, and each other message as often.
 
-
-def request_rates(rate: float, baud: int) -> dict[int, float]:
-    """Return the rates to request [Hz]: ESTIMATOR_STATUS as often as positions, at `rate`, if the link carries that."""
-    rates = dict.fromkeys(STREAMS, _RATE) | {_POSITION: rate, _STATUS: 0.0}
-    free = _USABLE * baud / _BITS - sum(size * rates[number] for number, size in STREAMS.items())
-    rates[_STATUS] = max(_MIN_STATUS_RATE, min(rate, free / STREAMS[_STATUS]))
-    return rates
+    That is, up to the rate that it wants; on a link that does not carry it all, up to one that is the same for all.
+    """
+    wanted = {
+        number: max(_LEAST, rate) if number == _STATUS else hertz or rate
+        for number, (_, hertz, needed) in STREAMS.items()
+        if not set(needed.split()).isdisjoint(topics)
+    }
+    others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
+    free = _USABLE * baud / _BITS - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    for index, number in enumerate(others):
+        level = free / sum(STREAMS[each][0] for each in others[index:])
+        wanted[number] = min(wanted[number], max(_LEAST, level))
+        free -= STREAMS[number][0] * wanted[number]
+    return wanted
 
 
 class Vehicle:
     """The state of one vehicle: pass messages to `handle`, and send what `requests` yields."""
 
-    def __init__(self, rate: float, baud: int) -> None:
-        self._rates = request_rates(rate, baud)
+    def __init__(self, name: str, options: MavlinkOptions) -> None:
+        self._name = name
+        self._topics = options.chosen_topics or TOPICS
+        self._rates = request_rates(options.rate, options.baud, self._topics)
         self._sequences: dict[int, int] = {}  # by component
-        self._last_ms: int | None = None
-        self._wraps = 0
+        self._newest: int | None = None  # ms since boot, without the wraps of its counter
         self._last_message = 0.0
         self._last_position = 0.0
         self.lost = 0
-        self.rebooted = False
+        self._rebooted = False
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
         """Discard what was received, and request everything again: it was silent, or rebooted."""
         self._heading, self._yaw, self._status, self._bottom, self._velocity = (_Expiring() for _ in range(5))
-        self._origin: dict[str, object] = {}
+        self._global_status, self._sensors, self._utc = (_Expiring() for _ in range(3))
+        self._quaternion_until = now + _VALUE_TIMEOUT
+        self._origin = _Expiring()
         self._is_global = False
-        self._pending = [*self._rates, ORIGIN]
+        self._last: dict[Address, int] = {}  # timestamps
+        self._pending = [*self._rates, ORIGIN] if _POSITION in self._rates else [*self._rates]
         self._tries = 0
         self._next_request = now
         self._sequences.clear()
@@ -110,7 +138,7 @@ class Vehicle:
             self._tries += 1
             self._next_request = now + _ACK_TIMEOUT
             yield self._pending[0], self._rates.get(self._pending[0], 0.0)
-        elif not self._origin:
+        elif not self._origin.fields and _POSITION in self._rates:
             self._pending, self._next_request = [ORIGIN], now + _RETRY_INTERVAL
 
     def acknowledge(self, now: float) -> int | None:
@@ -126,21 +154,43 @@ class Vehicle:
         """Return whether it should be able to send this message now: without a global position there is no origin."""
         return number != ORIGIN or self._is_global
 
-    def handle(self, message: Any, now: float) -> dict[str, object] | None:
-        """Return the fields of an estimate if this is a position, else None.
+    def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
+        """Return what a message says of a topic that is wanted: of one at most; late ones are rejected."""
+        kind = message.get_type()
+        topic, fields_of = SAID.get(kind, ("", None))
+        timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
+        is_double = kind == "ATTITUDE" and now <= self._quaternion_until
+        self._remember(kind, message, timestamp, now)
+        if fields_of is None or topic not in self._topics or is_double or timestamp is None:
+            return None
+        fields = {name: value for name, value in fields_of(message).items() if value is not None}
+        if not fields:
+            return None
+        instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
+        address = Address(self._name, topic, instance)
+        if timestamp < (last := self._last.get(address, 0)):
+            reason = f"out of order: time_boot_ms {timestamp // 1000} after {last // 1000}"
+            return Rejection(str(address), reason, address)
+        self._last[address] = timestamp
+        if topic == DEFAULT_TOPIC or DEFAULT_TOPIC not in self._topics:
+            self._last_position = now
+        fields = {"timestamp": timestamp, **fields}
+        self._complete(topic, fields, timestamp, now)
+        lost, rebooted, self.lost, self._rebooted = self.lost, self._rebooted, 0, False
+        return SourceMessage(0.0, address, fields, lost, rebooted)
 
-        Raises OutOfOrderError for a position that is older than the last one.
-        """
-        match message.get_type():
-            case "LOCAL_POSITION_NED":
-                return self._estimate(message, now)
+    def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
+        """Keep what belongs to later messages."""
+        match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
                 self._heading = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(heading, math.tau)})
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._yaw = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(message.yaw, math.tau)})
+            case "ATTITUDE_QUATERNION":
+                self._quaternion_until = now + _VALUE_TIMEOUT
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
-                self._origin = {
+                origin = {
                     "xy_global": True,
                     "z_global": True,
                     "ref_lat": message.latitude / 1e7,
@@ -148,6 +198,7 @@ class Vehicle:
                     "ref_alt": message.altitude / 1e3,
                     **({"ref_timestamp": message.time_usec} if message.time_usec else {}),
                 }
+                self._origin = _Expiring(math.inf, origin)
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance)
                 bottom: dict[str, object] = {"dist_bottom": message.bottom_clearance} if is_known else {}
@@ -159,42 +210,52 @@ class Vehicle:
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
                 self._is_global = bool(message.flags & _POS_HORIZ_ABS)
-                self._status = _Expiring(now + _STATUS_TIMEOUT, _validity(message.flags) | known)
-        return None
+                valid = _validity(message.flags)
+                self._status = _Expiring(now + _STATUS_TIMEOUT, valid | known)
+                on_globe = {"lat_lon_valid": valid["xy_valid"] and self._is_global, "alt_valid": valid["z_valid"]}
+                self._global_status = _Expiring(now + _STATUS_TIMEOUT, on_globe | known)
+            case "SYS_STATUS":
+                self._sensors = _Expiring(now + _STATUS_TIMEOUT, sensors_of(message))
+            case "SYSTEM_TIME" if timestamp is not None and message.time_unix_usec > _LONG_AGO:
+                self._utc = _Expiring(now + _STATUS_TIMEOUT, {"boot": message.time_unix_usec - timestamp})
 
-    def _estimate(self, message: Any, now: float) -> dict[str, object]:
-        self._track_time(message.time_boot_ms, now)
-        self._last_position = now
-        position = {name: getattr(message, name) for name in ("x", "y", "z", "vx", "vy", "vz")}
-        fields: dict[str, object] = {
-            "timestamp": (self._wraps * _WRAP + message.time_boot_ms) * 1000,
-            **position,
-            **self._yaw.at(now),
-            **self._heading.at(now),
-            **self._status.at(now),
-            **self._bottom.at(now),
-            **self._velocity.at(now),
-            **self._origin,
-        }
-        # The flags are from an earlier message: these fields may have become NaN since.
-        for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
-            if fields.get(flag) and not all(math.isfinite(position[name]) for name in FLAGS[flag].fields):
-                fields[flag] = False
-        return fields
+    def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
+        """Add what earlier messages said."""
+        match topic:
+            case "vehicle_local_position":
+                for each in (self._yaw, self._heading, self._status, self._bottom, self._velocity, self._origin):
+                    fields |= each.at(now)
+                # The flags are from an earlier message: these fields may have become NaN since.
+                for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
+                    values = cast("Iterator[float]", (fields[name] for name in FLAGS[flag].fields))
+                    if fields.get(flag) and not all(map(math.isfinite, values)):
+                        fields[flag] = False
+            case "vehicle_global_position":
+                fields |= self._global_status.at(now)
+            case "vehicle_status":
+                fields |= self._sensors.at(now)
+            case "sensor_gps" if utc := self._utc.at(now):
+                fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
-    def _track_time(self, ms: int, now: float) -> None:
-        if self._last_ms is not None:
-            step = (ms - self._last_ms + _WRAP // 2) % _WRAP - _WRAP // 2
-            if -_MAX_DELAY <= step < 0:
-                raise OutOfOrderError(f"time_boot_ms {ms} after {self._last_ms}")
-            if step < 0:
-                self.rebooted = True
+    def _track_time(self, message: Any, now: float) -> int | None:
+        """Return when it was made [us since boot]; a message without a time is as old as the newest one with it."""
+        microseconds: int = getattr(message, "time_usec", 0)
+        if 0 < microseconds < _LONG_AGO:
+            return microseconds
+        ms: int | None = getattr(message, "time_boot_ms", self._newest)
+        if ms is None:
+            return None
+        if self._newest is not None:
+            step = (ms - self._newest + _WRAP // 2) % _WRAP - _WRAP // 2
+            if step < -_MAX_DELAY:
+                self._rebooted = True
                 self.lost = 0  # the sequence restarted too, so the count is wrong
-                self._wraps = 0
+                self._newest = None
                 self._reset(now)
-            elif ms < self._last_ms:
-                self._wraps += 1
-        self._last_ms = ms
+            else:
+                ms = self._newest + step
+        self._newest = max(ms, self._newest or 0)
+        return ms * 1000
 
 
 def _validity(bits: int) -> dict[str, object]:

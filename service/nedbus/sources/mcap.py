@@ -1,4 +1,4 @@
-"""Replay the local position topics of an MCAP file, at the times at which they were recorded."""
+"""Replay an MCAP file, at the times at which its messages were recorded."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
-from nedbus.recording import RecordedMessage, RecordingReader
-from nedbus_msgs import FIELD_TYPES, Address, decode_cdr
+from nedbus.recording import RecordedMessage, RecordedStream, RecordingReader
+from nedbus_msgs import BY_TOPIC, Address, decode_with
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -22,6 +22,7 @@ class McapSource:
         self._path = path
         self._vehicle = options.vehicle
         self._default_vehicle = context.vehicle
+        self._topics = options.chosen_topics
         self.finite = not options.loop
         self.loop = options.loop
         self.speed = None if options.speed == "max" else options.speed
@@ -31,24 +32,31 @@ class McapSource:
         """Check the file; raise SourceError when it is not an MCAP file, or has none of the topics."""
         with self._reader() as reader:
             reader.check()
-        addresses = sorted({stream.address for stream in reader.counts})
+        counts = {stream: count for stream, count in reader.counts.items() if self._delivers(stream)}
+        addresses = sorted({stream.address for stream in counts})
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
-            raise SourceError(self._path, "no message of the local position topics is in this recording")
+            raise SourceError(self._path, "no message of these topics is in this recording")
         if self._vehicle is not None and len(vehicles) > 1:
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
-        total = sum(reader.counts.values())
+        total = sum(counts.values())
         return ReplayRun(
             messages=self._messages(),
             addresses=tuple(sorted({self._rename(address) for address in addresses})),
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
             warnings=tuple(reader.warnings),
+            definitions={
+                stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
+            },
             damage=f"{self._path}: damage cost messages: {'; '.join(reader.warnings)}" if reader.damaged else None,
         )
 
     def _reader(self) -> RecordingReader:
         return RecordingReader(self._path, vehicle=self._default_vehicle)
+
+    def _delivers(self, stream: RecordedStream) -> bool:
+        return self._topics is None or stream.address.topic in self._topics
 
     def _rename(self, address: Address) -> Address:
         return Address(self._vehicle, address.topic, address.instance) if self._vehicle else address
@@ -57,6 +65,8 @@ class McapSource:
         latest, due = None, 0
         with self._reader() as reader:
             for number, recorded in enumerate(reader.messages(), 1):
+                if not self._delivers(recorded.stream):
+                    continue
                 step = 0 if latest is None else recorded.logged - latest
                 if 0 < step <= _MAX_GAP:
                     due += step
@@ -65,11 +75,11 @@ class McapSource:
                 yield self._decode(recorded, number, due / 1e9)
 
     def _decode(self, recorded: RecordedMessage, number: int, due: float) -> SourceMessage:
-        address = self._rename(recorded.stream.address)
+        address, definition = self._rename(recorded.stream.address), recorded.stream.definition
         try:
-            fields = decode_cdr(recorded.payload, layout=recorded.stream.layout)
+            fields = decode_with(definition, recorded.payload, recorded.stream.layout)
         except DecodeError as exc:
             return SourceMessage(due, address, {}, error=f"message {number} of the recording: {exc}")
-        for name in recorded.stream.missing & FIELD_TYPES.keys():
+        for name in recorded.stream.missing & definition.all_fields:
             fields.pop(name, None)
-        return SourceMessage(due, address, fields)
+        return SourceMessage(due, address, fields, definition=None if address.topic in BY_TOPIC else definition)

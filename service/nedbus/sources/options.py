@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from nedbus_msgs import LAYOUTS, check_vehicle
+from nedbus_msgs import ANY, DEFAULT, MESSAGES, RELEASES, TOPICS, check_vehicle, get_topic
 
 
 def _check_vehicle(name: str) -> str:
@@ -37,9 +37,21 @@ def _check_system_ids(vehicles: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def _check_layout(name: str) -> str:
-    if name not in LAYOUTS:
+    if name not in (*RELEASES, *DEFAULT.layouts):
         raise ValueError(name)
     return name
+
+
+def _parse_topics(text: object) -> object:
+    """Parse `TOPIC,TOPIC`, where the name of a message stands for all of its topics."""
+    if not isinstance(text, str):
+        return text
+    names = [part.strip() for part in text.split(",")]
+    topics = [topic for name in names for topic in (MESSAGES[name].topics if name in MESSAGES else [name])]
+    for topic in topics:
+        if topic != ANY:
+            get_topic(topic)
+    return tuple(topics)
 
 
 Vehicle = Annotated[str, AfterValidator(_check_vehicle)]
@@ -50,6 +62,15 @@ class Options(BaseModel):
     """What the options of all kinds have in common."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    topics: Annotated[tuple[str, ...], BeforeValidator(_parse_topics)] = Field(
+        (), description="topics or messages, separated by commas, or * for all that there are"
+    )
+
+    @property
+    def chosen_topics(self) -> Collection[str] | None:
+        """The topics to deliver: by default those that have a file here; None is all, whatever they are."""
+        return None if ANY in self.topics else self.topics or TOPICS
 
 
 class ReplayOptions(Options):
@@ -86,8 +107,9 @@ class Px4ZenohOptions(Options):
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
     layout: Annotated[str, AfterValidator(_check_layout)] | None = Field(
-        None, description=f"the layout of keys without a type hash: {', '.join(LAYOUTS)}"
+        None, description=f"the release of PX4 whose layouts keys without a type hash have: {', '.join(RELEASES)}"
     )
+    msg: str = Field("", description="PX4's definitions of messages: .msg files or folders, separated by commas")
 
 
 class MavlinkOptions(Options):

@@ -6,13 +6,25 @@ Times are monotonic seconds of the caller's clock.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from typing import Any, Final
 
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
-from nedbus_msgs import Address, layout_of_type_hash, split_ros2_topic
+from nedbus_msgs import (
+    BY_TOPIC,
+    Address,
+    Definition,
+    Layout,
+    dds_type,
+    message_of_type_hash,
+    ros2_types,
+    split_ros2_topic,
+)
 
 from .options import Px4ZenohOptions
+from .px4_definitions import Definitions
 from .px4_publishers import AlivePublishers
 
 _MAX_STREAMS: Final = 1000  # keys; a vehicle has a handful
@@ -25,17 +37,24 @@ class NotAcceptedError(Exception):
     """Raised for a message that may be valid, but not whose it is is certain, or not in which layout it is."""
 
 
+class NotCarriedError(Exception):
+    """Raised for a key whose message nobody asked for; its text is the message, empty for what `topics=` leaves out."""
+
+
 @dataclass(slots=True, eq=False)
 class Stream:
     """One key: the address and layout of its messages, its publisher, and the last sequence number.
 
+    `unknown`: fields of a layout newer than this version, whose names or types it does not know.
     `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
     `reboots`: how many reboots of its vehicle it took part in.
     """
 
     key: TopicKey
     address: Address
-    layout: str
+    definition: Definition[Any]
+    layout: Layout
+    unknown: tuple[str, ...]
     reboots: int
     publisher: PublisherToken | None = None
     gid: bytes | None = None
@@ -48,8 +67,9 @@ class Stream:
 class StreamRegistry:
     """All keys that messages arrived on, and the one stream that owns each address."""
 
-    def __init__(self, options: Px4ZenohOptions, *, vehicle: str) -> None:
+    def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
         self._options = options
+        self._given = given or {}
         self._vehicle = vehicle
         self._streams: dict[str, Stream] = {}
         self._owners: dict[Address, Stream] = {}
@@ -75,14 +95,15 @@ class StreamRegistry:
     def register(self, key: str) -> Stream:
         """Return a new stream for a key.
 
-        Raises DecodeError or AddressError for a key that is not that of a local position topic, NotAcceptedError for
-        one whose layout is unknown, and for one key too many.
+        Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one whose
+        layout is unknown, and for one key too many, NotCarriedError for one that nobody asked for.
         """
         parsed = TopicKey.parse(key)
-        namespace, topic, instance = split_ros2_topic(parsed.topic)
-        address = Address(self._vehicle_of(parsed.domain, namespace), topic, instance)
-        layout = self._layout_of(parsed.type_hash)
-        stream = Stream(parsed, address, layout, self._reboots.get(address.vehicle, 0))
+        address = self.address_of(parsed)
+        definition, layout = self._layout_of(parsed, address.topic)
+        known = definition.known_types
+        unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
+        stream = Stream(parsed, address, definition, layout, unknown, self._reboots.get(address.vehicle, 0))
         if len(self._streams) >= _MAX_STREAMS:
             raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
         self._streams[key] = stream
@@ -118,6 +139,18 @@ class StreamRegistry:
         self._reboots[vehicle] = stream.reboots = known + is_first
         return is_first
 
+    def address_of(self, key: TopicKey) -> Address:
+        """Return the address of a key's messages; AddressError or NotCarriedError for one that has none here."""
+        namespace, topic, instance = split_ros2_topic(key.topic)
+        options, name = self._options, _message_name(key)
+        is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
+        if options.chosen_topics is None:
+            if not is_known:
+                raise NotCarriedError(name)
+        elif topic not in options.chosen_topics and (options.topics or key.dds_type not in self._given):
+            raise NotCarriedError("" if options.topics else f"{name} on {topic}" if is_known else name)
+        return Address(self._vehicle_of(key.domain, namespace), topic, instance)
+
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the vehicle that is configured, else one named by namespace and by any domain but the expected one."""
         vehicles = self._options.vehicles
@@ -127,15 +160,45 @@ class StreamRegistry:
         of_domain = vehicles.get(str(domain), "" if is_expected else f"domain{domain}")
         return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
 
-    def _layout_of(self, type_hash: str) -> str:
-        if type_hash == NO_HASH:
-            if self._options.layout is None:
-                raise NotAcceptedError(f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14")
-            return self._options.layout
-        layout = layout_of_type_hash(type_hash)
+    def _layout_of(self, key: TopicKey, topic: str) -> tuple[Definition[Any], Layout]:
+        """Return message and layout by the type hash of a key, else by the definition that is given for it."""
+        name, known, given = _message_name(key), _by_dds_type().get(key.dds_type), self._given.get(key.dds_type, {})
+        expected = BY_TOPIC.get(topic)
+        if expected is not None and expected is not known:
+            raise NotAcceptedError(f"{topic} has messages of type {expected.name}, not {name}")
+        found = message_of_type_hash(key.type_hash)
+        if found is not None and found[0] is known:
+            return found
+        own = given.get(key.type_hash)
+        if own is None and key.type_hash == NO_HASH and len(given) == 1:
+            [own] = given.values()
+        if own is not None:
+            return known or own, own.current
+        hint = f"give PX4's own definition of it, as in px4-zenoh:?msg={name}.msg"
+        if given:
+            hashes = " or ".join(given)
+            raise NotAcceptedError(
+                f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's"
+            )
+        if known is None:
+            raise NotAcceptedError(f"{name} with the type hash {key.type_hash} has no file here: {hint}")
+        if key.type_hash != NO_HASH:
+            reason = f"no known layout of {name} has the type hash {key.type_hash}"
+            raise NotAcceptedError(f"{reason}: update nedbus, or {hint}")
+        release = self._options.layout
+        layout = known.layout_of_release(release) if release else None
         if layout is None:
-            raise NotAcceptedError(f"no known layout has the type hash {type_hash}: update nedbus")
-        return layout
+            raise NotAcceptedError(f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14, or {hint}")
+        return known, layout
+
+
+def _message_name(key: TopicKey) -> str:
+    return key.dds_type.rpartition("::")[2].removesuffix("_")
+
+
+@cache
+def _by_dds_type() -> Mapping[str, Definition[Any]]:
+    return {dds_type(name): definition for name, definition in ros2_types().items()}
 
 
 def track_sequence(stream: Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:

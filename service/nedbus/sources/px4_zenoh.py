@@ -1,4 +1,4 @@
-"""Receive from PX4's Zenoh module, and from any other publisher of VehicleLocalPosition over rmw_zenoh."""
+"""Receive from PX4's Zenoh module, and from any other publisher of px4_msgs over rmw_zenoh."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
+    PX4_TYPES,
     Attachment,
     PublisherToken,
     Session,
@@ -26,12 +27,14 @@ from nedbus.transport import (
     publishers_of_type_key_expr,
     while_open,
 )
-from nedbus_msgs import ROS2_TYPES, dds_type, decode_cdr, split_ros2_topic
+from nedbus_msgs import BY_TOPIC, Address, decode_with
 
 from .options import Px4ZenohOptions
+from .px4_absences import Absences
+from .px4_definitions import read_definitions
 from .px4_node import Px4ZenohNode
-from .px4_streams import NotAcceptedError, StreamRegistry, track_sequence
-from .source import Rejection, SourceContext, SourceMessage
+from .px4_streams import NotAcceptedError, NotCarriedError, Stream, StreamRegistry, track_sequence
+from .source import Absence, Rejection, SourceContext, SourceMessage
 
 _log = logging.getLogger(__name__)
 
@@ -40,15 +43,15 @@ _CHANNEL: Final = 16_384  # samples that arrive until a thread of ours takes the
 _MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
 _JOIN: Final = 3.0  # s
 _TICK: Final = 0.25  # s
+_LOOK: Final = 1.0  # s between two looks at what does not arrive
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
-_MAX_PAYLOAD: Final = 1024  # bytes
 _LARGEST_PENDING: Final = 4096  # bytes of a payload that waits
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
 _TOO_LARGE: Final = "size", f"a payload of more than {_LARGEST_PENDING} bytes, or a key that is too long"
 
 
 class Px4ZenohSource:
-    """Everything of type px4_msgs/VehicleLocalPosition at a router: that of the service, or another one."""
+    """Everything of px4_msgs at a router: that of the service, or another one."""
 
     def __init__(self, endpoint: str, options: Px4ZenohOptions, context: SourceContext) -> None:
         if endpoint:
@@ -57,9 +60,10 @@ class Px4ZenohSource:
         self._is_own = not endpoint or endpoint in context.routers
         self._tls = context.tls
         self._options = options
+        self._given = read_definitions(options.msg)
         self._vehicle = options.vehicle or context.vehicle
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
         """Receive; raise SourceError when no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
@@ -69,14 +73,15 @@ class Px4ZenohSource:
                 session = self._open_session()
                 closing.callback(session.close)
             node = Px4ZenohNode(session)
-            decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle), node)
+            decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle, given=self._given), node)
             inbox = _Inbox(self._name)
             closing.callback(inbox.close)
             with while_open():
-                for name in map(dds_type, ROS2_TYPES):
-                    inbox.subscribe(session, name, domain=self._options.domain)
+                inbox.subscribe(session, PX4_TYPES, domain=self._options.domain)
             closing.callback(node.close)
             yield None
+            last: Absence | None = None
+            next_look = 0.0
             while True:  # until this iterator is closed: a session that lost its router connects again by itself
                 yield from inbox.overflow()
                 sample: zenoh.Sample | None = None
@@ -85,6 +90,10 @@ class Px4ZenohSource:
                 for token in inbox.tokens():  # those that came before the message are here by now
                     decoder.follow(token)
                 yield None if sample is None else decoder.decode(sample)
+                if (now := time.monotonic()) >= next_look:
+                    next_look = now + _LOOK
+                    if (absence := decoder.absences.report(now)) != last:
+                        yield (last := absence)
 
     @property
     def _name(self) -> str:
@@ -174,6 +183,7 @@ class _Decoder:
     """Turn samples into messages and rejections, and log what vehicles do."""
 
     def __init__(self, streams: StreamRegistry, node: Px4ZenohNode) -> None:
+        self.absences = Absences()
         self._streams = streams
         self._node = node
         self._bridged: set[str] = set()  # keys on which messages of `nedbus ros2` arrived
@@ -181,21 +191,26 @@ class _Decoder:
     def decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
         key = str(sample.key_expr)
         now = time.monotonic()
-        if sample.kind != zenoh.SampleKind.PUT:
+        if sample.kind != zenoh.SampleKind.PUT or self.absences.hear(key, now):
             return None
         stream = self._streams.find(key)
         try:
             if stream is None:
                 stream = self._streams.register(key)
+                self._log_unknown(stream)
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
             if str(sample.encoding) == BRIDGED_ENCODING:
                 self._log_bridged(key)
                 return None
             self._streams.claim(stream, attachment, now)
-            if len(sample.payload) > _MAX_PAYLOAD:
-                raise DecodeError(f"{len(sample.payload)} bytes are too many")
-            fields = decode_cdr(sample.payload.to_bytes(), layout=stream.layout)
+            fields = decode_with(stream.definition, sample.payload.to_bytes(), stream.layout)
+            for name in stream.unknown:
+                del fields[name]
             lost, restarted = track_sequence(stream, attachment, now)
+        except NotCarriedError as exc:
+            if not str(exc) or str(sample.encoding) == BRIDGED_ENCODING:
+                return None
+            return Rejection(key, f"{exc}: not asked for by topics= or msg=")
         except (AddressError, DecodeError, NotAcceptedError) as exc:
             reason = exc.reason if isinstance(exc, DecodeError) else str(exc)
             return Rejection(key, reason, stream.address if stream else None)
@@ -203,22 +218,33 @@ class _Decoder:
         if rebooted:
             extra = about("rebooted", stream.address, source="px4-zenoh")
             _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted)
+        definition = None if stream.address.topic in BY_TOPIC else stream.definition
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
 
     def follow(self, sample: zenoh.Sample) -> None:
         """Note that a publisher appeared, or is gone, by its liveliness token."""
         now = time.monotonic()
         try:
             token = PublisherToken.parse(str(sample.key_expr))
-            split_ros2_topic(token.key.topic)
+            what: Address | str = self._streams.address_of(token.key)
         except (AddressError, DecodeError):
             return  # what it publishes is rejected
+        except NotCarriedError as exc:
+            what = str(exc)
         if sample.kind == zenoh.SampleKind.PUT:
+            if not token.node.startswith("nedbus_"):  # a bridge of several vehicles
+                self.absences.announce(token, what, now)
             self._streams.add_publisher(token, now)
             self._node.subscribe(token)
         else:
+            self.absences.withdraw(token)
             self._streams.remove_publisher(token, now)
             self._node.unsubscribe(token)
+
+    def _log_unknown(self, stream: Stream) -> None:
+        if stream.unknown:
+            extra = about("newer-layout", stream.address, source="px4-zenoh")
+            _log.warning("%s: unknown here, and left out: %s", stream.key, ", ".join(stream.unknown), extra=extra)
 
     def _log_bridged(self, key: str) -> None:
         if key not in self._bridged:

@@ -14,23 +14,25 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
-from nedbus_msgs import FIELD_TYPES, VehicleLocalPosition, wrap
+from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
 
 from .simulated_trajectory import Truth
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 LAP: Final = 120.0  # s
+OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
+ORIGIN_SET: Final = 2.0  # s after the start: the global origin is known
+REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
+BOOT: Final = 10_000_000  # us since boot at the start
+PROJECTION: Final = MapProjection(*REFERENCE[:2])
 
 _HEADING_RESET: Final = 15.0  # s into a lap
-_OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 _MAX_DEAD_RECKONING: Final = 10.0  # s after which the position is no longer valid
 _Z_RESET: Final = 90.0  # s into a lap
 _HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap: the error that the next heading reset corrects
-_ORIGIN_SET: Final = 2.0  # s after the start: the global origin is known
-_REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
-_BOOT: Final = 10_000_000  # us since boot at the start
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
 _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
+_GRAVITY: Final = 9.80665  # m/s^2
 
 
 @dataclass(slots=True)
@@ -47,7 +49,7 @@ class _Resets:
     heading: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Estimator:
     """An estimate of the truth with errors that wander, drift without GPS, and are reset.
 
@@ -75,7 +77,7 @@ class Estimator:
 
     def step(self, lap_time: float, truth: Truth) -> None:
         """Advance by one tick."""
-        if not self.aided and _OUTAGE[0] <= lap_time < _OUTAGE[1]:
+        if not self.aided and OUTAGE[0] <= lap_time < OUTAGE[1]:
             self._drift_away()
         elif self._dead_reckoning:
             self._reset_position()
@@ -100,8 +102,7 @@ class Estimator:
         x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
         vx, vy = truth.velocity[0] + self._drift[0], truth.velocity[1] + self._drift[1]
         vz = truth.velocity[2]
-        xy_valid = self._dead_reckoning < _MAX_DEAD_RECKONING
-        spread = self.noise * 2 + 0.02 * self._dead_reckoning**2
+        xy_valid, spread = self.xy_valid, self._spread
         resets = self._resets
         unlimited = math.inf
         return {
@@ -118,7 +119,7 @@ class Estimator:
             "unaided_heading": self._gyro,
             "delta_heading": resets.delta_heading, "heading_reset_counter": resets.heading,
             "heading_good_for_control": resets.heading > 0 or self.aided, "tilt_var": 1e-4,
-            **_origin(known=time >= _ORIGIN_SET),
+            **_origin(known=time >= ORIGIN_SET),
             **_terrain(z),
             "eph": spread, "epv": self.noise * 3,
             "evh": self.noise / 2 + 0.05 * self._dead_reckoning, "evv": self.noise / 2,
@@ -126,6 +127,43 @@ class Estimator:
             "vxy_max": unlimited, "vz_max": unlimited,
             "hagl_min": unlimited, "hagl_max_z": unlimited, "hagl_max_xy": unlimited,
         }  # fmt: skip
+
+    def skip_fields(self) -> None:
+        """Go on as if `fields` had been called: the flight is the same, whatever is chosen of it."""
+        self._random.gauss(0.0, 0.02)
+
+    def attitude(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the attitude: the tilt is that of a multicopter's thrust, which makes the acceleration; no wind."""
+        (ax, ay, az), resets = truth.acceleration, self._resets
+        cos, sin = math.cos(truth.heading), math.sin(truth.heading)
+        forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
+        roll = math.atan2(right, math.hypot(forward, up))
+        q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + self._heading_error)
+        delta = euler_to_quaternion(0.0, 0.0, resets.delta_heading)
+        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": resets.heading}
+
+    def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the global position; there is one once the origin is known."""
+        x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
+        (latitude, longitude), altitude, resets = PROJECTION.reproject(x, y), REFERENCE[2], self._resets
+        return {
+            **_timestamps(time),
+            "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
+            "lat_lon_valid": self.xy_valid, "alt_valid": True, "delta_alt": -resets.delta_z, "delta_terrain": 0.0,
+            "lat_lon_reset_counter": resets.xy, "alt_reset_counter": resets.z,
+            "eph": self._spread, "epv": self.noise * 3,
+            "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
+            "dead_reckoning": self._dead_reckoning > 0,
+        }  # fmt: skip
+
+    @property
+    def xy_valid(self) -> bool:
+        """Whether its horizontal position and velocity are valid."""
+        return self._dead_reckoning < _MAX_DEAD_RECKONING
+
+    @property
+    def _spread(self) -> float:
+        return self.noise * 2 + 0.02 * self._dead_reckoning**2
 
     def _wander(self) -> None:
         keep = math.exp(-TICK / 20.0)
@@ -154,7 +192,9 @@ def truth_fields(time: float, truth: Truth) -> dict[str, object]:
               vxy_max vz_max hagl_min hagl_max_z hagl_max_xy"""
     return {
         **dict.fromkeys(zero.split(), 0.0),
-        **dict.fromkeys((name for name, kind in FIELD_TYPES.items() if kind == "uint8"), 0),
+        **dict.fromkeys(
+            (name for name, kind in VehicleLocalPosition.DEFINITION.types.items() if kind.base == "uint8"), 0
+        ),
         "dead_reckoning": False,
         **_timestamps(time),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
@@ -172,14 +212,14 @@ def truth_fields(time: float, truth: Truth) -> dict[str, object]:
 
 
 def _timestamps(time: float) -> dict[str, object]:
-    timestamp = _BOOT + round(time * 1e6)
+    timestamp = BOOT + round(time * 1e6)
     return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
 
 
 def _origin(*, known: bool) -> dict[str, object]:
-    latitude, longitude, altitude = _REFERENCE if known else (math.nan,) * 3
+    latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
     return {
-        "xy_global": known, "z_global": known, "ref_timestamp": _BOOT + round(_ORIGIN_SET * 1e6) if known else 0,
+        "xy_global": known, "z_global": known, "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if known else 0,
         "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
     }  # fmt: skip
 

@@ -10,6 +10,7 @@ from typing import Final
 from nedbus_msgs import wrap
 
 _ALTITUDE: Final = 20.0  # m
+CLIMB: Final = 10.0  # s until it is there
 _SIZE: Final = 40.0  # m
 _STEP: Final = 1e-3  # s, of the derivatives
 
@@ -43,7 +44,7 @@ class Trajectory:
         return Truth(now, velocity, acceleration, heading)
 
     def _position(self, time: float) -> Vector:
-        climb = _smoothstep(time / 10.0)
+        climb = _smoothstep(time / CLIMB)
         # The phase starts slowly after the climb and then advances evenly, one figure a minute.
         late = max(0.0, time - 8.0)
         phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))

@@ -1,17 +1,30 @@
-"""Replay a simulated flight that has all four topics: the same seed gives the same messages, to the bit."""
+"""Replay a simulated flight with all that its vehicle says: the same seed gives the same messages, to the bit."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import count
+from typing import NamedTuple
 
-from nedbus_msgs import TOPICS, Address
+from nedbus.errors import SourceError
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
 from .options import SimulatorOptions
-from .simulated_estimator import LAP, TICK, Estimator, truth_fields
-from .simulated_trajectory import Trajectory
+from .simulated_estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
+from .simulated_trajectory import Trajectory, Truth
+from .simulated_vehicle import SimulatedVehicle
 from .source import ReplayRun, SourceContext, SourceMessage
+
+
+class _Stream(NamedTuple):
+    """What is sent at some ticks, and the estimator that it needs, if any."""
+
+    address: Address
+    ticks: range
+    fields: Callable[[float, Truth], dict[str, object]]
+    estimator: Estimator | None = None
 
 
 class SimulatorSource:
@@ -22,6 +35,7 @@ class SimulatorSource:
     def __init__(self, _: str, options: SimulatorOptions, context: SourceContext) -> None:
         self._vehicle = options.vehicle or context.vehicle
         self._seed = options.seed
+        self._topics = options.chosen_topics
         self._ticks = None if options.duration is None else round(options.duration / TICK)
         self.finite = options.duration is not None
         self.speed = None if options.speed == "max" else options.speed
@@ -29,35 +43,64 @@ class SimulatorSource:
 
     def open(self) -> ReplayRun:
         """Start a new flight."""
-        single = (Address(self._vehicle, topic.name) for topic in TOPICS.values() if not topic.instances)
-        estimate, truth, external = single
-        instances = [Address(self._vehicle, "estimator_local_position", instance) for instance in (0, 1)]
-        # In every 100 ticks: 100 estimates, 50 truths, 50 external, 2 of each instance.
-        total = None if self._ticks is None else 2 * self._ticks + 2 * math.ceil(self._ticks / 50)
+        streams = self._streams(sys.maxsize if self._ticks is None else self._ticks)
+        chosen = [
+            each for each in streams if each.ticks and (self._topics is None or each.address.topic in self._topics)
+        ]
+        if not chosen:
+            raise SourceError("sim:", f"a simulated vehicle does not have {', '.join(self._topics or ())}")
+        total = None if self._ticks is None else sum(len(each.ticks) for each in chosen)
         return ReplayRun(
-            messages=self._messages(estimate, truth, external, instances),
-            addresses=(estimate, truth, external, *instances),
+            messages=self._messages(streams, chosen),
+            addresses=tuple(sorted((each.address for each in chosen), key=lambda each: each.topic != DEFAULT_TOPIC)),
             total=total,
             summary=f"vehicle {self._vehicle}, seed {self._seed}, "
             + ("endless" if self._ticks is None else f"{total} messages, {self._ticks * TICK:g} s"),
         )
 
-    def _messages(
-        self, estimate: Address, truth: Address, external: Address, instances: list[Address]
-    ) -> Iterator[SourceMessage]:
-        trajectory = Trajectory(self._seed)
-        filters = [Estimator("ekf 0", self._seed, 0.3), Estimator("ekf 1", self._seed, 0.5)]
+    def _streams(self, end: int) -> tuple[_Stream, ...]:
+        """Return all streams, in the order of their messages in one tick."""
+        first, second = (Estimator(f"ekf {each}", self._seed, noise) for each, noise in enumerate((0.3, 0.5)))
         ins = Estimator("ins", self._seed, 0.05, aided=True)
+        vehicle, origin = SimulatedVehicle(self._seed, first), round(ORIGIN_SET / TICK)
+        at = partial(Address, self._vehicle)
+        return (
+            _Stream(at("vehicle_local_position_groundtruth"), range(0, end, 2), truth_fields),
+            _Stream(at("external_ins_local_position"), range(1, end, 2), ins.fields, ins),
+            _Stream(at("estimator_local_position", 0), range(0, end, 50), first.fields, first),
+            _Stream(at("estimator_local_position", 1), range(0, end, 50), second.fields, second),
+            _Stream(at("vehicle_local_position"), range(end), first.fields, first),
+            _Stream(at("vehicle_attitude"), range(0, end, 2), first.attitude, first),
+            _Stream(at("vehicle_global_position"), range(origin, end, 10), first.global_fields, first),
+            _Stream(at("sensor_gps", 0), range(0, end, 10), vehicle.gps),
+            _Stream(at("vehicle_status"), range(0, end, 50), vehicle.status, first),
+            _Stream(at("vehicle_land_detected"), range(0, end, 100), vehicle.land_detected),
+            _Stream(at("battery_status", 0), range(0, end, 100), vehicle.battery),
+            _Stream(at("home_position"), range(0, min(end, origin + 1), origin), vehicle.home),
+        )
+
+    def _messages(self, streams: tuple[_Stream, ...], chosen: list[_Stream]) -> Iterator[SourceMessage]:
+        trajectory = Trajectory(self._seed)
+        estimators = list(dict.fromkeys(each.estimator for each in chosen if each.estimator))
+        noisy = [estimator.fields for estimator in estimators]
+        wanted = {each.address: _absent(each.address.topic) for each in chosen}
+        rows = [(each, wanted.get(each.address)) for each in streams if each in chosen or each.fields in noisy]
         for tick in count() if self._ticks is None else range(self._ticks):
             time = tick * TICK
             now = trajectory.at(time)
-            for estimator in (*filters, ins):
+            for estimator in estimators:
                 estimator.step(time % LAP, now)
-            if tick % 2 == 0:
-                yield SourceMessage(time, truth, truth_fields(time, now))
-            else:
-                yield SourceMessage(time, external, ins.fields(time, now))
-            if tick % 50 == 0:
-                for address, estimator in zip(instances, filters, strict=True):
-                    yield SourceMessage(time, address, estimator.fields(time, now))
-            yield SourceMessage(time, estimate, filters[0].fields(time, now))
+            for each, absent in rows:
+                if tick not in each.ticks:
+                    continue
+                if absent is not None:
+                    fields = each.fields(time, now)
+                    yield SourceMessage(time, each.address, fields if len(fields) == len(absent) else absent | fields)
+                elif each.estimator:
+                    each.estimator.skip_fields()
+
+
+def _absent(topic: str) -> dict[str, object]:
+    """Return all fields that PX4's newest messages on a topic have, as "not known"."""
+    layout = BY_TOPIC[topic].layout_of_release("main")
+    return {name: kind.absent for name, kind in layout.types.items()} if layout else {}

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from nedbus.transport import Session, Tls
-from nedbus_msgs import Address
+from nedbus_msgs import Address, Definition
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +19,7 @@ class SourceMessage:
     `lost`: messages that were lost between the vehicle and the source, just before this one.
     `rebooted`: this is the first message after the vehicle rebooted.
     `error`: why it cannot be decoded, if so; it has no fields then.
+    `definition`: that of its message, where the topic has no file.
     """
 
     due: float
@@ -27,6 +28,7 @@ class SourceMessage:
     lost: int = 0
     rebooted: bool = False
     error: str | None = None
+    definition: Definition[Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,18 @@ class Rejection:
 
 
 @dataclass(frozen=True, slots=True)
+class Absence:
+    """All that vehicles publish and a live source does not deliver, which yields it when it changes.
+
+    `not_carried`: messages that have no definition here.
+    `silent`: addresses that are announced, and of which nothing arrives while other topics of their vehicles do.
+    """
+
+    not_carried: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class ReplayRun:
     """One run of a replay.
 
@@ -51,6 +65,7 @@ class ReplayRun:
     `addresses`: every address that occurs in the messages.
     `total`: the number of messages, None if they never end.
     `summary`: a description for the log; `warnings`: what is damaged or left out.
+    `definitions`: those of the messages on topics that have no file.
     `damage`: what damage cost, if it cost messages; at its end the run has failed then.
     """
 
@@ -60,6 +75,7 @@ class ReplayRun:
     summary: str
     warnings: tuple[str, ...] = field(default=())
     damage: str | None = None
+    definitions: Mapping[str, Definition[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +123,7 @@ class ReplaySource(Protocol):
 class LiveSource(Protocol):
     """A source that receives from vehicles; which addresses it has is known when messages arrive."""
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
         """Yield what arrives until the iterator is closed, and None at least twice a second when nothing does.
 
         `router`: the session of the service where that is a router itself; it is lent, and must not be closed.

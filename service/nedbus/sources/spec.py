@@ -112,13 +112,14 @@ def _parse_text(text: str) -> SourceSpec:
     return SourceSpec(text, kind_name, target, options)
 
 
-def source_text_of_file(path: str | PurePath, vehicle: str | None = None) -> str:
-    """Return the text of the source that replays a file, such as `ulog:flight.ulg?vehicle=7`.
+def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
+    """Return the text of the source that replays a file, such as `ulog:flight.ulg?vehicle=7`, with these options.
 
     Raises ConfigError for a file suffix that belongs to no kind.
     """
     text = f"{format_of(path)}:{escape_path(str(path))}"
-    return f"{text}?{urlencode({'vehicle': vehicle})}" if vehicle else text
+    given = {name: value for name, value in options.items() if value}
+    return f"{text}?{urlencode(given)}" if given else text
 
 
 def _check_file(text: str, path: Path) -> None:

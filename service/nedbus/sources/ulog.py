@@ -1,19 +1,19 @@
-"""Replay a PX4 .ulg log: every local position topic and every estimator instance, paced by its timestamps."""
+"""Replay a PX4 .ulg log: its topics with every instance, paced by their timestamps."""
 
 from __future__ import annotations
 
 import heapq
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from nedbus.recording import UlogColumns, read_ulog
-from nedbus_msgs import FIELD_TYPES, LAYOUTS, Address, find_layout
+from nedbus.recording import UlogTopic, read_ulog
+from nedbus_msgs import ALL, DEFAULT, Definition
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -21,34 +21,35 @@ from .source import ReplayRun, SourceContext, SourceMessage
 _MAX_GAP: Final = 60_000_000  # us: a longer gap in a log is a damaged timestamp, not a time to wait for
 _CHUNK: Final = 1000  # rows that are converted to Python values at a time
 
-_KNOWN_FIELDS: Final = frozenset(name for layout in LAYOUTS.values() for name in layout.fields)
 _BOOLS: Final = {0: False, 1: True}  # valid bytes of a bool; the model rejects any other
 
 
 @dataclass(frozen=True, slots=True)
 class _Track:
-    """One topic of a log: its address, its columns, and when each row is due."""
+    """One topic of a log, and when each row is due."""
 
-    address: Address
-    columns: UlogColumns
+    topic: UlogTopic
     due: npt.NDArray[np.float64]
 
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the rows."""
+        address, definition, names = self.topic.address, self.topic.definition, tuple(self.topic.columns)
+        described = definition if self.topic.is_described else None
         for start in range(0, len(self.due), _CHUNK):
             rows = slice(start, start + _CHUNK)
-            columns = [_python_values(name, column[rows]) for name, column in self.columns.items()]
+            columns = [python_values(definition, name, column[rows]) for name, column in self.topic.columns.items()]
             for due, row in zip(self.due[rows].tolist(), zip(*columns, strict=True), strict=True):
-                yield SourceMessage(due, self.address, dict(zip(self.columns, row, strict=True)))
+                yield SourceMessage(due, address, dict(zip(names, row, strict=True)), definition=described)
 
 
 class UlogSource:
-    """A .ulg file; `open` reads its local position topics into memory."""
+    """A .ulg file; `open` reads its topics into memory."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path = Path(path).expanduser()
         self._vehicle = options.vehicle
         self._default_vehicle = context.vehicle
+        self._topics = options.chosen_topics
         self.finite = not options.loop
         self.loop = options.loop
         self.speed = None if options.speed == "max" else options.speed
@@ -56,40 +57,47 @@ class UlogSource:
 
     def open(self) -> ReplayRun:
         """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
-        log = read_ulog(self._path, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        log = read_ulog(self._path, topics=self._topics, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
         topics, warnings = log.topics, list(log.warnings)
-        vehicle = topics[0][0].vehicle
-        clocks = [_monotonic(columns["timestamp"]) for _, columns in topics]
-        for (address, columns), clock in zip(topics, clocks, strict=True):
-            outliers = int(np.count_nonzero(clock != columns["timestamp"]))
+        clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
+        for topic, clock in zip(topics, clocks, strict=True):
+            outliers = int(np.count_nonzero(clock != topic.columns["timestamp"]))
             if outliers:
-                warnings.append(f"{address}: {outliers} timestamps out of order; the log's own order is kept")
-            unknown = sorted(name for name in columns if name not in _KNOWN_FIELDS)
-            if unknown and "hagl_max_z" in columns:
-                warnings.append(f"{address}: {', '.join(unknown)} left out: the log is newer than this version")
+                warnings.append(f"{topic.address}: {outliers} timestamps out of order; the log's own order is kept")
+            unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
+            if unknown and _is_newer(topic):
+                warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than this version")
         dues, gaps = _pace(clocks)
         if gaps:
             warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")
-        tracks = [_Track(address, columns, due) for (address, columns), due in zip(topics, dues, strict=True)]
+        tracks = [_Track(topic, due) for topic, due in zip(topics, dues, strict=True)]
         total = sum(map(len, clocks))
-        layouts = " and ".join(sorted({_layout_name(columns) for _, columns in topics}))
+        layouts = " and ".join(sorted({_layout_name(topic) for topic in topics if topic.definition is DEFAULT}))
+        layout = f", layout {layouts}" if layouts else ""
         return ReplayRun(
             messages=heapq.merge(*(track.messages() for track in tracks), key=lambda message: message.due),
-            addresses=tuple(track.address for track in tracks),
+            addresses=tuple(topic.address for topic in topics),
             total=total,
-            summary=f"vehicle {vehicle}, {total} messages of {len(tracks)} streams, layout {layouts},"
+            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(tracks)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
+            definitions={topic.address.topic: topic.definition for topic in topics if topic.is_described},
         )
 
 
-def _python_values(name: str, column: npt.NDArray[np.generic]) -> list[object]:
-    """Return a column as values that the model accepts: int, float, bool, or tuples of two floats."""
+def python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
+    """Return a column as values that the model accepts: int, float, bool, or tuples of them."""
     values: list[object] = column.tolist()
-    if FIELD_TYPES.get(name) == "bool":
-        return [_BOOLS.get(value, value) if isinstance(value, int) else value for value in values]
+    if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
+        return [_to_bool(value) for value in values]
     return [tuple(value) for value in values if isinstance(value, list)] if column.ndim == 2 else values
+
+
+def _to_bool(value: object) -> object:
+    if isinstance(value, list):
+        return tuple(map(_to_bool, value))
+    return _BOOLS.get(value, value) if isinstance(value, int) else value
 
 
 def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
@@ -122,6 +130,12 @@ def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.flo
     return [elapsed[np.searchsorted(times, clock)] for clock in clocks], int(np.count_nonzero(gaps))
 
 
-def _layout_name(columns: Mapping[str, object]) -> str:
-    layout = find_layout(columns)
-    return layout.name if layout else "newer than 1.16" if "hagl_max_z" in columns else "1.12 or older"
+def _is_newer(topic: UlogTopic) -> bool:
+    """Return whether a log has all fields of the newest layout: it may have more."""
+    newest = [layout for layout in topic.definition.layouts.values() if layout.name != ALL][-1]
+    return newest.types.keys() <= topic.columns.keys()
+
+
+def _layout_name(topic: UlogTopic) -> str:
+    layout = topic.definition.find_layout(topic.columns)
+    return layout.name if layout else "newer than 1.16" if _is_newer(topic) else "1.12 or older"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -52,14 +52,18 @@ class Answers:
 
     def wait(self, timeout: float) -> Iterator[zenoh.Reply]:
         """Yield the answers as they come, until the query has ended, or its timeout has passed."""
-        end = time.monotonic() + zenoh_timeout(timeout) + _GRACE
-        pause, longest = _PAUSES
-        while not self.ended and time.monotonic() < end:
-            taken = self.take()
-            yield from taken
-            if not taken and not self.ended:
-                time.sleep(pause)
-                pause = min(2 * pause, longest)
+        return _replies([self], timeout)
+
+
+def _replies(asked: Sequence[Answers], timeout: float) -> Iterator[zenoh.Reply]:
+    end = time.monotonic() + zenoh_timeout(timeout) + _GRACE
+    pause, longest = _PAUSES
+    while (still := [answers for answers in asked if not answers.ended]) and time.monotonic() < end:
+        taken = [reply for answers in still for reply in answers.take()]
+        yield from taken
+        if not taken:
+            time.sleep(pause)
+            pause = min(2 * pause, longest)
 
 
 def ask(
@@ -84,14 +88,14 @@ def ask(
     return Answers(handler)
 
 
-def query(session: Session, key_expr: str, *, timeout: float, newest: bool = True) -> list[RawSample]:
-    """Return what is answered within `timeout` seconds: the newest answer for each key, or all.
+def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True) -> list[RawSample]:
+    """Return what is answered on any of these within `timeout` seconds: the newest answer for each key, or all.
 
     At most 10,000 answers of 64 MB in all are kept, whoever sends them; that there are more is logged.
     """
     kept: dict[object, RawSample] = {}
     size = left_out = 0
-    replies = ask(session, key_expr, timeout=timeout).wait(timeout)
+    replies = _replies([ask(session, key_expr, timeout=timeout) for key_expr in key_exprs], timeout)
     for sample in filter(None, (reply.ok for reply in replies)):
         key: object = str(sample.key_expr) if newest else len(kept)
         other = kept.get(key)
@@ -103,7 +107,7 @@ def query(session: Session, key_expr: str, *, timeout: float, newest: bool = Tru
         if fits:
             kept[key], size = sample, new_size
     if left_out:
-        _log.warning("%s: %d answers too many are left out", key_expr, left_out, extra=about("incomplete"))
+        _log.warning("%s: %d answers too many are left out", ", ".join(key_exprs), left_out, extra=about("incomplete"))
     return list(kept.values())
 
 
@@ -144,12 +148,12 @@ def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[
 
 
 class AliveChanges:
-    """The liveliness tokens that appear and go from now on, for the thread of whoever follows them."""
+    """The liveliness tokens that are there, appear and go, for the thread of whoever follows them."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANGES)
         with while_open():
-            subscriber = session.liveliness().declare_subscriber(key_expr, channel)
+            subscriber = session.liveliness().declare_subscriber(key_expr, channel, history=True)
         self.missed = False
         """Whether more tokens changed than are kept until they are taken: all have to be asked for again."""
         self.undeclare: Callable[[], object] = subscriber.undeclare

@@ -137,9 +137,8 @@ def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> s
     return _endpoint_token("MS", key, session, node, entity)
 
 
-def publishers_key_expr(key: TopicKey) -> str:
-    """Return the key expression for the tokens of all publishers of a topic with this type and hash."""
-    return f"@ros2_lv/{key.domain}/*/*/*/MP/*/*/*/{_mangle(key.topic)}/{key.dds_type}/{key.type_hash}/*"
+PX4_TYPES: Final = "px4_msgs$*"
+"""The DDS types of PX4's messages, as a chunk of a key expression; those of its translation node too."""
 
 
 def publishers_of_type_key_expr(domain: int | None, dds_type: str) -> str:

@@ -7,12 +7,12 @@ import threading
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from nedbus.client import Health, RejectionReport, Sample, StreamState, describe_stream, health_of_last, stream_state
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address, Message
+from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address
 
-from .stream import Origin, Stream
+from .stream import Origin, Stream, is_position
 
 Condition = Literal["disconnected", "gone", "stale", "invalid", "dead reckoning", "slow", "ok"]
 CONDITIONS: Final[tuple[Condition, ...]] = (
@@ -22,7 +22,7 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
-"""Streams that a page shows; more are counted."""
+"""Streams that a page shows, positions before others; more are counted."""
 
 _OVER: Final = 600.0  # s after which nobody needs to look for what has gone
 _SILENT: Final = 60.0  # s after which a stream makes room for another
@@ -95,12 +95,12 @@ class Fleet:
     _reports: deque[RejectionReport] = field(default_factory=lambda: deque(maxlen=_REPORTS))
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def add(self, sample: Sample[Message], time: float) -> None:
+    def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample at this time [s since the epoch]."""
         address = sample.address
         stream = self.streams.get(address)
         if stream is None:
-            if len(self.streams) >= MAX_STREAMS and not self._make_room(time):
+            if len(self.streams) >= MAX_STREAMS and not (is_position(address) and self._make_room(time)):
                 if len(self._left_out) < MAX_STREAMS:
                     self._left_out.add(address)
                 return
@@ -154,10 +154,10 @@ class Fleet:
         return self.picture
 
     def _make_room(self, time: float) -> bool:
-        """Forget the stream that was silent for longest, if that was a minute, and return whether there was one."""
+        """Forget one that is no position, or was silent for longest, if that was a minute; return whether there was."""
         with self._lock:
-            address = min(self.streams, key=lambda each: self.streams[each].time)
-            if time - self.streams[address].time < _SILENT:
+            address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
+            if is_position(address) and time - self.streams[address].time < _SILENT:
                 return False
             del self.streams[address]
             self._since.pop(address, None)
@@ -177,8 +177,8 @@ class Fleet:
 
 
 def main_line(lines: Sequence[Line]) -> Line:
-    """Return the line of a vehicle that its marker shows: vehicle_local_position, if it has that."""
-    return next((line for line in lines if line.address.topic == DEFAULT_TOPIC), lines[0])
+    """Return the line of a vehicle that its marker shows: vehicle_local_position, else another position, if any."""
+    return min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
 
 
 def _condition(health: Health, state: StreamState) -> Condition:

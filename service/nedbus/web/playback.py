@@ -8,7 +8,7 @@ import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 from bokeh.layouts import row
 from bokeh.models import Row
@@ -18,9 +18,10 @@ from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import InvalidMessageError, NedbusError
 from nedbus.log_event import about
 from nedbus.sources import ReplaySource, parse_source, source_text_of_file
-from nedbus_msgs import Address, decode_row, encode_fields, upgrade_fields
+from nedbus_msgs import DEFAULT, Address, codec_of, upgrade_fields
 
 from .fleet import Fleet
+from .stream import is_position
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +32,9 @@ _SPEEDS: Final[Mapping[str | tuple[Any, str], float]] = {
 
 
 class Recording:
-    """All messages of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
+    """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
+
+    Of other messages, which outnumber them, only PX4's time is kept.
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -40,7 +43,7 @@ class Recording:
         spec = parse_source(source_text_of_file(path))
         self.name = path.name
         self.dues: list[float] = []
-        self.entries: list[tuple[Address, bytes | str]] = []
+        self.entries: list[tuple[Address, bytes | str | int]] = []
         self._path = str(path)
         self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
         for warning in self._run.warnings:
@@ -55,7 +58,8 @@ class Recording:
     def _read(self) -> None:
         try:
             for message in self._run.messages:
-                self.entries.append((message.address, message.error or _encode(message.fields)))
+                keep = _encode if is_position(message.address) else _time_of
+                self.entries.append((message.address, message.error or keep(message.fields)))
                 self.dues.append(message.due)
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=self._path, reason=str(exc)))
@@ -64,9 +68,19 @@ class Recording:
 def _encode(fields: Mapping[str, object]) -> bytes | str:
     """Return a message as bytes, or why it is none."""
     try:
-        return encode_fields(upgrade_fields(fields))
+        return codec_of(DEFAULT).encode_fields(upgrade_fields(DEFAULT, fields))
     except InvalidMessageError as exc:
         return exc.reason
+
+
+def _time_of(fields: Mapping[str, object]) -> int:
+    return cast("int", fields["timestamp"])
+
+
+class _Unread(NamedTuple):
+    """A message of which only its time is known."""
+
+    timestamp: int
 
 
 class Player:
@@ -118,7 +132,8 @@ class Player:
             if isinstance(payload, str):
                 self.fleet.reject([RejectionReport(address, payload, round(due * 1e9))])
                 continue
-            sample = Sample(decode_row(payload), address, round(due * 1e9))
+            message: Any = _Unread(payload) if isinstance(payload, int) else codec_of(DEFAULT).decode_row(payload)
+            sample = Sample(message, address, round(due * 1e9))
             self._monitor.add(sample, received=sample.received)
             self.fleet.add(sample, due)
         self._next = max(self._next, end)

@@ -1,4 +1,7 @@
-"""What is kept of one stream for a page: where it was in the last minute, at ten points a second; no I/O."""
+"""What is kept of one stream for a page: where it was in the last minute, at ten points a second; no I/O.
+
+Of other messages than positions only the last one is kept.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +9,12 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from nedbus.client import Sample
-from nedbus_msgs import MapProjection, Message, ResetTracker, to_global
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, MapProjection, ResetTracker, VehicleLocalPosition, to_global
 
 POINTS: Final = 600
 """Points of a history: a minute."""
@@ -29,6 +32,11 @@ _events = attrgetter(
     "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "ref_timestamp", "xy_global",
     "xy_valid", "z_valid", "dead_reckoning",
 )  # fmt: skip
+
+
+def is_position(address: Address) -> bool:
+    """Return whether there are positions at an address, which a map and plots can show."""
+    return BY_TOPIC.get(address.topic) is DEFAULT
 
 
 class Place(NamedTuple):
@@ -49,7 +57,7 @@ class Origin:
 
     projection: MapProjection | None = None
 
-    def place(self, message: Message) -> Place:
+    def place(self, message: VehicleLocalPosition) -> Place:
         """Return where a message is; NaN where it is not valid."""
         position = to_global(message)
         north, east = message.x, message.y
@@ -70,9 +78,9 @@ class Stream:
     """
 
     def __init__(self, origin: Origin) -> None:
-        self.history = np.full((POINTS, len(COLUMNS)), np.nan)
+        self.history = np.empty((POINTS, len(COLUMNS)))  # no memory until it is written, as it never is for others
         self.written = 0
-        self.last: Sample[Message] | None = None
+        self.last: Sample[Any] | None = None
         self.time = -math.inf  # of `last` [s since the epoch]
         self.valid: Place | None = None
         self.resets: deque[tuple[float, float, float]] = deque(maxlen=50)  # time [s], east, north
@@ -81,9 +89,11 @@ class Stream:
         self._state: object = None
         self._sampled = -math.inf
 
-    def add(self, sample: Sample[Message], time: float, truth: Stream | None = None) -> None:
+    def add(self, sample: Sample[Any], time: float, truth: Stream | None = None) -> None:
         """Add the next sample of the stream at this time [s], beside the ground truth of its vehicle."""
         before, self.last, self.time = self.last, sample, time
+        if not is_position(sample.address):
+            return
         state = _events(sample.message)
         if state == self._state:
             if time - self._sampled < _STEP:
@@ -96,13 +106,13 @@ class Stream:
     @property
     def error(self) -> float:
         """The distance to the ground truth at the last point [m], NaN without one."""
-        return float(self.history[(self.written - 1) % POINTS, _ERROR])
+        return float(self.history[(self.written - 1) % POINTS, _ERROR]) if self.written else math.nan
 
     def points(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
         """Return the points with these numbers that are still there, in order, shape (n, columns)."""
         return self.history[np.arange(max(begin, end - POINTS, 0), end) % POINTS]
 
-    def _add_point(self, message: Message, time: float, truth: Stream | None) -> None:
+    def _add_point(self, message: VehicleLocalPosition, time: float, truth: Stream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             self._write([time * 1e3, *[math.nan] * (len(COLUMNS) - 1)])  # the line breaks here
@@ -132,7 +142,7 @@ class Stream:
         self.written += 1
 
 
-def _distance(place: Place, message: Message, truth: Stream | None) -> float:
+def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None) -> float:
     """Return the distance to the ground truth of the same moment [m], NaN without one."""
     if truth is None or truth.last is None or not math.isfinite(place.north):
         return math.nan
@@ -149,5 +159,5 @@ def _distance(place: Place, message: Message, truth: Stream | None) -> float:
     return math.hypot(*(offset for offset in offsets if math.isfinite(offset)))
 
 
-def _moment(message: Message) -> int:
+def _moment(message: VehicleLocalPosition) -> int:
     return message.timestamp_sample or message.timestamp

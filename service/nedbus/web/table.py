@@ -15,6 +15,7 @@ from nedbus_msgs import Address
 
 from .fleet import Line, Picture
 from .send import replace
+from .stream import is_position
 from .style import COLOURS, Style, to_clock
 
 _TOPICS: Final = {
@@ -28,7 +29,7 @@ _FLAGS: Final = {
     "dead_reckoning": "DR",
 }  # fmt: skip
 _WIDTHS: Final = {
-    "vehicle": 60, "topic": 80, "state": 90, "what is wrong": 150, "since": 54, "age": 44, "Hz": 32, "off truth": 54,
+    "vehicle": 60, "topic": 110, "state": 90, "what is wrong": 150, "since": 54, "age": 44, "Hz": 32, "off truth": 54,
     "lost": 32, "rejected": 50, "latency": 46, **dict.fromkeys(_FLAGS.values(), 25), "source": 44,
 }  # fmt: skip
 _SET, _CLEAR = "●", "○"
@@ -106,13 +107,13 @@ def _show(table: DataTable, source: ColumnDataSource, rows: Mapping[str, list[st
 def _cells(line: Line) -> dict[str, str]:
     health, last = line.health, line.stream.last
     instance = "" if line.address.instance is None else f" {line.address.instance}"
-    flags = {
-        label: _SET if last is not None and getattr(last.message, name) else _CLEAR for name, label in _FLAGS.items()
-    }
+    flags = dict.fromkeys(_FLAGS.values(), "")
+    if last is not None and is_position(line.address):
+        flags = {label: _SET if getattr(last.message, name) else _CLEAR for name, label in _FLAGS.items()}
     is_fresh = line.condition not in {"disconnected", "gone", "stale"}
     return {
         "vehicle": line.address.vehicle,
-        "topic": f"{_TOPICS[line.address.topic]}{instance}",
+        "topic": f"{_TOPICS.get(line.address.topic) or line.address.topic.replace('_', ' ')}{instance}",
         "state": line.condition,
         "what is wrong": line.words,
         "since": "" if line.condition == "ok" else to_clock(line.since),

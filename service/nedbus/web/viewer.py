@@ -20,6 +20,7 @@ from nedbus_msgs import Address
 from .fleet import CONDITIONS, MAX_STREAMS, TRUTH, Fleet, Line, Picture, main_line
 from .map_plot import MapPlot
 from .plots import Plots
+from .stream import is_position
 from .style import DARK, LIGHT, badge, to_clock
 from .table import RejectionTable, StreamTable
 
@@ -114,12 +115,15 @@ class Viewer:
         worst = sorted(map(_worst_of, vehicles.values()), key=lambda line: line.rank)
         if self.chosen is None and worst:
             self.chosen = main_line(vehicles[worst[0].address.vehicle]).address
+        plotted = self.chosen
+        if plotted is not None and not is_position(plotted) and plotted.vehicle in vehicles:
+            plotted = main_line(vehicles[plotted.vehicle]).address
         self._map.update(picture, mains, self.chosen, self._fleet.origin.projection)
         if self._ticks % _LOOK == 0:
             self._streams.update(picture, self.chosen)
             self._rejections.update(picture)
-            self._tell(picture, mains, worst, vehicles)
-            self._plots.update(self._fleet, self.chosen, Address(self.chosen.vehicle, TRUTH) if self.chosen else None)
+            self._tell(picture, mains, worst, vehicles, plotted)
+            self._plots.update(self._fleet, plotted, Address(plotted.vehicle, TRUTH) if plotted else None)
         if self._ticks % _AXIS == 0:
             self._plots.move(picture.time)
         self._ticks += 1
@@ -137,8 +141,9 @@ class Viewer:
             self._ticks = 0  # at once
 
     def _tell(
-        self, picture: Picture, mains: Sequence[Line], worst: Sequence[Line], vehicles: Mapping[str, Sequence[Line]]
-    ) -> None:
+        self, picture: Picture, mains: Sequence[Line], worst: Sequence[Line], vehicles: Mapping[str, Sequence[Line]],
+        plotted: Address | None,
+    ) -> None:  # fmt: skip
         """Write the header, and sentences about the vehicles that are worst."""
         counted = Counter(line.condition for line in worst)
         counts = "".join(badge(name, counted[name]) for name in CONDITIONS if counted[name])
@@ -163,8 +168,8 @@ class Viewer:
         more = f'<div class="quiet">and {len(bad) - _WORST} more, in the table</div>' if len(bad) > _WORST else ""
         nothing = "every vehicle is well" if vehicles else "waiting for the first message"
         self._worst.text = "".join(told) + more or f'<div class="quiet">{nothing}</div>'
-        where = next((f"last at {line.where}" for line in picture.lines if line.address == self.chosen), "")
-        self._title.text = f'<b>{escape(str(self.chosen or ""))}</b> <span class="quiet">{escape(where)}</span>'
+        where = next((f"last at {line.where}" for line in picture.lines if line.address == plotted), "")
+        self._title.text = f'<b>{escape(str(plotted or ""))}</b> <span class="quiet">{escape(where)}</span>'
         self._note.text = f'<span class="quiet">{escape(_frame(self._fleet, mains))}</span>'
 
     def _lay_out(self, controls: Row | None, *hidden: LayoutDOM) -> LayoutDOM:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import zenoh
 
 from nedbus.client.closing import Finalizer
+from nedbus.client.receiving.layout_lookup import Schemas
 from nedbus.log_event import about
 from nedbus.transport import RawSample, Session, query, while_open
 from nedbus_msgs import ANY, Address, AddressError, address_of_rejected_key, rejected_key_expr, schema_key, status_key
@@ -23,6 +25,8 @@ _MAX_TEXT: Final = 300  # characters of a key that are logged, and of a reason t
 _MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
 _MAX_CONTENT: Final = 2**28  # bytes that the status of all services may take up, about: JSON is up to 32 times larger
 _MAX_LAYOUTS: Final = 32  # of an answer; there are five
+_TIMEOUT: Final = 2.0  # s for this question: a publisher that is busy is not in time for less
+_MAX_ANSWERS: Final = 100  # to the question for a message: of many publishers all know the same
 _CHANNEL: Final = 1000  # reports that wait; beyond, the oldest are dropped
 _MAX_REPORT: Final = 2**16  # bytes of a report that is read
 
@@ -44,18 +48,29 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict
     return [status for status in _parse(accepted) if isinstance(status, dict)]
 
 
-def find_layouts(session: Session, *, prefix: str) -> dict[int, Sequence[str]]:
-    """Ask publishers for the field names of all layouts, by number; of different answers for one the first counts."""
-    found: dict[int, Sequence[str]] = {}
-    for content in _parse(query(session, schema_key(prefix=prefix), timeout=0.5, newest=False)):
+def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
+    """Ask publishers for the fields of all layouts of these messages; of different answers for one the first counts."""
+    found: dict[str, dict[int, dict[str, str]]] = {}
+    keys = [schema_key(name, prefix=prefix) for name in messages]
+    read: Counter[str] = Counter()
+    for raw in query(session, *keys, timeout=_TIMEOUT, newest=False):
+        name = str(raw.key_expr).rpartition("/")[2]
+        read[name] += 1
+        content = next(_parse([raw]), None) if read[name] <= _MAX_ANSWERS else None
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
             match layout:
                 case {"wire": int(number), "fields": list(fields)}:
-                    named = [field.get("name") for field in fields if isinstance(field, dict)]
-                    names = [name for name in named if isinstance(name, str)]
-                    if len(set(names)) == len(fields) <= _MAX_FIELDS:
-                        found.setdefault(number, names)
+                    types = {
+                        field.get("name"): field.get("type")
+                        for field in fields[:_MAX_FIELDS]
+                        if isinstance(field, dict)
+                    }
+                    known = {
+                        field: kind for field, kind in types.items() if isinstance(field, str) and isinstance(kind, str)
+                    }
+                    if len(known) == len(fields):
+                        found.setdefault(name, {}).setdefault(number, known)
     return found
 
 

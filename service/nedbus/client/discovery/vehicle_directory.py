@@ -16,13 +16,15 @@ from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_e
 _log = logging.getLogger(__name__)
 
 _ASK_AGAIN: Final = 10.0  # s after an incomplete answer
-_CONFIRM: Final = 2.0  # s after the first complete one: Zenoh's can be empty on a busy host, and look complete
+_CONTRADICTED: Final = 0.2  # s after one that looks complete, and lacks what is known
 
 
 class VehicleDirectory:
     """Know the addresses that are published, from the first question on.
 
     Asking a router for all tokens costs everybody who shares it; following them costs nothing while nothing changes.
+    Zenoh 1.10 can leave out of an answer, on a busy host, any of the tokens that this session was told of before, and
+    it looks complete: so all tokens are followed from the first, and what is known has to be in an answer.
     At most 10,000 tokens are kept, whoever declares them; that there are more, or that the router was too slow to list
     them, is logged.
     """
@@ -34,7 +36,6 @@ class VehicleDirectory:
         self._asking = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by the key of the token
         self._next_ask = float("-inf")
-        self._confirmed = False
         self._changes: AliveChanges | None = None
 
     def vehicles(self, *, timeout: float) -> dict[str, list[Address]]:
@@ -51,20 +52,21 @@ class VehicleDirectory:
 
     def _ask(self, timeout: float) -> None:
         keys, complete = ask_alive_keys(self._session, self._key_expr, timeout=timeout)
+        pause = float("inf") if self._addresses.keys() <= set(keys) else _CONTRADICTED
+        self._next_ask = time.monotonic() + (pause if complete else _ASK_AGAIN)
         for key in keys:
             self._change(key, alive=True)
-        pause = _ASK_AGAIN if not complete else float("inf") if self._confirmed else _CONFIRM
-        self._next_ask, self._confirmed = time.monotonic() + pause, complete
         if not complete:
             text = "%s: not all liveliness tokens are known, after %d: some vehicles are missing"
             _log.warning(text, self._key_expr, len(keys), extra=about("incomplete"))
 
     def _take(self, changes: AliveChanges) -> None:
-        for key, alive in changes.take():
-            self._change(key, alive=alive)
+        taken = changes.take()
         if changes.missed:
             self._addresses.clear()
-            self._next_ask, self._confirmed = float("-inf"), False
+            self._next_ask = float("-inf")
+        for key, alive in taken:
+            self._change(key, alive=alive)
 
     def _change(self, key: str, *, alive: bool) -> None:
         if not alive:

@@ -15,7 +15,7 @@ from operator import attrgetter, itemgetter
 from typing import Final, cast
 
 from nedbus.client.sample import Sample
-from nedbus_msgs import DOUBT_FLAGS, RESET_COUNTERS, TOPICS, Address, Message, Quantity
+from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
 
 from .histogram import Histogram
 
@@ -30,6 +30,7 @@ _COUNTER: Final = 256  # where reset counters wrap
 _LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, limits of the histogram
 _MAX_STREAMS: Final = 4096  # that a monitor follows
 _NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # what is looked at
+_UNSEEN: Final = (0,) * (len(_NAMES) - 1)
 _of_message: Callable[[object], tuple[int, ...]] = attrgetter(*_NAMES)
 _of_fields: Callable[[Mapping[str, object]], tuple[int, ...]] = itemgetter(*_NAMES)
 
@@ -42,9 +43,11 @@ class Health:
     (median) and `latency_max` [s], and `flags`, the share of the messages with each flag set, 0 to 1.
     Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's own time of more than three usual ones),
     `out_of_order`, `reboots` (that time went back by more than 1 s), `resets` of each quantity, and `flags_ever`.
-    `nominal`: the rate that PX4 has for this topic [Hz]; logs and links have less.
+    `nominal`: the rate that PX4 has for this topic [Hz], 0 if it has none; logs and links have less.
     `age`: seconds since the last message.
     `usual_rate`: the rate that this stream has had so far [Hz]; `rate` is far below it when a stream becomes slow.
+    `on_change`: messages come whenever something changes: neither pauses nor bursts say anything.
+    `resets` is empty, and flags are None, for other messages than positions.
     """
 
     rate: float | None
@@ -62,10 +65,13 @@ class Health:
     flags_ever: dict[str, float] | None
     usual_rate: float | None = None
     resets: dict[Quantity, int] = field(default_factory=dict)
+    on_change: bool = False
 
     @property
     def stale_after(self) -> float:
         """Seconds without a message after which this stream is stale: 3, or more where it is slow by nature."""
+        if self.on_change:
+            return max(_STALE, 2 / self.nominal) if self.nominal else math.inf
         return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
 
 
@@ -96,7 +102,8 @@ class StreamHealth:
     """
 
     def __init__(self, topic: str) -> None:
-        self._nominal = TOPICS[topic].rate
+        self._topic = get_topic(topic)
+        self._is_position = BY_TOPIC.get(topic) is DEFAULT  # the message that has flags and reset counters
         self._messages = self._lost = self._gaps = self._disorders = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
@@ -105,7 +112,7 @@ class StreamHealth:
         self._steps = 0
         self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
         self._counters: tuple[int, ...] = ()
-        self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS, 0)
+        self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
         self.latencies = Histogram(_LATENCIES)
         self._window = self._last_window = _Window(0)
 
@@ -113,7 +120,7 @@ class StreamHealth:
         self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
     ) -> None:
         """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
-        timestamp, *seen = _look(message)
+        timestamp, *seen = _look(message) if self._is_position else (_time_of(message), *_UNSEEN)
         if received - self._window.start >= _WINDOW:
             self._end_window(received)
         window = self._window
@@ -146,7 +153,7 @@ class StreamHealth:
         is_live = window.intervals and window.mean > 0 and age is not None and age < max(_STALE, 2 * window.mean)
         return Health(
             rate=1 / window.mean if is_live else None,
-            nominal=self._nominal,
+            nominal=self._topic.rate,
             jitter=math.sqrt(window.spread / window.intervals) if is_live else None,
             latency=latencies[len(latencies) // 2] if latencies else None,
             latency_max=latencies[-1] if latencies else None,
@@ -156,10 +163,11 @@ class StreamHealth:
             gaps=self._gaps,
             out_of_order=self._disorders,
             reboots=self._reboots,
-            flags=_shares(window.flags, window.messages),
-            flags_ever=_shares(self._ever, self._messages),
+            flags=_shares(window.flags, window.messages) if self._is_position else None,
+            flags_ever=_shares(self._ever, self._messages) if self._is_position else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
+            on_change=self._topic.on_change,
         )
 
     def _end_window(self, received: int) -> None:
@@ -184,7 +192,7 @@ class StreamHealth:
             return False
         self._time = timestamp
         if self._steps >= _SETTLED and step > _GAP * self._usual:
-            self._gaps += 1
+            self._gaps += not self._topic.on_change
         else:
             self._steps += 1
             self._usual += max(_WEIGHT, 1 / self._steps) * (step - self._usual)
@@ -227,6 +235,10 @@ class Monitor:
     def forget(self, address: Address) -> None:
         """Forget a stream; it is followed anew if it comes back."""
         self._streams.pop(address, None)
+
+
+def _time_of(message: Message | Mapping[str, object]) -> int:
+    return cast("int", message.get("timestamp", 0)) if isinstance(message, Mapping) else message.timestamp
 
 
 def _look(message: Message | Mapping[str, object]) -> tuple[int, ...]:

@@ -48,8 +48,9 @@ def stream_state(health: Health, *, alive: bool | None = None, connected: bool =
     if age is not None and age > health.stale_after:
         return StreamState("stale", f"nothing for {to_age(age)}")
     reasons = []
-    if health.rate is not None and health.usual_rate is not None and health.rate < _SLOW * health.usual_rate:
-        reasons.append(f"{health.rate:.1f} Hz, usually {health.usual_rate:.0f}")
+    usual = None if health.on_change else health.usual_rate
+    if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
+        reasons.append(f"{health.rate:.1f} Hz, usually {usual:.0f}")
     if health.latency is not None and health.latency > _LATE:
         reasons.append(f"{to_age(health.latency)} late, or clocks differ")
     return StreamState("slow", ", ".join(reasons)) if reasons else StreamState("ok")

@@ -14,10 +14,10 @@ from typing import Final
 
 import zenoh
 
-from nedbus.client.qos import RATES, TOPIC_QOS
+from nedbus.client.qos import RATES, priority_of
 from nedbus.client.rate_gate import RateGate
 from nedbus.transport import Session, while_open
-from nedbus_msgs import ANY, Address
+from nedbus_msgs import ANY, Address, get_topic
 
 from .heartbeats import Heartbeats
 from .writer import Writer
@@ -61,7 +61,7 @@ class Downsampler:
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
         self.vehicle, self._heartbeats = vehicle, heartbeats
         self._key = partial(address.rate_key, prefix=prefix)
-        self._priority = TOPIC_QOS[address.topic].priority
+        self._priority = priority_of(get_topic(address.topic))
         self._any_rate: MatchingListener | None = None
         self._streams: list[_Stream] = []
 

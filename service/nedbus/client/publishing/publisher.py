@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 import zenoh
 
-from nedbus.client.qos import TOPIC_QOS
+from nedbus.client.qos import priority_of
 from nedbus.errors import NedbusError
 from nedbus.transport import require_unforked, translate_error, while_open
-from nedbus_msgs import (
-    FIELD_TYPES,
-    PAYLOAD_SIZE,
-    Address,
-    Provenance,
-    Row,
-    VehicleLocalPosition,
-    encode,
-    encode_fields,
-    encode_row,
-    encoding_of,
-)
+from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, encoding_of, get_topic
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import KEPT, FlowControl, SharedWindow
@@ -33,7 +22,6 @@ if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
 
 FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
-_ALL: Final = frozenset(FIELD_TYPES)
 
 
 class Publisher:
@@ -48,6 +36,7 @@ class Publisher:
     def __init__(
         self,
         address: Address,
+        definition: Definition[Any],
         *,
         prefix: str,
         lossless: bool,
@@ -68,13 +57,16 @@ class Publisher:
         self._new_timestamp = session.new_timestamp
         self._on_close = on_close
         self._owner = owner  # the bus stays open for as long as a script may publish
-        self._encoding = encoding_of(source)
-        self._partial: tuple[Set[str], str] = _ALL, self._encoding  # the fields of messages, and their encoding
-        qos = TOPIC_QOS[address.topic]
+        self.definition = definition
+        self._codec = codec_of(definition)
+        self._all = definition.all_fields
+        self._encoding = encoding_of(definition, source)
+        self._partial: tuple[Set[str], str] = self._all, self._encoding  # the fields of messages, and their encoding
+        topic = get_topic(address.topic)
         with while_open():
             self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
-        cache = KEPT if lossless else qos.cache
-        self._writer = Writer(heartbeats, self.key, priority=qos.priority, cache=cache, encoding=self._encoding)
+        cache = KEPT if lossless else topic.kept
+        self._writer = Writer(heartbeats, self.key, priority=priority_of(topic), cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, window, needs_router=needs_router)
         self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=downsampled)
 
@@ -83,7 +75,7 @@ class Publisher:
         """How many messages it has published."""
         return self._writer.published
 
-    def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
+    def publish(self, message: Message | Mapping[str, object]) -> None:
         """Validate a message, or the fields of one by name, and publish it.
 
         A message that exists was validated when it was made; it is not validated again.
@@ -92,17 +84,19 @@ class Publisher:
         Raises InvalidMessageError for invalid fields, EncodeError for a message whose validation was bypassed,
         ClosedError once the publisher or its bus is closed.
         """
-        if isinstance(message, VehicleLocalPosition):
-            self._put(encode(message), message.__pydantic_fields_set__)
+        if isinstance(message, Message):
+            if not isinstance(message, self.definition.model):
+                raise TypeError(f"{self.address} carries {self.definition.name}, not {type(message).__name__}")
+            self._put(self._codec.encode(message), message.__pydantic_fields_set__)
         else:
-            self._put(encode_fields(message), message.keys())
+            self._put(self._codec.encode_fields(message), message.keys())
 
-    def publish_row(self, values: Sequence[object] | Row) -> None:
+    def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and publish them.
 
         The same as `publish` with these fields, and faster: no message is made of them.
         """
-        self._put(encode_row(values), _ALL)
+        self._put(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
 
     def publish_many(self, messages: MessageArray) -> None:
         """Validate all messages in a structured array of shape (n,) and dtype DTYPE, then publish them in order.
@@ -112,14 +106,15 @@ class Publisher:
         Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`,
         ClosedError once the publisher or its bus is closed.
         """
-        from nedbus_msgs.arrays import DTYPE, encode_array, require_valid
+        from nedbus_msgs.arrays import arrays_of
 
-        if messages.dtype != DTYPE:
-            raise TypeError("the array must have the dtype nedbus.DTYPE: convert it with astype")
-        require_valid(messages)
-        payloads = encode_array(messages)
-        for start in range(0, len(payloads), PAYLOAD_SIZE):
-            self._put(payloads[start : start + PAYLOAD_SIZE], _ALL)
+        arrays, size = arrays_of(self.definition), self._codec.size
+        if messages.dtype != arrays.dtype:
+            raise TypeError(f"the array must have the dtype of {self.definition.name}: convert it with astype")
+        arrays.require_valid(messages)
+        payloads = arrays.encode(messages)
+        for start in range(0, len(payloads), size):
+            self._put(payloads[start : start + size], self._all)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
         """Wait until all readers of mode "every" have what was published; return False if one has not in time.
@@ -156,10 +151,10 @@ class Publisher:
     def _put(self, payload: bytes, provided: Set[str]) -> None:
         """Put the payload of a message that was made with these fields."""
         require_unforked()
-        encoding, is_whole = self._encoding, len(provided) == len(_ALL)
+        encoding, is_whole = self._encoding, len(provided) == len(self._all)
         if not is_whole:
             if provided != self._partial[0]:  # almost always the same fields are missing
-                self._partial = frozenset(provided), encoding_of(self.source, frozenset(provided))
+                self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
         try:
             stamp = self._new_timestamp()

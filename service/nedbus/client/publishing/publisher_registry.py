@@ -7,7 +7,8 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from typing import Final, cast
+from functools import partial
+from typing import Any, Final, cast
 
 import zenoh
 from pydantic_core import to_json
@@ -17,7 +18,7 @@ from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
 from nedbus.log_event import about
 from nedbus.transport import Session, alive_keys, while_open
-from nedbus_msgs import ANY, Address, Selection, json_schema, layout_table, schema_key
+from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Selection, schema_key, schema_of
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
@@ -47,6 +48,7 @@ class PublisherRegistry:
         self._heartbeats = Heartbeats(session)
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
+        self._described: set[str] = set()  # names of messages whose schema is answered
         self._downsampled: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
         self._window = SharedWindow()
         self._lock = threading.Lock()
@@ -57,9 +59,21 @@ class PublisherRegistry:
         return list(self._publishers.values())
 
     def publisher(
-        self, address: Address, *, lossless: bool = False, source: str | None = None, owner: object = None
+        self,
+        address: Address,
+        definition: Definition[Any] | None = None,
+        *,
+        lossless: bool = False,
+        source: str | None = None,
+        owner: object = None,
     ) -> Publisher:
-        """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one."""
+        """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one.
+
+        `definition` is needed for a topic whose message has no file: AddressError without.
+        """
+        definition = definition or BY_TOPIC.get(address.topic)
+        if definition is None:
+            raise AddressError("topic", address.topic, "one whose message has a file, or a definition of its message")
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
@@ -69,6 +83,7 @@ class PublisherRegistry:
                 self._downsampled[vehicle] = MatchingListener(self._session, key_expr)
             publisher = Publisher(
                 address,
+                definition,
                 prefix=self.prefix,
                 lossless=lossless,
                 source=source,
@@ -80,8 +95,12 @@ class PublisherRegistry:
                 owner=owner,
             )
             self._publishers[address] = publisher
+            if definition.name not in self._described:
+                self._described.add(definition.name)
+                self._queries.answer_json(
+                    schema_key(definition.name, prefix=self.prefix), partial(schema_of, definition)
+                )
             if not self._vehicles:
-                self._queries.answer_json(schema_key(prefix=self.prefix), _schema)
                 self._housekeeping.add(self._heartbeats.send_due)
             if vehicle not in self._vehicles:
                 self._vehicles.add(vehicle)
@@ -143,7 +162,3 @@ def _weakly(last_messages: Callable[[str, zenoh.Query], Iterable[Answer]], vehic
     """Return an answer that does not keep the registry, its publishers and their bus alive."""
     method = weakref.WeakMethod(last_messages)
     return lambda query: alive(vehicle, query) if (alive := method()) is not None else ()
-
-
-def _schema() -> Mapping[str, object]:
-    return {"json_schema": json_schema(), "layouts": layout_table()}

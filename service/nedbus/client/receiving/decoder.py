@@ -5,16 +5,29 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
-from nedbus.client.sample import M_co, Sample
+from nedbus.client.sample import Sample
 from nedbus.log_event import about
 from nedbus.transport import RawSample
-from nedbus_msgs import PAYLOAD_LIMIT, PAYLOAD_SIZE, Address, AddressError, DecodeError, Provenance, provenance_of
+from nedbus_msgs import (
+    BY_TOPIC,
+    PAYLOAD_LIMIT,
+    Address,
+    AddressError,
+    Codec,
+    DecodeError,
+    Provenance,
+    UnknownLayoutError,
+    codec_of,
+    message_name_of,
+    provenance_of,
+)
 
 from .layout_lookup import LayoutLookup
 
@@ -25,7 +38,6 @@ _log = logging.getLogger(__name__)
 
 MAX_KEYS: Final = 10_000  # that a reader remembers; no peer can make it remember more
 WAKE_UP: Final = "nedbus/wake-up"  # encoding of what a session sends to itself so that its reader looks again
-Decode = Callable[..., M_co]  # `nedbus_msgs.decode` or `decode_row`: a payload, and `newer` layouts, to a message
 _MAX_WARNED: Final = 100  # keys whose invalid messages are logged
 _MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
 
@@ -35,6 +47,7 @@ class Stream:
     """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
 
     `key`: that of the whole stream. `heard`: that on which messages come. `thinned`: these are those of a thinned copy.
+    `codec`: that of its messages, None while it is not known what a `message` is; `size`: bytes of a payload of ours.
     `writers`: its publishers, by name; `writer` is that of the last message.
     `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
     dropped or invalid; they are reported with the next sample that is read.
@@ -44,11 +57,18 @@ class Stream:
     heard: str
     address: Address
     thinned: bool = False
+    codec: Codec[Any] | None = None
+    size: int = -1
+    message: str = ""
     last: tuple[zenoh.Encoding | None, Provenance] = None, Provenance()  # in one piece: two threads look and change it
     writers: dict[str, WriterProxy] = field(default_factory=dict)
     writer: WriterProxy | None = None
     gap: int = 0
     unreported: int = 0
+
+    def carry(self, codec: Codec[Any]) -> None:
+        """Take note of which messages these are."""
+        self.codec, self.size = codec, codec.size
 
 
 class Kept(NamedTuple):
@@ -80,9 +100,20 @@ class Decoder:
             thinned = "/@" in key  # only who asks for thinned streams gets such keys
             address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
             stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
+            if address.topic in BY_TOPIC:
+                stream.carry(codec_of(BY_TOPIC[address.topic]))
             if len(self._streams) < MAX_KEYS:
                 self._streams[key] = stream
         return stream
+
+    def learn(self, batch: Iterable[RawSample]) -> None:
+        """Ask for what is not known of these, and wait for the answer: for a thread on which nothing arrives."""
+        for raw in batch:
+            with suppress(AddressError, DecodeError):
+                stream, payload = self.stream(str(raw.key_expr)), raw.payload.to_bytes()
+                if len(payload) != stream.size:
+                    self._inspect(stream, payload, raw)
+        self._layouts.wait()
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
         """Return what is worth queueing, with no losses so far; what is rejected, without its payload, for its number.
@@ -96,13 +127,13 @@ class Decoder:
             key = str(raw.key_expr)
             stream = known(key)
             payload = raw.payload.to_bytes()
-            if stream is None or len(payload) != PAYLOAD_SIZE:
+            if stream is None or len(payload) != stream.size:
                 if raw.encoding == WAKE_UP:
                     continue
                 try:
                     stream = stream or self.stream(key)
-                    if len(payload) != PAYLOAD_SIZE:
-                        self._inspect(payload, raw.kind)
+                    if len(payload) != stream.size:
+                        self._inspect(stream, payload, raw)
                 except (AddressError, DecodeError) as exc:
                     self.reject(key, exc)
                     if stream is None:
@@ -127,20 +158,45 @@ class Decoder:
             return raw.provenance
         encoding = raw.encoding
         known, provenance = stream.last
-        if encoding != known:  # almost always it is the same: comparing is all that it costs
-            provenance = provenance_of(str(encoding))
+        if encoding != known and stream.codec:  # almost always it is the same: comparing is all that it costs
+            provenance = provenance_of(stream.codec.definition, str(encoding))
             stream.last = encoding, provenance
         return provenance
 
-    def decode(self, arrival: Arrival, decode: Decode[M_co], *, lost: int = 0) -> Sample[M_co] | None:
-        """Return the sample of what arrived, None if it is invalid."""
+    def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
+        """Return the sample of what arrived, with a Row as its message if `rows`; None if it is invalid."""
         stream, payload, raw, _ = arrival
-        try:
-            message = decode(payload, newer=self._layouts.newer)
-        except DecodeError as exc:
-            self.reject(stream.key, exc)
+        codec = stream.codec or self.resolve(stream)
+        if codec is None or not payload:
+            if payload:
+                self.reject(stream.key, DecodeError("no publisher has said what it is", stream.message))
             return None
+        try:
+            message = codec.decode_row(payload) if rows else codec.decode(payload)
+        except DecodeError as exc:
+            newer = self._layouts.newer(codec.definition)
+            if not (isinstance(exc, UnknownLayoutError) and exc.layout in newer):
+                self.reject(stream.key, exc)
+                return None
+            try:
+                message = (codec.decode_row if rows else codec.decode)(payload, newer=newer)
+            except DecodeError as again:
+                self.reject(stream.key, again)
+                return None
         return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
+
+    def resolve(self, stream: Stream) -> Codec[Any] | None:
+        """Return the codec of a stream whose message has no file here, None if nobody says what it is.
+
+        A script that reads waits for an answer that is on its way, once; whoever receives does not.
+        """
+        if stream.codec is None and stream.message:
+            for _ in range(2):
+                with suppress(DecodeError):
+                    stream.carry(codec_of(self._layouts.definition(stream.message)))
+                    break
+                self._layouts.wait()
+        return stream.codec
 
     def count_invalid(self, count: int) -> None:
         """Count invalid samples."""
@@ -160,9 +216,16 @@ class Decoder:
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
-    def _inspect(self, payload: bytes, kind: zenoh.SampleKind) -> None:
+    def _inspect(self, stream: Stream, payload: bytes, raw: RawSample) -> None:
         if len(payload) > PAYLOAD_LIMIT:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
-        if kind == zenoh.SampleKind.DELETE:
+        if raw.kind == zenoh.SampleKind.DELETE:
             raise DecodeError("a delete, which no publisher of nedbus sends")
-        self._layouts.check(payload)
+        if stream.codec is None:
+            stream.message = message_name_of(str(raw.encoding)) or ""
+            if not stream.message:
+                raise DecodeError(f"nothing says which message it is: its encoding is {str(raw.encoding)!r:.100}")
+            with suppress(DecodeError):  # it is decoded when it is read: by then it may be known
+                stream.carry(codec_of(self._layouts.definition(stream.message)))
+        if len(payload) != stream.size and stream.codec:
+            self._layouts.check(stream.codec, payload)

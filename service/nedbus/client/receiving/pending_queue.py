@@ -12,15 +12,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
-from nedbus.client.sample import Counts, M_co, Mode, Sample
+from nedbus.client.sample import Counts, Mode, Sample
 from nedbus.log_event import about
 from nedbus.transport import RawSample
 from nedbus_msgs import AddressError
 
 from .acknowledgements import Acknowledgements, AckRequest
-from .decoder import MAX_KEYS, Arrival, Decode, Decoder
+from .decoder import MAX_KEYS, Arrival, Decoder
 from .stateful_reader import StatefulReader
 from .writer_proxy import WriterProxy
 
@@ -71,6 +71,7 @@ class PendingQueue:
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
+        self._groups: deque[list[Arrival]] = deque()  # of batches that were taken, and not returned yet
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, thinned=thinned, clock=clock)
         self._acknowledgements = Acknowledgements(self._reader)
         self._arrived = self._dropped = self._received = 0
@@ -86,7 +87,7 @@ class PendingQueue:
     @property
     def waiting(self) -> int:
         """How many messages wait to be read."""
-        return len(self._every) or len(self._newest)
+        return sum(map(len, self._groups)) + (len(self._every) or len(self._newest))
 
     @property
     def held(self) -> int:
@@ -206,7 +207,7 @@ class PendingQueue:
             self.wake()  # another thread that waits: of all that is put at once only one is woken
         return True
 
-    def pop(self, decode: Decode[M_co]) -> Sample[M_co] | None:
+    def pop(self, *, rows: bool) -> Sample[Any] | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take
@@ -221,7 +222,7 @@ class PendingQueue:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._acknowledgements.pending:
                 self.acknowledge(drained=False)
-            sample = self._decoder.decode(arrival, decode, lost=lost)
+            sample = self._decoder.decode(arrival, rows=rows, lost=lost)
             if sample is not None:
                 self._received += 1
                 return sample
@@ -229,14 +230,17 @@ class PendingQueue:
 
     def pop_batch(self) -> Batch | None:
         """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
-        from nedbus.client.batch import make_batch
+        from nedbus.client.batch import by_message, make_batch
 
         with self._lock:
-            if self.newest_only:
-                taken = list(self._newest.values())
-                self._newest.clear()
-            else:
-                taken = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
+            if not self._groups:
+                if self.newest_only:
+                    arrived = list(self._newest.values())
+                    self._newest.clear()
+                else:
+                    arrived = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
+                self._groups.extend(by_message(arrived, self._decoder))
+            taken = self._groups.popleft() if self._groups else []
             lost = sum(lost for _, _, _, lost in taken)
             for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
                 lost, stream.unreported = lost + stream.unreported, 0

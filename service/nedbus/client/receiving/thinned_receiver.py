@@ -13,7 +13,7 @@ from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import LIVE
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import AliveChanges, Session, ask, ask_alive, follow_heartbeats, while_open
+from nedbus.transport import AliveChanges, Answers, Session, ask, ask_alive, follow_heartbeats, while_open
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key
 
 from .receiver import Receiver, take_all
@@ -38,7 +38,7 @@ class ThinnedReceiver(Receiver):
         self._key_expr = selection.key_expr(prefix=prefix)
         self._alive_key = selection.alive_key_expr(prefix=prefix)
         self._changes = AliveChanges(session, self._alive_key)
-        self._tokens = ask_alive(session, self._alive_key, timeout=_TIMEOUT)
+        self._tokens: Answers | None = None  # all, if more changed than are kept
         self._last = ask(session, self._key_expr, timeout=_TIMEOUT)  # as what is thinned begins with the next message
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
         super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, thinned=True)
@@ -58,9 +58,10 @@ class ThinnedReceiver(Receiver):
             self._thinned_queue.put_last(live)
 
     def _follow_tokens(self, now: float) -> None:
-        if self._changes.missed and self._tokens.ended:
+        if self._changes.missed and (self._tokens is None or self._tokens.ended):
             self._tokens = ask_alive(self._session, self._alive_key, timeout=_TIMEOUT)
-        known = [(str(reply.ok.key_expr), True) for reply in self._tokens.take() if reply.ok is not None]
+        answers = [] if self._tokens is None else self._tokens.take()
+        known = [(str(reply.ok.key_expr), True) for reply in answers if reply.ok is not None]
         for token, alive in known + self._changes.take():
             with suppress(AddressError):  # not one of nedbus
                 key = address_of_alive_key(token, prefix=self._prefix).key(prefix=self._prefix)

@@ -1,25 +1,21 @@
-"""The message: PX4's VehicleLocalPosition as one validated, immutable Pydantic model.
+"""VehicleLocalPosition: where a vehicle is, how fast it moves, and how well that is known.
 
 Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Set
-from typing import TYPE_CHECKING, ClassVar, Final, Self, cast
+from typing import ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import Field
 
-from .equivalents import to_python
-from .fast_path import passes_rules, validate_fields
-from .float32 import float32_overflows, name_rounded
-from .px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
-from .rows import NAMES, TEMPLATE, Row, Values, values_of
-from .rules import violations
+from nedbus_msgs.declaration import Topic, older
+from nedbus_msgs.message import Message
+from nedbus_msgs.px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
+from nedbus_msgs.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
 
 
-class VehicleLocalPosition(BaseModel):
+class VehicleLocalPosition(Message):
     """One local position estimate of one vehicle, in PX4's current layout (1.16 to main).
 
     Frame: local NED, metres, radians, seconds; z points down.
@@ -33,12 +29,65 @@ class VehicleLocalPosition(BaseModel):
     Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
     """
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings")
+    TOPICS: ClassVar = (
+        Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
+        Topic("vehicle_local_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
+        Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)", cache=2000),
+        Topic("estimator_local_position", 2.0, "each EKF instance, when several run", instances=True),
+    )
+    LAYOUTS: ClassVar = {
+        "1.13": """
+            timestamp timestamp_sample xy_valid z_valid v_xy_valid v_z_valid x y z delta_xy xy_reset_counter delta_z
+            z_reset_counter vx vy vz z_deriv delta_vxy vxy_reset_counter delta_vz vz_reset_counter ax ay az heading
+            delta_heading heading_reset_counter heading_good_for_control xy_global z_global ref_timestamp ref_lat
+            ref_lon ref_alt dist_bottom dist_bottom_valid dist_bottom_sensor_bitfield eph epv evh evv vxy_max vz_max
+            hagl_min hagl_max""",
+        "1.14": "1.13, evv: dead_reckoning",
+        "1.15": "1.14, heading: heading_var unaided_heading, heading_good_for_control: tilt_var",
+        "V0": """
+            timestamp timestamp_sample xy_valid z_valid v_xy_valid v_z_valid x y z delta_xy xy_reset_counter delta_z
+            z_reset_counter vx vy vz z_deriv delta_vxy vxy_reset_counter delta_vz vz_reset_counter ax ay az heading
+            heading_var unaided_heading delta_heading heading_reset_counter heading_good_for_control tilt_var
+            xy_global z_global ref_timestamp ref_lat ref_lon ref_alt dist_bottom_valid dist_bottom dist_bottom_var
+            delta_dist_bottom dist_bottom_reset_counter dist_bottom_sensor_bitfield eph epv evh evv dead_reckoning
+            vxy_max vz_max hagl_min hagl_max""",
+        "1.16": "*",
+    }  # fmt: skip
+    WIRE: ClassVar = {0: "V0", 1: "1.16"}
+    ALWAYS: ClassVar = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
+    ALIASES: ClassVar = {  # the types of PX4's translation node
+        "V0": ("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0"),
+    }
+    OLDER: ClassVar = {
+        # As in PX4's own translation:
+        "hagl_max": older(("hagl_max_z", "hagl_max_xy"), doc="Greatest height above ground [m]"),
+        # Up to 1.11:
+        "yaw": older("heading"),
+        "delta_yaw": older("delta_heading"),
+        "yaw_reset_counter": older("heading_reset_counter"),
+    }
+    RULES: ClassVar = (
+        FiniteWhile({
+            "xy_valid": ("x", "y"),
+            "z_valid": ("z",),
+            "v_xy_valid": ("vx", "vy"),
+            "v_z_valid": ("vz",),
+            "heading_good_for_control": ("heading",),
+            "xy_global": ("ref_lat", "ref_lon"),
+            "z_global": ("ref_alt",),
+            "dist_bottom_valid": ("dist_bottom",),
+        }),
+        NotNegative("heading_var", "tilt_var", "dist_bottom_var", "eph", "epv", "evh", "evv"),
+        Within("heading", FLOAT32_PI),
+        Within("ref_lat", 90.0),
+        Within("ref_lon", 180.0),
+        NotLater("timestamp_sample", "timestamp"),
+    )  # fmt: skip
 
-    MESSAGE_VERSION: ClassVar[int] = 1
-    DIST_BOTTOM_SENSOR_NONE: ClassVar[int] = 0
-    DIST_BOTTOM_SENSOR_RANGE: ClassVar[int] = 1
-    DIST_BOTTOM_SENSOR_FLOW: ClassVar[int] = 2
+    MESSAGE_VERSION: ClassVar = 1
+    DIST_BOTTOM_SENSOR_NONE: ClassVar = 0
+    DIST_BOTTOM_SENSOR_RANGE: ClassVar = 1
+    DIST_BOTTOM_SENSOR_FLOW: ClassVar = 2
 
     timestamp: Uint64 = Field(description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)")
     timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this estimate [us], <= timestamp")
@@ -105,104 +154,3 @@ class VehicleLocalPosition(BaseModel):
     hagl_min: Float32 = Field(NAN, description="Least height above ground [m]; none: infinity (0 in ground truth)")
     hagl_max_z: Float32 = Field(NAN, description="Greatest height above ground for z control [m]; none: infinity")
     hagl_max_xy: Float32 = Field(NAN, description="Greatest height above ground for xy control [m]; none: infinity")
-
-    if not TYPE_CHECKING:
-
-        def __init__(self, /, **fields: object) -> None:
-            # A subclass may have validators of its own, which only Pydantic knows.
-            values = validate_fields(fields) if type(self) is VehicleLocalPosition else None
-            if values is None:
-                super().__init__(**fields)
-            else:
-                _fill(self, values, _ALL if len(fields) == len(NAMES) else frozenset(fields))
-
-        # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
-        __init__.__pydantic_base_init__ = True
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Validate, and where that fails once more with what NumPy and JSON have in place of Python's values."""
-        try:
-            return validate(fields)
-        except ValidationError:
-            if not isinstance(fields, dict):
-                raise
-            converted = to_python(fields)
-            if all(converted[name] is value for name, value in fields.items()):
-                raise
-        return validate(converted)
-
-    @model_validator(mode="after")
-    def _round_and_check(self) -> Self:
-        """Round float32 fields to float32, then check the rules between fields."""
-        values = self.__dict__
-        row = values_of(values)
-        try:
-            values.update(name_rounded(row))
-        except OverflowError:
-            raise _validation_error(values, float32_overflows(values)) from None
-        if not passes_rules(row):
-            broken = list(violations(values))
-            if broken:
-                raise _validation_error(values, broken)
-        return self
-
-    def __eq__(self, other: object) -> bool:
-        """Compare all fields; NaN equals NaN."""
-        if not isinstance(other, VehicleLocalPosition):
-            return NotImplemented
-        return all(_is_same(value, other.__dict__[name]) for name, value in self.__dict__.items())
-
-    def __hash__(self) -> int:
-        return hash((self.timestamp, self.timestamp_sample))
-
-    def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
-        """Return a copy; unlike Pydantic's own, one with updates is validated."""
-        if not update:
-            return super().model_copy(deep=deep)
-        given = {name: self.__dict__[name] for name in self.model_fields_set}
-        return type(self).model_validate({**given, **update})
-
-
-Message = VehicleLocalPosition | Row
-"""A message, as a model or as a named tuple: what functions accept that only read its fields."""
-
-
-def _is_same(one: object, other: object) -> bool:
-    if isinstance(one, tuple) and isinstance(other, tuple):
-        return all(map(_is_same, one, other))
-    return one == other or (repr(one) == repr(other) == "nan")
-
-
-def _validation_error(values: Mapping[str, object], broken: Iterable[tuple[str, str]]) -> ValidationError:
-    """Build an error with an entry for each field, like Pydantic's own."""
-    details: list[InitErrorDetails] = [
-        {"type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}), "loc": (name,), "input": values[name]}
-        for name, reason in broken
-    ]
-    return ValidationError.from_exception_data("VehicleLocalPosition", details)
-
-
-def message_of(row: Values) -> VehicleLocalPosition:
-    """Return the message of a row that is valid and rounded to float32, without validating it again."""
-    message = VehicleLocalPosition.__new__(VehicleLocalPosition)
-    values = TEMPLATE.copy()
-    values.update(zip(NAMES, row, strict=True))
-    _fill(message, values, _ALL)
-    return message
-
-
-def _fill(message: VehicleLocalPosition, values: dict[str, object], given: Set[str]) -> None:
-    _set_dict(message, values)
-    _set_fields_set(message, given)
-    _set_extra(message, None)
-    _set_private(message, None)
-
-
-# What Pydantic's own validator sets on an instance (2.12 to 2.x); the model is frozen, so this sets its slots.
-_ALL: Final = frozenset(NAMES)
-_set_dict, _set_fields_set, _set_extra, _set_private = (
-    cast("Callable[[VehicleLocalPosition, object], None]", vars(BaseModel)[slot].__set__)
-    for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")
-)

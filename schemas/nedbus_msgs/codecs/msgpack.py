@@ -1,0 +1,232 @@
+"""The msgpack codec: one array `[layout, field 1 ... field n]`, every field at its full width.
+
+So a payload is both plain msgpack and a fixed-size struct: 244 bytes of a VehicleLocalPosition.
+Any other valid msgpack encoding of the array is decoded as well.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, Generic, cast
+
+import msgpack
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from nedbus_msgs.definition import Definition, M
+from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
+from nedbus_msgs.layouts import upgrade_with
+from nedbus_msgs.message import fill
+from nedbus_msgs.px4_types import BASES, FieldType
+from nedbus_msgs.rules import evaluated
+from nedbus_msgs.validation import Values
+
+PAYLOAD_LIMIT: Final = 4096
+"""Bytes of the largest payload that is decoded, and of the largest message that can be carried."""
+
+Newer = Mapping[int, Sequence[str]]
+"""Field names of layouts that this version does not know, by their number on the wire."""
+
+
+def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
+    """Return the tags of a type with zeros for its values, the struct format of both, and the mask of its values.
+
+    A bool is only a tag, 0xc2 or 0xc3: its last bit is the value.
+    """
+    base = BASES[kind.base]
+    if kind.base == "bool":
+        one = bytes([base.tag]), "?", b"\x01"
+    else:
+        one = bytes([base.tag]) + bytes(kind.size), "x" + base.code, b"\x00" + b"\xff" * kind.size
+    if kind.length is None:
+        return one
+    head = bytes([0x90 | kind.length]) if kind.length < 16 else b"\xdc" + kind.length.to_bytes(2, "big")
+    tags, form, bits = one
+    return head + tags * kind.length, f"{len(head)}x" + form * kind.length, bytes(len(head)) + bits * kind.length
+
+
+@dataclass(frozen=True, slots=True)
+class Codec(Generic[M]):
+    """The codec of one message.
+
+    `size`: bytes of every payload that is encoded here.
+    `tags`: a payload with zeros for its values, as a number; `tag_mask`: its bits that are no values.
+    `offsets`: name, element and offset of every value in a payload.
+
+    `encode(message)`: return the payload of a message; floats are float32 where PX4 has one.
+    Raises EncodeError for values that do not fit their fields, in a message whose validation was bypassed.
+    `encode_fields(fields)`: return the payload of a message with these fields, validated without a model.
+    Raises InvalidMessageError for an invalid message.
+    `encode_row(values)`: the same with the values of all fields in their order.
+    Raises EncodeError for another number of values as well.
+    `decode(payload, newer=...)`: return the message of a payload, validated.
+    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
+    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
+    `decode_row(payload, newer=...)`: the same as a Row, a named tuple.
+    """
+
+    definition: Definition[M]
+    size: int
+    tags: int
+    tag_mask: int
+    offsets: tuple[tuple[str, int, int], ...]
+    encode: Callable[[M], bytes]
+    encode_fields: Callable[[Mapping[str, object]], bytes]
+    encode_row: Callable[[Sequence[object]], bytes]
+    decode: Callable[..., M]
+    decode_row: Callable[..., M]
+
+
+@cache
+def codec_of(definition: Definition[M]) -> Codec[M]:
+    """Return the codec of a message; its functions are closures, as every attribute costs time on the hot path."""
+    name, types, model = definition.name, definition.types, definition.model
+    validation, make_row = definition.validation, definition.row
+    check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
+    name_values, template_of_fields = validation.name, validation.template
+    count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
+    tags, tag_mask, packed = _forms(types, head)
+    size, pack_flat = packed.size, packed.pack
+    flatten = _flattener([kind.length is not None for kind in types.values()])
+    new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
+
+    def pack(row: Values) -> bytes:
+        """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
+        # The packed struct has zeros in place of the tags, and `tags` has zeros in place of the values.
+        return (from_bytes(pack_flat(*flatten(row)), "big") | tags).to_bytes(size, "big")
+
+    def encode(message: M) -> bytes:
+        try:
+            return pack(tuple(message.__dict__.values()))
+        except (struct.error, OverflowError, TypeError) as exc:
+            raise EncodeError(str(exc), name) from exc
+
+    def encode_fields(fields: Mapping[str, object]) -> bytes:
+        row = row_of(fields)
+        return encode(to_model(fields)) if row is None else encode_valid(row)
+
+    def encode_row(values: Sequence[object]) -> bytes:
+        values = tuple(values)
+        if len(values) != count:
+            raise EncodeError(f"{len(values)} values, where a row has {count}", name)
+        row = check_row(values)
+        return encode(to_model(name_values(values))) if row is None else encode_valid(row)
+
+    def encode_valid(row: Values) -> bytes:
+        try:
+            return pack(row)
+        except OverflowError:  # beyond float32: the model raises the error for it
+            return encode(to_model(name_values(row)))
+
+    def to_model(fields: Mapping[str, object]) -> M:
+        try:
+            return model.model_validate(dict(fields))
+        except ValidationError as exc:
+            violations = [(str(detail["loc"][0]), detail["msg"]) for detail in exc.errors(include_url=False)]
+            raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
+
+    def decode_full_width(payload: bytes) -> Values | None:
+        """Return the values of a payload as `encode` writes it, validated; None if `decode_any` has to decide."""
+        if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
+            return None
+        # With these tags each value has its type and range: there is nothing left to validate but the rules.
+        row: Values = unpack(payload, use_list=False)[1:]
+        return row if passes_rules(row) else None
+
+    def decode_any(payload: bytes, newer: Newer | None) -> M:
+        """Return the message of any msgpack encoding, in any known layout."""
+        try:
+            return upgrade_with(definition, _unpack_fields(definition, payload, newer or {}))
+        except ValidationError as exc:
+            raise DecodeError(describe(exc, definition), name) from exc
+
+    def decode(payload: bytes, *, newer: Newer | None = None) -> M:
+        row = decode_full_width(payload)
+        if row is None:
+            return decode_any(payload, newer)
+        values = template_of_fields.copy()
+        values.update(zip(template_of_fields, row, strict=True))
+        return fill(model.__new__(model), values, all_fields)
+
+    def decode_row(payload: bytes, *, newer: Newer | None = None) -> M:  # for type checkers
+        row = decode_full_width(payload)
+        values = tuple(decode_any(payload, newer).__dict__.values()) if row is None else row
+        return cast("M", new_row(make_row, values))
+
+    return Codec(
+        definition, size, tags, tag_mask, tuple(_offsets(types, len(head))),
+        encode, encode_fields, encode_row, decode, decode_row,
+    )  # fmt: skip
+
+
+def _forms(types: Mapping[str, FieldType], head: bytes) -> tuple[int, int, struct.Struct]:
+    """Return the tags of a payload, the mask of what is no value, and the values as a struct."""
+    forms = [full_width(kind) for kind in types.values()]
+    template = head + b"".join(tags for tags, _, _ in forms)
+    value_mask = int.from_bytes(bytes(len(head)) + b"".join(values for _, _, values in forms), "big")
+    packed = struct.Struct(f">{len(head)}x" + "".join(form for _, form, _ in forms))
+    return int.from_bytes(template, "big"), ((1 << 8 * len(template)) - 1) ^ value_mask, packed
+
+
+def describe(error: ValidationError, definition: Definition[Any]) -> str:
+    """Return a validation error in one line: each field, the reason, and its value."""
+    return "; ".join(_describe(detail, definition) for detail in error.errors(include_url=False))
+
+
+def _describe(detail: ErrorDetails, definition: Definition[Any]) -> str:
+    text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+    if detail["type"] == "missing":
+        return text
+    if detail["type"] == "extra_forbidden":
+        text = definition.explain_unknown_field(str(detail["loc"][0]))
+    return f"{text} (is {detail['input']!r:.40})"
+
+
+def _flattener(is_array: Sequence[bool]) -> Callable[[Values], Values]:
+    """Return a function that returns the values of a row with those of its arrays in their place."""
+    parts, start = [], 0
+    for index in [index for index, each in enumerate(is_array) if each]:
+        parts += [f"*row[{start}:{index}]", f"*row[{index}]"]
+        start = index + 1
+    return evaluated(f"lambda row: ({', '.join(parts)}, *row[{start}:])") if parts else tuple
+
+
+def _offsets(types: Mapping[str, FieldType], offset: int) -> Iterator[tuple[str, int, int]]:
+    for name, kind in types.items():
+        _, _, bits = full_width(kind)
+        step = kind.size + (kind.base != "bool")
+        first = len(bits) - kind.count * step + (kind.base != "bool")
+        yield from ((name, part, offset + first + part * step) for part in range(kind.count))
+        offset += len(bits)
+
+
+def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) -> dict[str, object]:
+    def reject(reason: str) -> DecodeError:
+        return DecodeError(reason, definition.name)
+
+    if len(payload) > PAYLOAD_LIMIT:
+        raise reject(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
+    try:
+        array = msgpack.unpackb(payload, use_list=False, max_map_len=0, max_ext_len=0)
+    except (ValueError, msgpack.UnpackException) as exc:
+        raise reject(f"{len(payload)} bytes that are not one msgpack value ({exc or type(exc).__name__})") from exc
+    if not isinstance(array, tuple) or not array or type(array[0]) is not int:
+        raise reject("not an array that starts with the number of its layout")
+    layout, *values = array
+    known = definition.wire_layouts
+    names = known[layout].fields if layout in known else newer.get(layout)
+    if names is None:
+        raise UnknownLayoutError(layout, len(values), (*known, *newer), definition.name)
+    if len(values) != len(names):
+        raise reject(f"{len(values)} fields where layout {layout} has {len(names)}")
+    for name, value in zip(names, values, strict=True):
+        # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
+        parts = value if isinstance(value, tuple) else (value,)
+        if isinstance(value, tuple) and any(isinstance(part, tuple) for part in parts):
+            raise reject(f"{name}: an array within an array")
+        if any(isinstance(part, str) for part in parts):  # which the model accepts as "NaN", from JSON
+            raise reject(f"{name}: text, where msgpack has numbers and bools")
+    return dict(zip(names, values, strict=True))

@@ -1,0 +1,49 @@
+"""The contract as functions: a message to its payload, and back."""
+
+from __future__ import annotations
+
+from typing import Any, Final, cast
+
+from typing_extensions import TypeVar
+
+from . import messages as _all  # noqa: F401 - so that all messages are known
+from .codecs.msgpack import Newer, codec_of
+from .definition import Definition
+from .message import Message
+from .messages.vehicle_local_position import VehicleLocalPosition
+from .registry import BY_TOPIC, MESSAGES
+from .topics import DEFAULT_TOPIC
+
+M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
+_FIRST: Final = cast("type[Any]", VehicleLocalPosition)
+
+
+def definition_of(message: type[M] | str) -> Definition[M]:
+    """Return the definition of a message, given its class, its name or one of its topics; KeyError if it is unknown."""
+    if isinstance(message, str):
+        return MESSAGES[message] if message in MESSAGES else BY_TOPIC[message]
+    return message.DEFINITION
+
+
+DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
+"""The message of whoever names none."""
+
+
+def encode(message: Message) -> bytes:
+    """Return the payload of a message; floats are float32 where PX4 has one.
+
+    Raises EncodeError for values that do not fit their fields, in a message whose validation was bypassed.
+    """
+    return codec_of(message.DEFINITION).encode(message)
+
+
+def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
+    """Return the message of a payload, validated by its model.
+
+    `newer` has the field names of layouts that this version does not know, by their number on the wire: fields with a
+    known name are decoded, the others ignored.
+
+    Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
+    not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
+    """
+    return cast("M", codec_of(definition_of(message)).decode(payload, newer=newer))

@@ -1,0 +1,154 @@
+"""The base of all messages: a validated, immutable Pydantic model with PX4's fields."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterable, Mapping, Set
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast
+
+from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from .definition import Definition
+from .px4_types import FieldType, Uint64
+from .registry import register
+
+_M = TypeVar("_M", bound="Message")
+_PARTS: Final = ("LAYOUTS", "RULES", "WIRE", "OLDER", "ALIASES", "ALWAYS")
+_FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
+
+
+class Message(BaseModel):
+    """One message of one vehicle: a subclass in a file of `nedbus_msgs.messages` says which fields it has.
+
+    A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
+    bit for bit as it was made; a number beyond float32 (1e39) is rejected.
+    A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
+
+    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings", defer_build=True, protected_namespaces=()
+    )
+    DEFINITION: ClassVar[Definition[Any]]
+    timestamp: Uint64
+
+    if not TYPE_CHECKING:
+
+        def __init__(self, /, **fields: object) -> None:
+            definition = self.DEFINITION
+            # A subclass may have validators of its own, which only Pydantic knows.
+            values = definition.validation.validate_fields(fields) if type(self) is definition.model else None
+            if values is None:
+                super().__init__(**fields)
+            else:
+                fill(self, values, definition.all_fields if len(fields) == len(values) else frozenset(fields))
+
+        # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
+        __init__.__pydantic_base_init__ = True
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Define the message, and make it known, if this class says what its topics are."""
+        super().__pydantic_init_subclass__(**kwargs)
+        said = vars(cls)
+        if "TOPICS" in said:
+            parts = {name.lower(): said[name] for name in _PARTS if name in said}
+            cls.DEFINITION = Definition(cls, topics=said["TOPICS"], **parts)
+            register(cls.DEFINITION)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        """Validate, and where that fails once more with what NumPy and JSON have in place of Python's values."""
+        try:
+            return validate(fields)
+        except ValidationError:
+            if not isinstance(fields, dict):
+                raise
+            types = cls.DEFINITION.types
+            converted = {name: _to_python(value, types.get(name)) for name, value in fields.items()}
+            if all(converted[name] is value for name, value in fields.items()):
+                raise
+        return validate(converted)
+
+    @model_validator(mode="after")
+    def _round_and_check(self) -> Self:
+        """Round float32 fields to float32, then check the rules between fields."""
+        values, validation = self.__dict__, self.DEFINITION.validation
+        row = validation.values_of(values)
+        try:
+            values.update(validation.name_rounded(row))
+        except OverflowError:
+            raise self._error(validation.overflows(values)) from None
+        if not validation.passes_rules(row):
+            broken = list(validation.violations(values))
+            if broken:
+                raise self._error(broken)
+        return self
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields; NaN equals NaN."""
+        if not isinstance(other, Message) or other.DEFINITION is not self.DEFINITION:
+            return NotImplemented
+        return all(_is_same(value, other.__dict__[name]) for name, value in self.__dict__.items())
+
+    def __hash__(self) -> int:
+        return hash((self.timestamp, self.__dict__.get("timestamp_sample")))
+
+    def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
+        """Return a copy; unlike Pydantic's own, one with updates is validated."""
+        if not update:
+            return super().model_copy(deep=deep)
+        given = {name: self.__dict__[name] for name in self.model_fields_set}
+        return type(self).model_validate({**given, **update})
+
+    def _error(self, broken: Iterable[tuple[str, str]]) -> ValidationError:
+        """Build an error with an entry for each field, like Pydantic's own."""
+        details: list[InitErrorDetails] = [
+            {
+                "type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}),
+                "loc": (name,),
+                "input": self.__dict__[name],
+            }
+            for name, reason in broken
+        ]
+        return ValidationError.from_exception_data(self.DEFINITION.name, details)
+
+
+def _is_same(one: object, other: object) -> bool:
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return all(map(_is_same, one, other))
+    return one == other or (repr(one) == repr(other) == "nan")
+
+
+def _to_python(value: Any, kind: FieldType | None) -> object:
+    """Return Python's own value for NumPy's scalar or array, a list, or the name that JSON has for a float.
+
+    Anything else stays as it is, for the model to reject.
+    """
+    if type(value).__module__ == "numpy":
+        value = value.tolist()
+    if kind and kind.length and isinstance(value, list | tuple):
+        parts = tuple(_to_python(part, FieldType(kind.base)) for part in value)
+        return value if all(map(operator.is_, parts, value)) and isinstance(value, tuple) else parts
+    if kind and kind.is_float and isinstance(value, str) and value in _FLOAT_NAMES:
+        return float(value)
+    return value
+
+
+def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
+    """Set the fields of a new message, which are valid and rounded to float32, without validating them; return it."""
+    _set_dict(message, values)
+    _set_fields_set(message, given)
+    _set_extra(message, None)
+    _set_private(message, None)
+    return message
+
+
+# What Pydantic's own validator sets on an instance (2.12 to 2.x); the models are frozen, so this sets their slots.
+_set_dict, _set_fields_set, _set_extra, _set_private = (
+    cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
+    for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")
+)

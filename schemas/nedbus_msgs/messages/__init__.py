@@ -1,0 +1,12 @@
+"""The messages, one file each: what is in this folder is a message that nedbus carries."""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+from nedbus_msgs.registry import MESSAGES
+from nedbus_msgs.topics import DEFAULT_TOPIC
+
+for _name in sorted((module.name for module in iter_modules(__path__)), key=lambda name: (name != DEFAULT_TOPIC, name)):
+    import_module(f"{__name__}.{_name}")
+
+globals().update({name: definition.model for name, definition in MESSAGES.items()})

@@ -1,0 +1,44 @@
+"""VehicleAttitude: where the vehicle's body points."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from nedbus_msgs.declaration import Topic
+from nedbus_msgs.message import Message
+from nedbus_msgs.px4_types import NAN, Float32x4, Uint8, Uint64
+from nedbus_msgs.rules import NotLater, UnitQuaternion
+
+
+class VehicleAttitude(Message):
+    """Attitude of a vehicle: the rotation from its body frame (FRD) to the local frame (NED).
+
+    Quaternions are Hamilton's, (w, x, y, z), of norm 1; FRD: x forward, y right, z down.
+    q turns a vector of the body frame into one of NED; q and -q are the same attitude, either may come.
+    A first element of NaN means that the attitude is not known.
+
+    delta_q_reset keeps the value of the latest reset: it explains a jump only if quat_reset_counter rose by exactly 1.
+    It is all 0 in some ground truth, which is no rotation at all.
+    """
+
+    TOPICS: ClassVar = (
+        Topic("vehicle_attitude", 50.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
+        Topic("vehicle_attitude_groundtruth", 50.0, "simulators (SITL, HITL)"),
+        Topic("external_ins_attitude", 50.0, "an external INS driver (VectorNav, ...)"),
+        Topic("estimator_attitude", 2.0, "each EKF instance, when several run", instances=True),
+    )
+    LAYOUTS: ClassVar = {
+        "1.13": "*",
+    }  # fmt: skip
+    RULES: ClassVar = (NotLater("timestamp_sample", "timestamp"), UnitQuaternion("q"))
+
+    timestamp: Uint64 = Field(description="Time since boot [us]")
+    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this [us], <= timestamp")
+
+    q: Float32x4 = Field((NAN,) * 4, description="Rotation from FRD body to NED, Hamilton (w, x, y, z)")
+    delta_q_reset: Float32x4 = Field(
+        (NAN,) * 4, description="Change of q at its latest reset: q after = this * q before"
+    )
+    quat_reset_counter: Uint8 = Field(0, description="Count of q resets, wraps at 255")

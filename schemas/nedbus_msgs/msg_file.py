@@ -1,0 +1,147 @@
+"""PX4's .msg files: fields with their types, units, ranges and meanings, and what is wrong with a text that is none."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import Final, NamedTuple
+
+from .definition import Definition
+from .message import Message
+from .other import define
+from .px4_types import ALIASES, BASES, FieldType, field_type
+from .ros2_types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
+from .rules import InRange, Rule
+
+_FIELD = re.compile(r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]+)\s*(?:=\s*(?P<value>[^#]*))?(?P<comment>#.*)?")
+_NUMBER: Final = r"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|inf)"
+_RANGE = re.compile(rf"@range\s+({_NUMBER})?\s*,\s*({_NUMBER})?")
+_INVALID = re.compile(rf"@invalid\s+({_NUMBER})")
+_MOST: Final = 1000  # fields that are read; a message has fewer
+_NESTED: Final = 3  # levels of messages within messages; PX4 has one
+_LONGEST: Final = 2**18  # characters of a file; PX4's longest has 20,000
+
+
+class MsgError(ValueError):
+    """Raised for a text that is no .msg file of a message; `line` and `column` count from 1."""
+
+    def __init__(self, line: int, column: int, reason: str) -> None:
+        super().__init__(f"line {line}, column {column}: {reason}")
+        self.line = line
+        self.column = column
+
+
+@dataclass(frozen=True, slots=True)
+class MsgField:
+    """One field of a .msg file, with its comment, and the range that it is annotated with."""
+
+    name: str
+    type: FieldType
+    comment: str = ""
+    rules: tuple[Rule, ...] = field(default=(), compare=False)
+
+
+def read_msg(text: str) -> list[MsgField]:
+    """Return the fields of a .msg file, in order, without its constants; MsgError for what is none.
+
+    Messages within it follow it as in ROS 2 and MCAP, behind a line of = and one of `MSG: package/Name`: their fields
+    are those of the message, `current_lat`, `esc_0_esc_rpm`.
+    """
+    return list(islice(_flatten(_parts(text), "", "", 0), _MOST))
+
+
+def define_msg(name: str, text: str) -> Definition[Message]:
+    """Return the message that a .msg file describes, range-checked as it is annotated; MsgError for what is none."""
+    fields = read_msg(text)
+    try:
+        return define(
+            name,
+            {each.name: each.type for each in fields},
+            meanings={each.name: each.comment for each in fields if each.comment},
+            rules=[rule for each in fields for rule in each.rules],
+        )
+    except ValueError as exc:
+        raise MsgError(1, 1, str(exc)) from None
+
+
+def hash_of_msg(name: str, text: str) -> str:
+    """Return the RIHS01 hash of the px4_msgs type that a .msg file describes, with the messages within it."""
+    parts = _parts(text)
+    described = {part: [_describe(line, parts) for line in lines] for part, lines in parts.items()}
+    used = sorted({line.base for lines in parts.values() for line in lines} & parts.keys())
+    return type_hash(f"{PACKAGE}/{name}", described[""], [(f"{PACKAGE}/{each}", described[each]) for each in used])
+
+
+def bases_of_msg(text: str) -> set[str]:
+    """Return the names of the types that a .msg file has, base types and messages within it."""
+    return {line.base for lines in _parts(text).values() for line in lines}
+
+
+class _Line(NamedTuple):
+    """A field as it is written: `base` is its type without the length of an array."""
+
+    number: int
+    column: int
+    base: str
+    length: str
+    name: str
+    comment: str
+
+
+def _parts(text: str) -> dict[str, list[_Line]]:
+    """Return the fields of the message, by "", and of those within it by their names."""
+    if len(text) > _LONGEST:
+        raise MsgError(1, 1, f"{len(text)} characters are no .msg file")
+    parts: dict[str, list[_Line]] = {"": []}
+    current = parts[""]
+    for number, line in enumerate(text.splitlines(), 1):
+        start = len(line) - len(line.lstrip())
+        if line.startswith("MSG: "):
+            current = parts.setdefault(line.rpartition("/")[2].strip(), [])
+        elif line.strip() and line[start] != "#" and not line.startswith("==="):
+            found = _FIELD.fullmatch(line.strip())
+            if found is None:
+                raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q', or a constant")
+            base, bracket, length = found["type"].rpartition("/")[2].partition("[")
+            column, comment = start + 1 + found.start("name"), (found["comment"] or "").lstrip("# ").strip()
+            if any(each.name == found["name"] for each in current):
+                raise MsgError(number, column, f"a second field {found['name']!r}")
+            if found["value"] is None:
+                current.append(_Line(number, start + 1, base, bracket + length, found["name"], comment))
+            elif base not in BASES and base not in ALIASES:
+                raise MsgError(number, start + 1, f"a constant of type {base!r}")
+    return parts
+
+
+def _flatten(parts: Mapping[str, Sequence[_Line]], message: str, prefix: str, level: int) -> Iterator[MsgField]:
+    for line in parts[message]:
+        count = re.fullmatch(r"\[(\d{1,3})\]", line.length)
+        if line.base in parts and level < _NESTED and (count or not line.length):
+            for index in range(int(count[1])) if count else [None]:
+                yield from _flatten(
+                    parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
+                )
+            continue
+        try:
+            kind, name = field_type(line.base + line.length), prefix + line.name
+        except ValueError as exc:
+            raise MsgError(line.number, line.column, str(exc)) from None
+        yield MsgField(name, kind, line.comment, _rules(name, kind, line.comment))
+
+
+def _describe(line: _Line, parts: Mapping[str, object]) -> Described:
+    if line.base in parts:
+        length = int(line.length.strip("[]") or 0)
+        return line.name, NESTED + (ARRAY if length else 0), length, f"{PACKAGE}/{line.base}"
+    return described(line.name, field_type(line.base + line.length))
+
+
+def _rules(name: str, kind: FieldType, comment: str) -> tuple[Rule, ...]:
+    found, invalid = _RANGE.search(comment), _INVALID.search(comment)
+    if found is None or kind.base == "bool":
+        return ()
+    least, greatest = float(found[1] or "-inf"), float(found[2] or "inf")
+    unknown = {"or_": float(invalid[1])} if invalid else {}
+    return (InRange(name, least, greatest, is_array=kind.length is not None, **unknown),)

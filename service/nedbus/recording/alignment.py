@@ -1,0 +1,203 @@
+"""Several messages at one time: one table of the values that each stream has at the times of another one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from nedbus.errors import AddressError, ConfigError
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
+from nedbus_msgs.arrays import MessageArray
+
+from .arrays import Library, Pandas, Polars, Streams, missing_of, read_streams, to_dataframe
+from .utc import tell_utc
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+
+_METHODS: Final = ("last", "nearest", "linear")
+_PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # by the unit of an angle
+_MAX_ROWS: Final = 10_000_000  # of a table at a rate: a damaged timestamp must not fill the memory
+_STRAY: Final = 0.01  # of the messages may be out of order; more are several boots
+_PARALLEL: Final = 1 - 1e-9  # cosine from which two quaternions are as good as equal
+
+
+_Floats = npt.NDArray[np.float64]
+_Ints = npt.NDArray[np.int64]
+
+
+class _How(TypedDict, total=False):
+    topics: Sequence[str] | None
+    on: str | float | Sequence[int] | npt.NDArray[np.int64]
+    method: Literal["last", "nearest", "linear"]
+    vehicle: str | int
+    utc: bool
+
+
+@overload
+def align(
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: None = None, **how: Unpack[_How]
+) -> MessageArray: ...
+@overload
+def align(
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Pandas, **how: Unpack[_How]
+) -> pd.DataFrame: ...
+@overload
+def align(
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Polars, **how: Unpack[_How]
+) -> pl.DataFrame: ...
+def align(
+    flight: str | Path | Mapping[str, MessageArray],
+    *,
+    topics: Sequence[str] | None = None,
+    on: str | float | Sequence[int] | npt.NDArray[np.int64] = DEFAULT_TOPIC,
+    method: Literal["last", "nearest", "linear"] = "last",
+    vehicle: str | int = ANY,
+    utc: bool = False,
+    dataframe: Library = None,
+) -> Any:
+    """Return one table by time of several streams of a .ulg log, an .mcap recording, or arrays of `read`.
+
+    `topics` are those of `read`; by default all, but of a log only those that have a file here.
+    `on` gives the rows: a stream, whose messages they are, a rate [Hz], or times as PX4's `timestamp` has them [us].
+    Columns are `timestamp` [us], and of each stream `<stream>.<field>` and `<stream>.age` [s]: the time since the
+    message that the values are from, NaN where there is none yet; then floats are NaN, others 0 or false.
+    With `dataframe` it is a data frame as `read` returns it; what is not there is null.
+
+    `method`: "last" takes the last message that is not later: no value is from the future.
+    "nearest" takes that nearest in time, so that an age can be negative. "linear" interpolates floats between the
+    messages before and after: unit quaternions by slerp, angles the shorter way around. Everything else is the last
+    value, as floats are where a reset counter changes, and after the last message.
+    With `utc`, a column `utc` is the UTC that `utc_of` tells, NaT where it tells none.
+
+    Raises ConfigError for several boots of a vehicle in one stream: they have no common time; errors of `read`.
+    """
+    if method not in _METHODS:
+        raise ConfigError("method", f"{method!r} is none of {', '.join(_METHODS)}")
+    reference = [on] if isinstance(on, str) else []
+    names = [*reference, *(topics or ())]
+    if isinstance(flight, Mapping):
+        everything = not topics or ANY in topics
+        streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
+        offset = tell_utc(flight)
+    else:
+        wants_utc = utc or dataframe == "pandas"
+        streams, offset = read_streams(flight, names if topics else None, vehicle=vehicle, utc=wants_utc)
+    for name in names if isinstance(flight, Mapping) else reference:
+        if name not in (ANY, *streams):
+            raise AddressError("topic", name, f"one of {', '.join(streams)}")
+    streams = {name: streams[name] for name in [*reference, *streams]}
+    stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
+    times = stamps[on] if isinstance(on, str) else _times(on, stamps.values())
+    types: list[tuple[str, Any]] = [("timestamp", "u8"), *[("utc", "M8[us]")] * utc]
+    for name, (messages, _) in streams.items():
+        types += [(f"{name}.age", "f8"), *((f"{name}.{field}", kind) for field, kind in _fields(messages))]
+    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
+    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
+    table["timestamp"] = times
+    if utc:
+        table["utc"] = (times + offset.offset_us).astype("M8[us]") if offset else np.datetime64("NaT", "us")
+    absent: dict[str, npt.NDArray[np.bool_]] = {}
+    for name, (messages, lacking) in streams.items():
+        rows, following, weight = _look_up(stamps[name], times, "own" if name == on else method)
+        padded = np.append(messages, np.zeros(1, messages.dtype))  # with what row -1 is
+        for field, kind in _fields(messages):
+            padded[field][-1] = np.nan if kind.base.kind == "f" else 0
+        values = padded[rows]
+        if method == "linear":
+            _interpolate(name, values, padded[following], weight)
+        table[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+        for field, _ in _fields(messages):
+            table[f"{name}.{field}"] = values[field]
+            absent[f"{name}.{field}"] = np.append(lacking.get(field, np.zeros(len(messages), bool)), True)[rows]
+    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe, offset)
+
+
+def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
+    return [(name, messages.dtype[name]) for name in messages.dtype.names or ()]
+
+
+def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
+    """Return the message for each time, -1 for none, the next one, and how far between these two the time is."""
+    if method == "own" or not len(stamps):  # by its place: two messages may have one time
+        rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
+        return rows, rows, np.zeros(len(times))
+    order = np.argsort(stamps, kind="stable")
+    stamps = stamps[order]
+    before = np.searchsorted(stamps, times, side="right") - 1
+    after = np.minimum(before + 1, len(stamps) - 1)
+    since, gap = times - stamps[before], stamps[after] - stamps[before]
+    weight = np.where((before >= 0) & (gap > 0), since / np.maximum(gap, 1), 0.0)
+    if method == "nearest":
+        before = np.where((before < 0) | (stamps[after] - times < since), after, before)
+    return np.where(before < 0, -1, order[before]), order[after], weight
+
+
+def _interpolate(stream: str, values: MessageArray, following: MessageArray, weight: _Floats) -> None:
+    """Move the floats of messages towards those of the following ones."""
+    definition = BY_TOPIC.get(stream.partition("/")[0])
+    rules = definition.rules if definition else ()
+    quaternions = {name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields}
+    for name, _ in _fields(values):
+        if name.endswith("reset_counter"):
+            weight = np.where(values[name] == following[name], weight, 0.0)
+    between = weight > 0
+    for name, kind in _fields(values):
+        if kind.base.kind != "f":
+            continue
+        first, second = values[name][between].astype(float), following[name][between].astype(float)
+        parts = weight[between].reshape(-1, *[1] * (first.ndim - 1))
+        unit = definition.meaning(name) if definition else ""
+        period = next((each for text, each in _PERIODS.items() if text in unit), np.inf)
+        find = _slerp if name in quaternions else _linear
+        values[name][between] = np.where(first == second, first, find(first, second, parts, period))
+
+
+def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
+    """Return values between two; of angles the shorter way around, from 0 or minus half a period on, as they are."""
+    with np.errstate(invalid="ignore"):  # infinity minus itself
+        step = second - first
+        seam = np.abs(step) > period / 2
+        if not seam.any():
+            return first + weight * step
+        found = first + weight * (step - np.sign(step) * period)
+        start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
+        return np.where(seam, start + np.mod(found - start, period), first + weight * step)
+
+
+def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:
+    """Return unit quaternions between two, of shape (n, 4), on the shorter way."""
+    cosine = np.sum(first * second, axis=1, keepdims=True)
+    angle = np.arccos(np.minimum(np.abs(cosine), _PARALLEL))
+    near = np.where(cosine < 0, -1, 1) * second
+    found: _Floats = np.sin((1 - weight) * angle) * first + np.sin(weight * angle) * near
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found
+
+
+def _stamps(stream: str, messages: MessageArray) -> _Ints:
+    """Return the timestamps [us]; raise ConfigError where the vehicle's clock starts again."""
+    stamps: _Ints = np.minimum(messages["timestamp"], 2**62).astype(np.int64)
+    late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
+    early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])
+    if min(late, early) > max(1, _STRAY * len(stamps)):
+        raise ConfigError(stream, "its timestamps start again: align the messages of one boot, as slices of `read`")
+    return stamps
+
+
+def _times(on: float | Sequence[int] | _Ints, stamps: Iterable[_Ints]) -> _Ints:
+    """Return times that are given, or those at a rate from the first message to the last one [us]."""
+    if not isinstance(on, float | int):
+        return np.asarray(on).astype(np.int64)
+    every = np.concatenate([*stamps, np.empty(0, np.int64)])
+    every, rate = every[every > 0], float(on)  # 0 is no time
+    count = np.ptp(every) / 1e6 * rate + 1 if len(every) else 0
+    if not 0 <= count <= _MAX_ROWS:
+        raise ConfigError("on", f"{count:.0f} rows at {rate:g} Hz: expected up to {_MAX_ROWS}, or times")
+    first: int = every.min(initial=2**62)
+    return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

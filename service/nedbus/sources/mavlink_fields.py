@@ -1,0 +1,123 @@
+"""What single MAVLink messages say, as fields of PX4's messages: what is unknown, or not MAVLink's, is left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from nedbus_msgs import MESSAGES, euler_to_quaternion, quaternion_to_euler
+
+_U16: Final = 2**16 - 1  # "not known" of most fields of that type
+_WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # of MAV_BATTERY_CHARGE_STATE
+_FAILSAFE: Final = {3: False, 4: False, 5: True}  # of MAV_STATE: standby, active, critical
+_POSE_FRAMES: Final = {1: 1, 20: 2}  # of MAV_FRAME: local NED, local FRD
+_VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
+_ARMED, _HIL = 128, 32  # bits of base_mode
+_SENSORS: Final = [f"onboard_control_sensors_{each}" for each in ("present", "enabled", "health")]
+
+
+def _number(value: int, unit: float, *unknown: int) -> float | None:
+    return None if value in unknown else value / unit
+
+
+def _local_position(message: Any) -> dict[str, object]:
+    return {name: getattr(message, name) for name in ("x", "y", "z", "vx", "vy", "vz")}
+
+
+def _global_position(message: Any) -> dict[str, object]:
+    return {"lat": message.lat / 1e7, "lon": message.lon / 1e7, "alt": message.alt / 1e3}
+
+
+def _home(message: Any) -> dict[str, object]:
+    """Return home, which is known on the globe if it is sent at all."""
+    angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
+    return {
+        "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": message.altitude / 1e3,
+        "x": message.x, "y": message.y, "z": message.z, "valid_hpos": True, "valid_alt": True,
+        **dict(zip(("roll", "pitch", "yaw"), angles, strict=True)),
+    }  # fmt: skip
+
+
+def _gps(message: Any) -> dict[str, object]:
+    if message.satellites_visible == 255 and message.fix_type < 2:
+        return {"fix_type": message.fix_type}  # there is no receiver, or it is silent
+    course = _number(message.cog, 100, _U16)
+    heading = _number(message.yaw, 100, 0, _U16)
+    return {
+        "fix_type": message.fix_type if message.fix_type <= 6 else None,  # then MAVLink's are others than PX4's
+        "latitude_deg": message.lat / 1e7, "longitude_deg": message.lon / 1e7, "altitude_msl_m": message.alt / 1e3,
+        "altitude_ellipsoid_m": _number(message.alt_ellipsoid, 1e3, 0),
+        "eph": _number(message.h_acc, 1e3, 0), "epv": _number(message.v_acc, 1e3, 0),
+        "s_variance_m_s": _number(message.vel_acc, 1e3, 0),
+        "hdop": _number(message.eph, 100, _U16), "vdop": _number(message.epv, 100, _U16),
+        "vel_m_s": _number(message.vel, 100, _U16), "cog_rad": None if course is None else math.radians(course),
+        "heading": None if heading is None else math.remainder(math.radians(heading), math.tau),
+        "satellites_used": None if message.satellites_visible == 255 else message.satellites_visible,
+    }  # fmt: skip
+
+
+def _status(message: Any) -> dict[str, object]:
+    """Return what a heartbeat says: its custom mode is not PX4's nav_state."""
+    model = MESSAGES["VehicleStatus"].model
+    is_armed = message.base_mode & _ARMED
+    return {
+        "arming_state": model.ARMING_STATE_ARMED if is_armed else model.ARMING_STATE_DISARMED,
+        "hil_state": int(bool(message.base_mode & _HIL)), "failsafe": _FAILSAFE.get(message.system_status),
+        "system_type": message.type,
+        "system_id": message.get_srcSystem(), "component_id": message.get_srcComponent(),
+    }  # fmt: skip
+
+
+def sensors_of(message: Any) -> dict[str, object]:
+    """Return what SYS_STATUS says for VehicleStatus."""
+    return {name: getattr(message, name) for name in _SENSORS}
+
+
+def _battery(message: Any) -> dict[str, object]:
+    """Return its voltage, but none of cells: the first one is the whole battery's where those are not measured."""
+    cells = [each for each in message.voltages if each != _U16] + [each for each in message.voltages_ext if each]
+    return {
+        "voltage_v": sum(cells) / 1e3 if cells else None, "current_a": _number(message.current_battery, 100, -1),
+        "discharged_mah": _number(message.current_consumed, 1, -1),
+        "remaining": _number(message.battery_remaining, 100, -1),
+        "time_remaining_s": _number(message.time_remaining, 1, 0),
+        "temperature": _number(message.temperature, 100, 2**15 - 1), "warning": _WARNINGS.get(message.charge_state),
+    }  # fmt: skip
+
+
+def _odometry(message: Any) -> dict[str, object]:
+    """Return pose and velocity where their frames are some of PX4's."""
+    pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
+    of_pose = {
+        "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),
+        "position_variance": tuple(message.pose_covariance[each] for each in (0, 6, 11)),
+        "orientation_variance": tuple(message.pose_covariance[each] for each in (15, 18, 20)),
+    }  # fmt: skip
+    of_velocity = {
+        "velocity_frame": velocity, "velocity": (message.vx, message.vy, message.vz),
+        "velocity_variance": tuple(message.velocity_covariance[each] for each in (0, 6, 11)),
+    }  # fmt: skip
+    return {
+        **(of_pose if pose else {}), **(of_velocity if velocity else {}),
+        "angular_velocity": (message.rollspeed, message.pitchspeed, message.yawspeed),
+        "reset_counter": message.reset_counter, "quality": message.quality,
+    }  # fmt: skip
+
+
+SAID: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
+    "LOCAL_POSITION_NED": ("vehicle_local_position", _local_position),
+    "GLOBAL_POSITION_INT": ("vehicle_global_position", _global_position),
+    "ATTITUDE_QUATERNION": ("vehicle_attitude", lambda each: {"q": (each.q1, each.q2, each.q3, each.q4)}),
+    "ATTITUDE": ("vehicle_attitude", lambda each: {"q": euler_to_quaternion(each.roll, each.pitch, each.yaw)}),
+    "ODOMETRY": ("vehicle_odometry", _odometry),
+    "HOME_POSITION": ("home_position", _home),
+    "EXTENDED_SYS_STATE": (
+        "vehicle_land_detected",
+        lambda each: {"landed": each.landed_state == 1} if each.landed_state else {},
+    ),
+    "GPS_RAW_INT": ("sensor_gps", _gps),
+    "HEARTBEAT": ("vehicle_status", _status),
+    "BATTERY_STATUS": ("battery_status", _battery),
+}
+"""The topic of each message, and the function that returns the fields that it has of it; None is not known."""

@@ -1,0 +1,55 @@
+"""PX4's own definitions of messages, .msg files that a user gives: of messages without a file here, or newer ones."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nedbus.errors import ConfigError
+from nedbus.log_event import about
+from nedbus_msgs import Definition, MsgError, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
+
+_log = logging.getLogger(__name__)
+
+Definitions = Mapping[str, Mapping[str, Definition[Any]]]
+"""By the DDS type of the message, and the hash of its ROS 2 type."""
+
+
+def read_definitions(paths: str) -> Definitions:
+    """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
+
+    What cannot be carried is left out of a folder, and named in the log.
+
+    Raises ConfigError, with line and column, for a file that is no message, and for what cannot be read.
+    """
+    found: dict[str, dict[str, Definition[Any]]] = {}
+    left_out: list[str] = []
+    for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
+        for file in sorted([*path.glob("*.msg"), *path.glob("*/*.msg")]) or [path]:
+            try:
+                text = _with_messages_within(file)
+                definition = define_msg(file.stem, text)
+            except (OSError, UnicodeDecodeError) as exc:
+                raise ConfigError(str(file), getattr(exc, "strerror", None) or "no UTF-8 text", key="msg") from None
+            except MsgError as exc:
+                if file == path:
+                    raise ConfigError(str(file), str(exc), key="msg") from None
+                left_out.append(f"{file.stem} ({exc})")
+                continue
+            found.setdefault(dds_type(ros2_type(definition)), {})[hash_of_msg(file.stem, text)] = definition
+    if left_out:
+        extra = about("damaged", source="px4-zenoh")
+        _log.info("px4-zenoh: not carried, of %s: %.2000s", paths, ", ".join(left_out), extra=extra)
+    return found
+
+
+def _with_messages_within(file: Path) -> str:
+    """Return a .msg file with those beside it whose messages are within its own, as ROS 2 puts them together."""
+    text, added = file.read_text(), set[str]()
+    while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
+        added |= missing
+        for base in sorted(missing):
+            text += f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{file.with_name(f'{base}.msg').read_text()}"
+    return text

@@ -1,0 +1,277 @@
+"""All messages: against vectors and hashes of rosbags, in all forms, and one more that is only a file."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+import shutil
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from nedbus_msgs import (
+    ALL,
+    MESSAGES,
+    RELEASES,
+    Definition,
+    FieldType,
+    InvalidMessageError,
+    Message,
+    codec_of,
+    message_of_type_hash,
+    schema_of,
+    upgrade_fields,
+)
+from nedbus_msgs.arrays import arrays_of
+from tests.first_message import decode_cdr, encode_cdr
+from tests.generated import made
+from tests.processes import Start
+from tests.ulogs import UlogWriter
+
+from .strategies import DATA
+
+VECTORS = DATA / "cdr_vectors_messages.jsonl.gz"
+GOLDEN = DATA / "golden_messages.json"
+PAGES = Path(__file__).parents[2] / "docs" / "messages"
+SCHEMAS = Path(__file__).parents[2] / "schemas"
+NAMES = list(MESSAGES)
+float32s = st.one_of(st.floats(width=32), st.sampled_from([0.0, 1.0, -1.0, 0.5]))
+
+
+def vectors() -> Iterator[Mapping[str, Any]]:
+    """Yield the random messages of each layout that rosbags encoded; infinities and NaN are text."""
+    with gzip.open(VECTORS, "rt") as file:
+        yield from map(json.loads, file)
+
+
+def to_python(value: Any) -> Any:
+    """Return a value of a vector as `decode_cdr` returns it."""
+    if isinstance(value, list):
+        return tuple(map(to_python, value))
+    return float(value) if isinstance(value, str) else value
+
+
+def bits(value: object) -> object:
+    """Return what tells any two values apart, and no NaN from another."""
+    return tuple(map(bits, value)) if isinstance(value, tuple) else (type(value), repr(value))
+
+
+def test_vectors_of_rosbags_are_decoded_and_encoded_to_the_bit() -> None:
+    """Of each message and layout, found by its hash: fields in order, and the same bytes again."""
+    found = set()
+    for vector in vectors():
+        payload, fields = (
+            bytes.fromhex(vector["cdr"]),
+            {name: to_python(each) for name, each in vector["fields"].items()},
+        )
+        known = message_of_type_hash(vector["type_hash"])
+        assert known is not None
+        definition, layout = known
+        assert definition.name == vector["message"]
+        assert definition.layout_of_release(vector["releases"][-1]) is layout
+        decoded = decode_cdr(payload, layout=vector["type_hash"])
+        assert list(decoded) == list(layout.fields) == list(fields)
+        assert {name: bits(value) for name, value in decoded.items()} == {
+            name: bits(each) for name, each in fields.items()
+        }
+        assert encode_cdr(fields, layout=vector["type_hash"]) == payload
+        found.add((definition.name, layout.name))
+    layouts = {(name, layout) for name, each in MESSAGES.items() for layout in each.layouts}
+    assert {each for each in layouts - found if each[1] != ALL} == {
+        ("VehicleLocalPosition", "V0")
+    }  # of a node of PX4's
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_fields_of_older_layouts_survive_the_model(name: str) -> None:
+    """What an older vehicle says is in the model, under its present name, and is the same when it is downgraded."""
+    dropped = {"q_offset", "pose_covariance", "velocity_covariance", "local_frame"}  # of odometry in 1.13
+    for vector in (each for each in vectors() if each["message"] == name):
+        known = message_of_type_hash(vector["type_hash"])
+        assert known is not None
+        definition, layout = known
+        fields = {field: to_python(each) for field, each in vector["fields"].items()}
+        absent = {field: kind.absent for field, kind in definition.types.items()}
+        back = definition.downgrade(absent | upgrade_fields(definition, fields), layout)
+        kept = fields.keys() - dropped
+        assert {field: bits(back[field]) for field in kept} == {field: bits(fields[field]) for field in kept}
+
+
+def test_layouts_are_told_apart_by_their_names() -> None:
+    """A log has no version: each layout is found by the names of its fields, in any order."""
+    for definition in MESSAGES.values():
+        for layout in definition.layouts.values():
+            assert definition.find_layout(reversed(layout.fields)) is layout
+            assert layout.name in (*RELEASES, ALL, "V0")
+
+
+def values_of(kind: FieldType) -> st.SearchStrategy[object]:
+    """Return a strategy for the values of a type."""
+    if kind.base == "bool":
+        one: st.SearchStrategy[object] = st.booleans()
+    elif kind.is_float:
+        one = float32s if kind.base == "float32" else st.floats()
+    else:
+        one = st.one_of(st.integers(0, 9), st.integers(*kind.limits))
+    return st.tuples(*[one] * kind.length) if kind.length else one
+
+
+@st.composite
+def any_fields(draw: st.DrawFn) -> tuple[Definition[Any], dict[str, object]]:
+    """Return fields of any message, with values of their types that perhaps break its rules."""
+    definition = MESSAGES[draw(st.sampled_from(NAMES))]
+    fields = {name: draw(values_of(kind)) for name, kind in definition.types.items()}
+    if draw(st.booleans()):  # else almost all break some rule
+        times = [name for name in ("timestamp_sample", "timestamp") if name in fields]
+        fields |= {name: number for number, name in enumerate(times)}
+        for rule in definition.rules:
+            fields |= {name: definition.types[name].absent for name in rule.fields if name not in times}
+    return definition, fields
+
+
+@given(any_fields())
+def test_all_forms_of_all_messages_agree(case: tuple[Definition[Any], dict[str, object]]) -> None:
+    """Model, fields, rows and arrays accept the same messages, write the same bytes, and read the same values."""
+    definition, fields = case
+    codec, arrays = codec_of(definition), arrays_of(definition)
+    array = np.array([tuple(fields.values())] * 21, arrays.dtype)  # enough to be checked by columns
+    try:
+        message = definition.model.model_validate(fields)
+    except ValidationError:
+        assert not arrays.valid_mask(array).any()
+        assert not arrays.valid_mask(array[:1]).any()
+        with pytest.raises(InvalidMessageError, match=definition.name):
+            codec.encode_fields(fields)
+        with pytest.raises(InvalidMessageError):
+            codec.encode_row(tuple(fields.values()))
+        return
+    payload = codec.encode(message)
+    assert len(payload) == codec.size
+    assert payload == codec.encode_fields(fields) == codec.encode_row(tuple(fields.values()))
+    assert codec.decode(payload) == message == definition.model(**fields)
+    assert bits(tuple(codec.decode_row(payload))) == bits(tuple(message.__dict__.values()))
+    assert definition.model.model_validate_json(message.model_dump_json()) == message
+    decoded, valid = arrays.decode(payload * 21)
+    assert valid.all()
+    assert arrays.encode(decoded) == arrays.encode(array) == payload * 21
+    cdr = arrays.encode_cdr(array, definition.current)
+    again, valid = arrays.decode_cdr([each.tobytes() for each in cdr], definition.current)
+    assert valid.all()
+    assert arrays.encode(again) == payload * 21
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_golden_bytes(name: str) -> None:
+    """A message of a real flight (twelve_messages.ulg) has these bytes for ever; one that is added has some too."""
+    definition, golden = MESSAGES[name], json.loads(GOLDEN.read_text())[name]
+    message = definition.model.model_validate_json(json.dumps(golden["fields"]))
+    assert codec_of(definition).encode(message).hex() == golden["payload"]
+    assert codec_of(definition).decode(bytes.fromhex(golden["payload"])) == message
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_message_is_described(name: str) -> None:
+    """Each field has a meaning, each rule fields, each enum constants; the schema is JSON, and defaults are valid."""
+    definition = MESSAGES[name]
+    assert [field for field in definition.types if not definition.meaning(field)] == []
+    assert {field for rule in definition.rules for field in rule.fields} <= definition.types.keys()
+    for field, prefix in getattr(definition.model, "ENUMS", {}).items():
+        assert field in definition.types
+        assert any(constant.startswith(prefix) for constant in vars(definition.model)), prefix
+    assert json.loads(json.dumps(schema_of(definition)))["json_schema"]["title"] == name
+    message = definition.model(timestamp=1)
+    assert isinstance(message, Message)
+    for field, kind in definition.types.items():
+        if field != "timestamp":
+            assert bits(getattr(message, field)) == bits(kind.absent), field
+    assert math.isfinite(sum(topic.rate for topic in definition.topics.values()))
+
+
+@pytest.mark.process
+def test_what_is_made_from_the_files_is_up_to_date() -> None:
+    """The stubs of type checkers and the page of each message: after a change, `make generated`."""
+    assert [path.name for path, text in made().items() if not path.exists() or path.read_text() != text] == []
+    assert {path.name for path in PAGES.glob("*.md")} == {path.name for path in made() if path.suffix == ".md"}
+
+
+THIRTEENTH = '''
+"""WheelEncoders: how far the wheels of a rover turned."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from nedbus_msgs.declaration import Topic
+from nedbus_msgs.message import Message
+from nedbus_msgs.px4_types import NAN, Float32x2, Uint64
+
+
+class WheelEncoders(Message):
+    """Speed and angle of the wheels of a rover."""
+
+    TOPICS: ClassVar = (Topic("wheel_encoders", 10.0, "a rover's driver"),)
+    LAYOUTS: ClassVar = {"1.14": "*"}
+
+    timestamp: Uint64 = Field(description="Time since boot [us]")
+    wheel_speed: Float32x2 = Field((NAN, NAN), description="Speed of the right and left wheel [rad/s]")
+    wheel_angle: Float32x2 = Field((NAN, NAN), description="Angle of the right and left wheel [rad]")
+'''
+USE_IT = """
+import sys
+import nedbus
+from nedbus.sources import parse_source
+from nedbus_msgs import MESSAGES, codec_of, upgrade_fields
+from nedbus_msgs.arrays import dtype_of
+
+definition = MESSAGES["WheelEncoders"]
+run = parse_source(f"ulog:{sys.argv[1]}").open_source(vehicle="7").open()
+messages = list(run.messages)
+assert run.definitions == {}, "it is known"
+sent = [codec_of(definition).encode_fields(upgrade_fields(definition, each.fields)) for each in messages]
+assert nedbus.read(sys.argv[1], "wheel_encoders")["wheel_speed"].tolist() == [[n, -n] for n in range(len(messages))]
+with nedbus.connect(sys.argv[2]) as bus:
+    with bus.subscribe("wheel_encoders", mode="every") as subscription:
+        publisher = bus.publisher("wheel_encoders", vehicle=7)
+        for each in messages:
+            publisher.publish(each.fields)
+        received = []
+        while len(received) < len(messages):
+            batch = subscription.receive_batch(20.0)
+            assert batch.messages.dtype == dtype_of("wheel_encoders")
+            received += batch.messages["wheel_speed"].tolist()
+        [last] = bus.latest("wheel_encoders")
+assert received == [[n, -n] for n in range(len(messages))], received
+assert last.message == definition.model(timestamp=len(messages), wheel_speed=received[-1], wheel_angle=(0.5, 0.5))
+print("used", len(messages), nedbus.WheelEncoders.__name__)
+"""
+
+
+def write_wheels(path: Path, count: int) -> Path:
+    """Write a log of a rover: its wheels turn as many times as there were messages before."""
+    log = UlogWriter()
+    log.put("F", b"wheel_encoders:uint64_t timestamp;float[2] wheel_speed;float[2] wheel_angle;")
+    log.put("A", struct.pack("<BH", 0, 0) + b"wheel_encoders")
+    for number in range(count):
+        log.put("D", struct.pack("<HQ4f", 0, number + 1, number, -number, 0.5, 0.5))
+    return log.write(path)
+
+
+def test_thirteenth_message_is_one_file(tmp_path: Path, start: Start, endpoint: str) -> None:
+    """A file in the folder of messages, and nothing else: from a log over a router to an array."""
+    shutil.copytree(SCHEMAS / "nedbus_msgs", tmp_path / "nedbus_msgs")
+    (tmp_path / "nedbus_msgs" / "messages" / "wheel_encoders.py").write_text(THIRTEENTH)
+    log = write_wheels(tmp_path / "rover.ulg", 20)
+    program = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n{USE_IT}"
+    process = start("-c", program, str(log), endpoint, measured=False, fresh=True)
+    assert process.wait() == 0, process.err
+    assert process.out == "used 20 WheelEncoders\n"

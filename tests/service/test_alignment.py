@@ -1,0 +1,253 @@
+"""Several streams as one table by time, and the UTC that a flight tells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from itertools import repeat
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nedbus
+from nedbus.errors import AddressError, ConfigError
+from nedbus.recording import RecordingWriter
+from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
+from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from tests.messages import VLP
+
+BOOT = 1_700_000_000_000_000  # us, of a vehicle in 2023
+
+
+def array_of(topic: str, *fields: Mapping[str, object]) -> MessageArray:
+    """Return messages of a topic with these fields."""
+    definition: Definition[Message] = definition_of(topic)
+    return arrays_of(definition).of([definition.model.model_validate(dict(each)) for each in fields])
+
+
+def yaw(angle: float) -> tuple[float, float, float, float]:
+    """Return the quaternion of a rotation about z."""
+    return math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)
+
+
+def write(path: Path, streams: dict[str, MessageArray], vehicle: str = "1") -> Path:
+    """Write a recording of these streams."""
+    with RecordingWriter(path) as writer:
+        for name, array in streams.items():
+            topic, _, instance = name.partition("/")
+            address = Address(vehicle, topic, int(instance) if instance else None)
+            writer.write(
+                array,
+                definition_of(topic),
+                repeat((address, Provenance())),
+                logged=[1] * len(array),
+                published=repeat(1),
+            )
+    return path
+
+
+POSITIONS = array_of(VLP, *({"timestamp": 1_000_000 + 100_000 * number, "x": float(number)} for number in range(5)))
+HOME = array_of("home_position", {"timestamp": 1_150_000, "alt": 7.0}, {"timestamp": 1_250_000, "alt": 9.0})
+
+
+def test_last_value_is_never_from_the_future() -> None:
+    """Each row has the last message that is not later, and its age; before the first one there is none."""
+    table = nedbus.align({VLP: POSITIONS, "home_position": HOME})
+    assert table["timestamp"].tolist() == POSITIONS["timestamp"].tolist()
+    assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4]
+    assert np.array_equal(table["home_position.alt"], np.array([np.nan, np.nan, 7, 9, 9]), equal_nan=True)
+    assert np.allclose(table["home_position.age"], [np.nan, np.nan, 0.05, 0.05, 0.15], equal_nan=True)
+    assert table["home_position.timestamp"].tolist() == [0, 0, 1_150_000, 1_250_000, 1_250_000]
+    assert table[f"{VLP}.age"].tolist() == [0] * 5
+    exactly = nedbus.align({"home_position": HOME}, on=[1_150_000, 1_149_999])
+    assert exactly["home_position.age"][0] == 0
+    assert np.isnan(exactly["home_position.age"][1])
+
+
+def test_nearest_may_be_from_the_future() -> None:
+    """The nearest message, with a negative age where it is later; of two equally near ones the earlier."""
+    table = nedbus.align({"home_position": HOME}, on=[0, 1_200_000, 1_200_001, 9_000_000], method="nearest")
+    assert table["home_position.alt"].tolist() == [7, 7, 9, 9]
+    assert np.allclose(table["home_position.age"], [-1.15, 0.05, -0.049999, 7.75])
+
+
+def test_floats_are_interpolated() -> None:
+    """Floats move evenly, and everything else stays as it last was: integers, flags, and what is not known."""
+    messages = array_of(
+        VLP,
+        {"timestamp": 1_000_000, "x": 1.0, "ref_lon": 179.0, "vx": math.nan, "vxy_max": math.inf, "ref_timestamp": 2},
+        {"timestamp": 2_000_000, "x": 3.0, "ref_lon": -179.0, "vx": 1.0, "vxy_max": math.inf, "ref_timestamp": 4},
+    )
+    table = nedbus.align({VLP: messages}, on=[999_999, 1_000_000, 1_250_000, 1_750_000, 2_500_000], method="linear")
+    assert np.array_equal(table[f"{VLP}.x"], np.array([np.nan, 1, 1.5, 2.5, 3]), equal_nan=True)
+    assert table[f"{VLP}.ref_timestamp"].tolist() == [0, 2, 2, 2, 4]
+    assert table[f"{VLP}.ref_lon"][2:].tolist() == [179.5, -179.5, -179.0]
+    assert np.array_equal(table[f"{VLP}.vx"][1:], np.array([np.nan, np.nan, np.nan, 1]), equal_nan=True)
+    assert table[f"{VLP}.vxy_max"][1:].tolist() == [math.inf] * 4
+    assert np.allclose(table[f"{VLP}.age"], [np.nan, 0, 0.25, 0.75, 0.5], equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("field", "first", "second", "middle"),
+    [
+        ("heading", 3.0, -3.0, math.pi),
+        ("heading", -0.5, 0.5, 0.0),
+        ("cog_rad", 6.0, 0.4, 6.0 + (2 * math.pi - 5.6) / 2),
+        ("cog_rad", 0.2, 6.2, 6.2 + (2 * math.pi - 6.0) / 2),
+    ],
+)
+def test_angles_go_the_shorter_way(field: str, first: float, second: float, middle: float) -> None:
+    """An angle between two is on the shorter way, within the range that its field has: from -pi, or from 0."""
+    messages = array_of("vehicle_gps_position", {"timestamp": 1, field: first}, {"timestamp": 3, field: second})
+    [value] = nedbus.align({"vehicle_gps_position": messages}, on=[2], method="linear")[f"vehicle_gps_position.{field}"]
+    assert math.remainder(value - middle, math.tau) == pytest.approx(0, abs=1e-6)
+    low = -math.pi if min(first, second) < 0 else 0.0
+    assert low - 1e-6 <= value <= low + math.tau + 1e-6
+
+
+def test_quaternions_are_interpolated_by_slerp() -> None:
+    """The rotation is even and the norm 1, also where the sign flips; equal ones and unknown ones are no trouble."""
+    turns = [yaw(0.0), tuple(-each for each in yaw(2.0)), yaw(2.0), (math.nan,) * 4]
+    messages = array_of("vehicle_attitude", *({"timestamp": 4 * n, "q": q} for n, q in enumerate(turns)))
+    table = nedbus.align({"vehicle_attitude": messages}, on=[0, 1, 2, 3, 4, 6, 10], method="linear")
+    q = table["vehicle_attitude.q"]
+    angles = 2 * np.arctan2(q[:5, 3], q[:5, 0])
+    assert np.allclose(np.mod(angles, 2 * math.pi), [0, 0.5, 1, 1.5, 2])
+    assert np.allclose(np.linalg.norm(q[:6], axis=1), 1)
+    assert np.isnan(q[6]).all()
+
+
+def test_nothing_is_interpolated_over_a_reset() -> None:
+    """Where a reset counter changes, the values stay as they were before it."""
+    fields = ({"timestamp": 0, "x": 0.0}, {"timestamp": 4, "x": 50.0, "xy_reset_counter": 1})
+    table = nedbus.align({VLP: array_of(VLP, *fields)}, on=[0, 2, 3, 4], method="linear")
+    assert table[f"{VLP}.x"].tolist() == [0, 0, 0, 50]
+
+
+def test_rate_covers_the_flight() -> None:
+    """A rate gives even times from the first message of all to the last one; too many rows are an error."""
+    table = nedbus.align({VLP: POSITIONS, "home_position": HOME}, on=20)
+    assert table["timestamp"].tolist() == list(range(1_000_000, 1_400_001, 50_000))
+    late = array_of("home_position", {"timestamp": 2**63})
+    for rate in (20, 0, -1, math.nan):
+        with pytest.raises(ConfigError, match="on: "):
+            nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate or 1e9)
+
+
+def test_odd_streams_are_aligned(tmp_path: Path) -> None:
+    """Empty ones, messages of one time, and some out of order; several boots are an error that says what to do."""
+    nothing = HOME[:0]
+    table = nedbus.align({VLP: POSITIONS, "home_position": nothing})
+    assert np.isnan(table["home_position.age"]).all()
+    assert len(nedbus.align({VLP: POSITIONS, "home_position": nothing}, on="home_position")) == 0
+    assert len(nedbus.align({"home_position": nothing}, on=10.0)) == 0
+    twice = POSITIONS[[0, 0, 1, 3, 2, 4]]
+    twice["x"] = range(6)
+    table = nedbus.align({VLP: twice, "home_position": HOME}, method="linear")
+    assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert nedbus.align({VLP: twice}, on=[1_000_000, 1_300_000])[f"{VLP}.x"].tolist() == [1, 3]
+    again = np.concatenate([POSITIONS, POSITIONS])
+    with pytest.raises(ConfigError, match=f"^{VLP}: its timestamps start again: align the messages of one boot"):
+        nedbus.align({VLP: again})
+    with pytest.raises(ConfigError, match="'spline' is none of last, nearest, linear"):
+        nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # that is the mistake
+    with pytest.raises(AddressError, match=f"topic 'home_position' is not valid: expected one of {VLP}"):
+        nedbus.align({VLP: POSITIONS}, topics=["home_position"])
+    with pytest.raises(ConfigError, match="neither pandas nor polars"):
+        nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # that is the mistake
+
+
+def test_file_is_read_by_streams(tmp_path: Path) -> None:
+    """A list is a dict by stream, of one vehicle; a table has what is selected, and the stream of its rows."""
+    batteries = [array_of("battery_status", {"timestamp": 1_200_000, "voltage_v": volts}) for volts in (16.0, 12.0)]
+    streams = {
+        VLP: POSITIONS,
+        "home_position": HOME,
+        "battery_status/0": batteries[0],
+        "battery_status/1": batteries[1],
+    }
+    path = write(tmp_path / "a.mcap", streams)
+    read = nedbus.read(path, ["*"])
+    assert read.keys() == streams.keys()
+    assert all(read[name].tobytes() == array.tobytes() for name, array in streams.items())
+    assert list(nedbus.read(path, ["home_position", "battery_status"])) == list(streams)[1:]
+    assert nedbus.read(path, ["battery_status/1"])["battery_status/1"]["voltage_v"] == [12]
+    assert nedbus.align(path).tobytes() == nedbus.align(nedbus.read(path, ["*"])).tobytes()
+    table = nedbus.align(path, topics=["battery_status/1"])
+    assert {name.partition(".")[0] for name in table.dtype.names or ()} == {"timestamp", VLP, "battery_status/1"}
+    for wrong in ("home_positions", "battery_status/7", "battery_status/x", "vehicle_status"):
+        with pytest.raises(AddressError):
+            nedbus.read(path, [wrong])
+    with RecordingWriter(tmp_path / "two.mcap") as writer:
+        for vehicle, array in (("1", POSITIONS), ("2", HOME)):
+            definition = MESSAGES["VehicleLocalPosition" if vehicle == "1" else "HomePosition"]
+            address = Address(vehicle, next(iter(definition.topics)))
+            writer.write(
+                array, definition, repeat((address, Provenance())), logged=[1] * len(array), published=repeat(1)
+            )
+    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: expected one of those in .*: 1, 2"):
+        nedbus.read(tmp_path / "two.mcap", ["*"])
+    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid"):
+        nedbus.utc_of(tmp_path / "two.mcap")
+
+
+def test_tables_are_frames_with_nulls(tmp_path: Path) -> None:
+    """What is not there yet, or not at all, is null; arrays have a column for each element; times are UTC."""
+    pytest.importorskip("pandas")
+    pl = pytest.importorskip("polars")
+    gps = array_of("sensor_gps", {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9})
+    attitude = array_of("vehicle_attitude", {"timestamp": 1_100_000, "q": yaw(1.0)})
+    path = write(tmp_path / "a.mcap", {VLP: POSITIONS, "sensor_gps/0": gps, "vehicle_attitude": attitude})
+    panda = nedbus.align(path, dataframe="pandas", utc=True)
+    bear = nedbus.align(path, dataframe="polars", utc=True)
+    assert list(panda.columns) == bear.columns
+    assert bear["sensor_gps/0.satellites_used"].to_list() == [None, 9, 9, 9, 9]
+    assert panda["sensor_gps/0.satellites_used"].isna().tolist() == [True] + [False] * 4
+    assert panda["vehicle_attitude.q[3]"].iloc[1] == np.float32(math.sin(0.5))
+    assert bear["utc"].dtype == pl.Datetime("us", "UTC")
+    assert panda["utc"].iloc[1] == bear["utc"][1] == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
+    assert panda.attrs["utc"] == {"source": "sensor_gps/0", "offset_us": BOOT, "count": 1, "spread_us": 0}
+    assert nedbus.read(path, dataframe="pandas").attrs["utc"]["source"] == "sensor_gps/0"
+    assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
+    assert "utc" not in nedbus.align({VLP: POSITIONS}, dataframe="pandas").attrs
+
+
+def test_utc_is_told_or_absent() -> None:
+    """A receiver tells it, else a companion with a date after 2000; zeros, other clocks and disagreement do not."""
+    times = range(1_000_000, 11_000_000, 1_000_000)
+    told = array_of(
+        "sensor_gps",
+        *({"timestamp": t, "timestamp_time_relative": -200, "time_utc_usec": BOOT + t - 200 + t % 7} for t in times),
+    )
+    silent = array_of("sensor_gps", *({"timestamp": t} for t in times))
+    companion = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -BOOT - 5} for t in times))
+    monotonic = array_of("timesync_status", *({"timestamp": t, "estimated_offset": -12_345} for t in times))
+    found = nedbus.utc_of({"sensor_gps/0": told, "timesync_status": companion})
+    assert found is not None
+    assert (found.source, found.count) == ("sensor_gps/0", 10)
+    assert 0 <= found.offset_us - BOOT <= found.spread_us <= 6
+    assert found.at(5) == datetime.fromtimestamp(0, UTC) + (found.at(5) - datetime.fromtimestamp(0, UTC))
+    assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": companion}) == nedbus.UtcOffset(
+        "timesync_status", BOOT + 5, 10, 0
+    )
+    assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": monotonic}) is None
+    rebooted = told.copy()
+    rebooted["time_utc_usec"][5:] += 3_600_000_000
+    assert nedbus.utc_of({"sensor_gps/0": rebooted}) is None
+    assert nedbus.utc_of({}) is None
+    without = [name for name in told.dtype.names or () if name != "timestamp_time_relative"]
+    assert nedbus.utc_of({"sensor_gnss_relative": told[without]}) is not None
+
+
+def test_samples_tell_utc(bus: nedbus.Bus) -> None:
+    """What a live vehicle last said is enough: the UTC of any of its samples, and by whom; None without."""
+    for vehicle, utc in (("7", 1_700_000_000_000_000), ("8", 0)):
+        gps = bus.publisher("sensor_gps", vehicle=vehicle, instance=1)
+        gps.publish({"timestamp": 5_000_000, "time_utc_usec": utc})
+        bus.publisher("vehicle_attitude", vehicle=vehicle).publish({"timestamp": 6_000_000})
+    told = nedbus.utc_of(bus.latest("*", vehicle="7"))
+    assert told is not None
+    assert (told.source, str(told.at(6_000_000))) == ("sensor_gps/1", "2023-11-14 22:13:21+00:00")
+    assert nedbus.utc_of(bus.latest("*", vehicle="8")) is None

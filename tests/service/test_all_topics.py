@@ -1,0 +1,213 @@
+"""Real logs, all that is in them: arrays, replays and recordings equal what pyulog reads."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from pydantic import ValidationError
+from pyulog import ULog
+
+import nedbus
+from nedbus.recording import RecordingReader
+from nedbus_msgs import BY_TOPIC, MESSAGES, TOPICS, describe, upgrade_with
+from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from tests.command_line import run_command
+from tests.processes import Start
+from tests.replays import convert_replay, open_replay
+from tests.ulogs import LOGS
+from tests.waits import DEADLINE
+
+FLIGHTS: Final = sorted([*LOGS.glob("*.ulg"), *(LOGS.parent / "px4").glob("*.ulg")])
+REJECTED: Final = {  # a bool that PX4 did not set
+    ("cuav_1.16_gps_interference", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is -62)"): 31,
+    ("nxp_v0_ekf_failure", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 94)"): 39,
+}
+BEFORE_1_13: Final = {  # fields of another type, of cubeorange_1.12_small
+    "battery_status": {"cell_count", "voltage_cell_v"},
+    "vehicle_status": {f"onboard_control_sensors_{what}" for what in ("enabled", "health", "present")},
+}
+STREAMS: Final = {  # addresses, messages
+    "gps_loss": (7, 26775),
+    "twelve_messages": (27, 46863),
+    "cuav_1.16_gps_interference": (95, 42253),
+    "cubeorange_1.12_small": (70, 14604),
+    "fmuv6c_1.17_selector_whipsaw": (7, 16301),
+    "nxp_v0_ekf_failure": (86, 48847),
+    "sitl_1.13_three_topics": (96, 21229),
+    "sitl_1.15_events": (69, 29480),
+}
+CONVERTED: Final = {  # of older layouts, by PX4's source
+    "lat": ("latitude_deg", 1e7),
+    "lon": ("longitude_deg", 1e7),
+    "alt": ("altitude_msl_m", 1e3),
+    "alt_ellipsoid": ("altitude_ellipsoid_m", 1e3),
+}
+UTC: Final = {  # source, and the date of the boot as it tells it
+    "twelve_messages": ("timesync_status", "2026-11-22T23:08:32"),
+    "cuav_1.16_gps_interference": ("timesync_status", "2026-01-13T05:53:53"),
+    "cubeorange_1.12_small": ("vehicle_gps_position", "2021-04-21T06:30:38"),
+    "nxp_v0_ekf_failure": ("sensor_gps/0", "2025-02-10T13:55:42"),
+    "sitl_1.13_three_topics": ("sensor_gps/0", "2022-04-29T08:45:26"),
+    "sitl_1.15_events": ("sensor_gps/0", "1970-01-01T00:00:00"),  # its timestamps are Unix time
+}
+
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not FLIGHTS, reason=f"no real logs: {LOGS} is not there"),
+]
+each_flight = pytest.mark.parametrize("flight", FLIGHTS, ids=lambda path: path.stem)
+
+
+def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
+    """Return what pyulog reads, by the names that streams have here."""
+    log = ULog(str(flight))
+    several = {data.name for data in log.data_list if data.multi_id}
+    found: dict[str, Mapping[str, npt.NDArray[Any]]] = {}
+    for data in log.data_list:
+        has_instances = TOPICS[data.name].instances if data.name in TOPICS else data.name in several
+        found[f"{data.name}/{data.multi_id}" if has_instances else data.name] = data.data
+    return found
+
+
+def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArray, flight: str) -> int:
+    """Assert that messages have the values of a log in all fields; return how many values were compared."""
+    topic, compared = stream.partition("/")[0], 0
+    for column, values in raw.items():
+        *outer, last = re.sub(r"\[(\d+)\](?=.*\.)", r"_\1", column).split(".")
+        name, _, index = last.partition("[")
+        name = "_".join([*outer, name])
+        if last.startswith("_padding") or (flight.startswith("cube") and name in BEFORE_1_13.get(topic, ())):
+            continue
+        expected, fields = values, [name]
+        if topic in BY_TOPIC:
+            if name in CONVERTED and MESSAGES["SensorGps"] is BY_TOPIC[topic]:
+                field, scale = CONVERTED[name]
+                expected, fields = values / scale, [field]
+            elif name not in BY_TOPIC[topic].types:
+                fields = list(BY_TOPIC[topic].plan([name]).provided)
+        for field in fields:
+            ours = array[field][:, int(index[:-1])] if index else array[field]
+            assert ours.tobytes() == expected.astype(ours.dtype).tobytes(), (stream, column)
+            assert np.array_equal(ours, expected, equal_nan=expected.dtype.kind == "f"), (stream, column)
+            compared += len(ours)
+    return compared
+
+
+@each_flight
+def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
+    """Every topic of every log is read, each value to the bit; what is left out is known, with its reason."""
+    raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
+    assert arrays.keys() == raw.keys()
+    left_out = {topic: count for (log, topic, _), count in REJECTED.items() if log == flight.stem}
+    compared = 0
+    for stream, array in arrays.items():
+        count = len(raw[stream]["timestamp"])
+        assert len(array) == count - left_out.get(stream, 0), stream
+        compared += compare(stream, raw[stream], array, flight.stem) if len(array) == count else 0
+    assert compared > 100_000
+
+
+@pytest.mark.slow
+@each_flight
+def test_every_message_of_a_replay_is_its_value(flight: Path) -> None:
+    """A source delivers every topic of a log, and its messages are those of the arrays; nothing else is rejected."""
+    run = open_replay(f"ulog:{flight}?topics=*")
+    assert (len(run.addresses), run.total) == STREAMS[flight.stem]
+    assert run.damage is None
+    arrays = nedbus.read(flight, ["*"])
+    messages: dict[str, list[Any]] = {}
+    rejected: Counter[tuple[str, str, str]] = Counter()
+    for each in run.messages:
+        definition = each.definition or BY_TOPIC[each.address.topic]
+        try:
+            message = upgrade_with(definition, each.fields)
+        except ValidationError as exc:
+            rejected[flight.stem, each.address.topic, describe(exc, definition)] += 1
+        else:
+            messages.setdefault(each.address.stream, []).append(message)
+    assert rejected == {key: count for key, count in REJECTED.items() if key[0] == flight.stem}
+    assert messages.keys() == {stream for stream, array in arrays.items() if len(array)}
+    for stream, found in messages.items():
+        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), stream
+
+
+@pytest.mark.slow
+@each_flight
+def test_every_message_of_a_log_reaches_another_process(
+    flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
+    """All topics of a log go log -> daemon -> router -> reader: what arrives are the arrays, and nothing is missing."""
+    arrays = {stream: array for stream, array in nedbus.read(flight, ["*"]).items() if len(array)}
+    rejected = sum(count for (log, _, _), count in REJECTED.items() if log == flight.stem)
+    messages: dict[str, list[Any]] = {}
+    with bus.subscribe("*", mode="every") as subscription:
+        source = f"ulog:{flight}?topics=*&speed=max&wait=1"
+        service = run_nedbus("serve", "--connect", endpoint, "--until-done", "--source", source)
+        for _ in range(STREAMS[flight.stem][1] - rejected):
+            sample = subscription.receive(DEADLINE)
+            messages.setdefault(sample.address.stream, []).append(sample.message)
+        assert service.wait() == 0, service.err
+        assert (subscription.counts.lost, subscription.counts.invalid) == (0, 0)
+    assert messages.keys() == arrays.keys()
+    for stream, found in messages.items():
+        assert arrays_of(found[0].DEFINITION).of(found).tobytes() == arrays[stream].tobytes(), stream
+    assert f"{rejected:,} rejected" in service.err
+
+
+@pytest.mark.slow
+@each_flight
+def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
+    """A recording has every message of a log, with what is missing, also of topics that only the log describes."""
+    path = tmp_path / "flight.mcap"
+    convert_replay(f"ulog:{flight}?topics=*", path)
+    before, after = nedbus.read(flight, ["*"]), nedbus.read(path, ["*"])
+    assert after.keys() == {stream for stream, array in before.items() if len(array)}
+    for stream, array in after.items():
+        assert array.tobytes() == before[stream].tobytes(), stream
+        assert nedbus.missing_of(array) == nedbus.missing_of(before[stream]), stream
+    assert nedbus.utc_of(path) == nedbus.utc_of(flight)
+    with RecordingReader(path, vehicle="1") as reader:
+        for recorded in reader.counts:
+            provided = recorded.definition.all_fields - recorded.missing
+            assert recorded.layout is recorded.definition.recorded_layout(provided)
+
+
+@each_flight
+def test_utc_is_what_a_log_tells(flight: Path) -> None:
+    """A GNSS receiver tells it, or a companion's clock; of a log where none does it is absent."""
+    found = nedbus.utc_of(flight)
+    told = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
+    assert told == UTC.get(flight.stem)
+    assert found is None or found.spread_us < 1_000_000
+
+
+@each_flight
+def test_log_is_one_table(flight: Path) -> None:
+    """All topics of a log stand in one table, at the times of one of them: each value is that of the last message."""
+    raw = raw_streams(flight)
+    table = nedbus.align(flight, topics=["*"], utc=True)
+    assert len(table) == len(raw["vehicle_local_position"]["timestamp"])
+    for name in [name for name in table.dtype.names or () if name.endswith(".timestamp")]:
+        stream = name.removesuffix(".timestamp")
+        stamps = np.sort(raw[stream]["timestamp"])
+        rows = np.searchsorted(stamps, table["timestamp"], side="right") - 1
+        expected = np.where(rows < 0, 0, stamps[rows])
+        if not any(key[:2] == (flight.stem, stream) for key in REJECTED):
+            assert np.array_equal(table[name], expected), name
+            assert np.array_equal(np.isnan(table[f"{stream}.age"]), rows < 0)
+
+
+def test_plot_of_another_topic_says_why_not(tmp_path: Path) -> None:
+    """Only positions have a track; the error says how to look at others."""
+    plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
+    assert plot.exit_code == 2
+    assert "vehicle_attitude has no track to draw" in plot.err
+    drawn = run_command("plot", str(LOGS.parent / "px4" / "twelve_messages.ulg"), "-t", "*", "-o", f"{tmp_path}/a.png")
+    assert drawn.exit_code == 0, drawn.err

@@ -1,0 +1,91 @@
+"""Messages that have no file here: from a log over a service to readers that learn from its publisher what they are."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+
+import msgpack
+import pytest
+
+import nedbus
+from nedbus.transport import Session
+from tests.contract.test_messages import write_wheels
+from tests.processes import Start
+from tests.waits import DEADLINE
+
+from .answering import answering, reply_with
+
+COUNT = 500
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("form", ["models", "rows", "batches"])
+def test_message_of_a_log_is_read_without_a_file(
+    tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
+) -> None:
+    """Nothing of it is lost while the reader asks what it is, in any form; the values are those of the log."""
+    log = write_wheels(tmp_path / "rover.ulg", COUNT)
+    with bus.subscribe("wheel_encoders", mode="every") as subscription:
+        run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
+        read: list[tuple[int, tuple[float, ...]]] = []
+        while len(read) < COUNT:
+            if form == "batches":
+                batch = subscription.receive_batch(DEADLINE)
+                assert batch.message.__name__ == "WheelEncoders"
+                read += zip(
+                    batch.messages["timestamp"].tolist(),
+                    map(tuple, batch.messages["wheel_speed"].tolist()),
+                    strict=True,
+                )
+                continue
+            message = next(iter(subscription) if form == "models" else subscription.rows()).message
+            read.append((message.timestamp, message.wheel_speed))
+        assert read == [(number + 1, (number, -number)) for number in range(COUNT)]
+        assert subscription.counts == nedbus.Counts(received=COUNT)
+    [last] = bus.latest("wheel_encoders")
+    assert (last.source, last.missing, last.message.wheel_angle) == ("ulog", frozenset(), (0.5, 0.5))
+    assert last.address in [address for addresses in bus.vehicles().values() for address in addresses]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"[" * 10_000,
+        b'{"layouts": 7}',
+        {"fields": [{"name": f"f{number}", "type": "float32"} for number in range(100_000)]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "float32[999999999]"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "__class__", "type": "uint8"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "model_fields", "type": "uint8"}]},
+        {"fields": [{"name": "timestamp", "type": "uint64"}, {"name": "x", "type": "__import__('os')"}]},
+        {"fields": [{"name": "x", "type": "uint8"}]},
+        {"fields": []},
+    ],
+)
+def test_hostile_description_harms_nobody(
+    client: nedbus.Bus, bus: nedbus.Bus, raw: Session, answer: bytes | dict[str, object]
+) -> None:
+    """A peer that says nonsense of a message of its own: that message is invalid, and others are read."""
+    payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
+    schema = "nedbus/@schema/Evil"
+    with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
+        good = bus.publisher("vehicle_attitude", vehicle="1")
+        raw.put("nedbus/7/evil", msgpack.packb([0, 1, 2]), encoding="application/msgpack;px4_msgs/Evil")
+        good.publish({"timestamp": 5})
+        assert subscription.receive(DEADLINE).message == nedbus.VehicleAttitude(timestamp=5)
+        while not subscription.counts.invalid:  # of another priority: it may come later
+            with suppress(nedbus.NoDataError):
+                subscription.receive(0.1)
+
+
+def test_message_of_unknown_encoding_says_so(
+    client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without a message in its encoding nobody can be asked what it is."""
+    with client.subscribe("wheel_encoders") as subscription:
+        raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
+        with pytest.raises(nedbus.NoDataError):
+            subscription.receive(0.5)
+        assert subscription.counts.invalid == 1
+    assert "nothing says which message it is: its encoding is 'text/plain'" in caplog.text

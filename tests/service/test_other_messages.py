@@ -1,0 +1,227 @@
+"""Messages other than the first, over a real router: one with arrays, and one of flags that has instances."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+import nedbus
+from nedbus import Counts
+from nedbus.cli.format import to_line
+from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.receiving import Receiver
+from nedbus.transport import open_client
+from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, encode, field_type
+from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from tests.command_line import run_command
+from tests.messages import VLP, message
+from tests.waits import DEADLINE, wait_for, wait_for_reader
+
+from .lossy import LossyQueue
+from .publishing import take, wait_for_subscriber
+from .thinning import MS, Clock, clock, wait_for_demand
+
+__all__ = ["clock"]  # a fixture
+
+ATTITUDE: Final = Address("7", "vehicle_attitude")
+FLAGS: Final = Address("7", "estimator_status_flags", 1)
+BOTH: Final = pytest.mark.parametrize("address", [ATTITUDE, FLAGS], ids=["attitude", "flags"])
+
+
+def definition_of(address: Address) -> Definition[Any]:
+    return BY_TOPIC[address.topic]
+
+
+def make(address: Address, number: int) -> Message:
+    """Return a message with this timestamp, and values that follow from it; not all fields are given."""
+    half = number / 20
+    fields: dict[str, object] = {
+        "q": (math.cos(half), 0.0, 0.0, math.sin(half)),
+        "delta_q_reset": (1, 0, math.nan, -0.0),
+    }
+    if address == FLAGS:
+        fields = {"control_status_changes": 2**32 - number - 1, "cs_in_air": number % 2 == 0, "fs_bad_hdg": True}
+    made: Message = definition_of(address).model.model_validate({"timestamp": number, **fields})
+    return made
+
+
+def array_of(address: Address, numbers: range) -> MessageArray:
+    return arrays_of(definition_of(address)).of([make(address, number) for number in numbers])
+
+
+def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Publisher:
+    return bus.publisher(address.topic, vehicle=address.vehicle, instance=address.instance, **options)
+
+
+@pytest.fixture
+def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
+    """Subscribe to all; named before `bus` it ends after that, which would wait 5 s for a reader that has gone."""
+    with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
+        yield subscription
+
+
+@BOTH
+def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
+    """From either client it is its model, equal to the bit, with what was not given; latest has the last one."""
+    publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
+    publisher.publish(make(address, 4))
+    subscription = client.subscribe(address.topic, mode="every")
+    assert take(subscription, 1) == [4]
+    wait_for_subscriber(publisher)
+    publisher.publish(sent)
+    sample = subscription.receive(DEADLINE)
+    wait_for(lambda: client.latest(address.topic)[0].message == sent, what="the last one")
+    for each in (sample, *client.latest(address.topic), *client.latest("*", vehicle="7")):
+        assert type(each.message) is definition_of(address).model
+        assert encode(each.message) == encode(sent)
+        assert (each.address, each.source) == (address, "ins")
+        assert each.missing == definition_of(address).all_fields - sent.model_fields_set
+    assert client.latest() == []
+
+
+@BOTH
+def test_invalid_message_names_its_field(bus: nedbus.Bus, address: Address) -> None:
+    """Another length, another type, another message: nothing of it is published."""
+    publisher = publisher_of(bus, address)
+    wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
+    with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
+        publisher.publish({"timestamp": 1, **wrong})
+    with pytest.raises(TypeError, match=f"carries {definition_of(address).name}, not VehicleLocalPosition"):
+        publisher.publish(message(1))
+    assert publisher.published == 0
+
+
+@BOTH
+def test_rows_and_batches_hold_everything(
+    subscription: nedbus.Subscription[Any], bus: nedbus.Bus, address: Address
+) -> None:
+    """Sent as rows and as an array, read as rows and as arrays: the same bytes, in order, none lost."""
+    publisher, sent = publisher_of(bus, address, lossless=True), array_of(address, range(1, 301))
+    wait_for_subscriber(publisher)
+    for number in range(1, 301):
+        publisher.publish_row(tuple(make(address, number).__dict__.values()))
+    rows = [sample.message for sample in islice(subscription.rows(), 300)]
+    assert all(isinstance(row, Row) for row in rows)
+    assert np.array([tuple(row) for row in rows], sent.dtype).tobytes() == sent.tobytes()
+    publisher.publish_many(sent)
+    batches, taken = subscription.batches(), list[MessageArray]()
+    while sum(map(len, taken)) < len(sent):
+        batch = next(batches)
+        assert (batch.message.DEFINITION, batch.addresses) == (definition_of(address), (address,))
+        taken.append(batch.of(address))
+    assert np.concatenate(taken).tobytes() == sent.tobytes()
+    assert subscription.counts == Counts(received=2 * len(sent))
+
+
+def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
+    """What arrives mixed is read as arrays of one dtype each, of all addresses of that message."""
+    addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
+    publishers = {address: publisher_of(bus, address) for address in addresses}
+    for publisher in publishers.values():
+        wait_for_subscriber(publisher)
+    for number in range(1, 101):
+        for address, publisher in publishers.items():
+            publisher.publish(message(number) if address.topic == VLP else make(address, number))
+    taken: dict[Address, list[int]] = {address: [] for address in addresses}
+    for batch in subscription.batches():
+        assert batch.messages.dtype == arrays_of(batch.message.DEFINITION).dtype
+        for address in batch.addresses:
+            assert definition_of(address) is batch.message.DEFINITION
+            taken[address] += batch.of(address)["timestamp"].tolist()
+        if sum(map(len, taken.values())) == 400:
+            break
+    assert set(map(tuple, taken.values())) == {tuple(range(1, 101))}
+
+
+@BOTH
+def test_max_rate_thins_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
+    """Of 1 s at 100 Hz there arrive ten, evenly, as they were."""
+    publisher = publisher_of(bus, address)
+    publisher.publish(make(address, 0))
+    subscription = client.subscribe(address.topic, mode="every", max_rate=10)
+    assert take(subscription, 1) == [0]
+    wait_for_demand(publisher)
+    for number in range(1, 101):
+        clock.now += 10 * MS
+        publisher.publish(make(address, number))
+    assert [subscription.receive(DEADLINE).message for _ in range(10)] == [
+        make(address, number) for number in range(1, 101, 10)
+    ]
+
+
+@BOTH
+def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
+    """A reader of mode `every` gets what did not come from the publisher's cache, in order."""
+    publisher, queue = publisher_of(bus, address), LossyQueue()
+    queue.missing = {1, 2, 3, 6}
+    with closing(Housekeeping()) as housekeeping, closing(open_client([endpoint], timeout=DEADLINE)) as session:
+        receiver = Receiver(session, address.key(), queue, housekeeping=housekeeping)
+        with nedbus.Subscription[Any](receiver, queue, name="lossy", owner=None) as subscription:
+            wait_for_reader(bus._session, address.key())
+            for number in range(10):
+                publisher.publish(make(address, number))
+            received = [subscription.receive(DEADLINE).message for _ in range(10)]
+            assert received == [make(address, number) for number in range(10)]
+            assert subscription.counts == Counts(received=10)
+
+
+def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
+    """Arrays are numbers with nine digits, columns of CSV, and lists of JSON with NaN as text."""
+    with publisher_of(bus, ATTITUDE) as publisher:
+        publisher.publish(make(ATTITUDE, 2))
+        wait_for(lambda: bus.latest(ATTITUDE.topic), what="the message")
+        got = run_command("get", "-c", endpoint, ATTITUDE.topic, "--field", "q,delta_q_reset")
+        assert got.out.splitlines()[1:] == [
+            "  q: 0.995004177 0 0 0.099833414", "  delta_q_reset: 1 0 nan -0", "---"
+        ]  # fmt: skip
+        lines = run_command("echo", "-c", endpoint, str(ATTITUDE), "--csv", "--once").out.splitlines()
+        (row,) = csv.DictReader(lines)
+        assert row["q[0]"] == "0.995004177"
+        assert row["delta_q_reset[2]"] == "nan"
+        shown = json.loads(run_command("echo", "-c", endpoint, ATTITUDE.topic, "--json", "--once").out)
+        assert shown["message"]["delta_q_reset"] == [1.0, 0.0, "NaN", 0.0]
+        assert shown["missing"] == ["quat_reset_counter", "timestamp_sample"]
+        assert str(ATTITUDE) in run_command("list", "-c", endpoint).out
+        assert json.loads(run_command("schema", ATTITUDE.topic).out)["title"] == "VehicleAttitude"
+
+
+def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: nedbus.Bus) -> None:
+    """What is published can be described, whoever defined it; anything else is an error that names what is known."""
+    definition = define("WheelEncoders", {"timestamp": field_type("uint64"), "wheel_speed": field_type("float32[2]")})
+    with bus._publishers.publisher(Address("7", "wheel_encoders"), definition) as publisher:
+        publisher.publish({"timestamp": 1})
+        wait_for(lambda: bus.latest("wheel_encoders"), what="the message")
+        shown = json.loads(run_command("schema", "wheel_encoders", "-c", endpoint).out)
+        assert shown["description"] == "A message of PX4 that has no file in nedbus."
+        assert list(shown["properties"]) == ["timestamp", "wheel_speed"]
+    for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
+        ended = run_command("schema", wrong, "-c", endpoint)
+        assert (ended.exit_code, ended.out) == (2, "")
+        assert "nor is it a topic that is published: VehicleLocalPosition, " in ended.err
+
+
+def test_line_says_what_was_lost_before_what_has_no_room() -> None:
+    """A terminal cuts the end of a long line: what is known of the sample stands before its fields."""
+    sample = nedbus.Sample(make(FLAGS, 2), FLAGS, received=1, lost=3)
+    assert to_line(sample).split(" s  ")[1] == "[3 lost]  control_status_changes 4294967293  cs_in_air  fs_bad_hdg"
+
+
+def test_size_is_that_of_its_own_codec(bus: nedbus.Bus) -> None:
+    """A payload of another message under the key is invalid, and counted."""
+    with bus.subscribe(ATTITUDE.topic, mode="every") as subscription:
+        session = bus._session
+        session.put(ATTITUDE.key(), encode(message(1)))
+        session.put(
+            ATTITUDE.key(), encode(make(ATTITUDE, 2)), encoding=f"application/msgpack;{definition_of(ATTITUDE).name}"
+        )
+        assert subscription.receive(DEADLINE).message == make(ATTITUDE, 2)
+        assert subscription.counts.invalid == 1
+        assert len(encode(make(ATTITUDE, 2))) == codec_of(definition_of(ATTITUDE)).size
