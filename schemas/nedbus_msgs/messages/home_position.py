@@ -31,20 +31,7 @@ class HomePosition(Message):
     RULES: ClassVar = (
         Within("lat", 90.0),
         Within("lon", 180.0),
-        FiniteWhile(
-            {
-                "valid_hpos": (
-                    "lat",
-                    "lon",
-                ),
-                "valid_alt": ("alt",),
-                "valid_lpos": (
-                    "x",
-                    "y",
-                    "z",
-                ),
-            }
-        ),
+        FiniteWhile({"valid_hpos": ("lat", "lon"), "valid_alt": ("alt",), "valid_lpos": ("x", "y", "z")}),
     )
 
     timestamp: Uint64 = Field(description="Time since boot [us]")

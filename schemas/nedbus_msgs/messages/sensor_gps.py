@@ -71,15 +71,7 @@ class SensorGps(Message):
         Within("latitude_deg", 90.0),
         Within("longitude_deg", 180.0),
         NotNegative("eph", "epv"),
-        FiniteWhile(
-            {
-                "vel_ned_valid": (
-                    "vel_n_m_s",
-                    "vel_e_m_s",
-                    "vel_d_m_s",
-                )
-            }
-        ),
+        FiniteWhile({"vel_ned_valid": ("vel_n_m_s", "vel_e_m_s", "vel_d_m_s")}),
     )
 
     FIX_TYPE_NONE: ClassVar = 1

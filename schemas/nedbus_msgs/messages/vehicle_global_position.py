@@ -38,16 +38,7 @@ class VehicleGlobalPosition(Message):
         Within("lat", 90.0),
         Within("lon", 180.0),
         NotNegative("eph", "epv"),
-        FiniteWhile(
-            {
-                "lat_lon_valid": (
-                    "lat",
-                    "lon",
-                ),
-                "alt_valid": ("alt",),
-                "terrain_alt_valid": ("terrain_alt",),
-            }
-        ),
+        FiniteWhile({"lat_lon_valid": ("lat", "lon"), "alt_valid": ("alt",), "terrain_alt_valid": ("terrain_alt",)}),
     )
 
     timestamp: Uint64 = Field(description="Time since boot [us]")
