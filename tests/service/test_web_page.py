@@ -260,9 +260,10 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
     until(lambda: len(page.marks) == 1, "the vehicle")
 
     def jump(share: float) -> None:
-        bar = page.page.locator(".noUi-base").bounding_box()  # now: what is told above it has more or fewer lines
-        assert bar is not None
-        page.page.mouse.click(bar["x"] + bar["width"] * share, bar["y"] + bar["height"] / 2)
+        bar = page.page.locator(".noUi-base")  # it moves: what is told above it has more or fewer lines
+        box = bar.bounding_box()
+        assert box is not None
+        bar.click(position={"x": box["width"] * share, "y": box["height"] / 2})
 
     jump(0.75)
     until(lambda: page.states == {"wing": "invalid"}, "the second minute")
