@@ -260,7 +260,8 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
     until(lambda: len(page.marks) == 1, "the vehicle")
 
     def jump(share: float) -> None:
-        bar = page.page.locator(".noUi-base")  # it moves: what is told above it has more or fewer lines
+        # It moves, as what is told above it has more or fewer lines, and is deaf for 0.3 s after each click.
+        bar = page.page.locator(".noUi-target:not(.noUi-state-tap) .noUi-base")
         box = bar.bounding_box()
         assert box is not None
         bar.click(position={"x": box["width"] * share, "y": box["height"] / 2})
