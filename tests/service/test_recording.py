@@ -111,21 +111,26 @@ def test_recording_is_replayed_to_the_bit(
 
 @pytest.mark.slow
 def test_power_cut_costs_a_second_at_most(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
-    """After kill -9 the file opens with an independent reader, and ends within a second of the last message."""
-    path = tmp_path / "cut.mcap"
-    recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), measured=False)
-    wait_for(path.exists, what="the file")
+    """After kill -9 the file opens with an independent reader, and ends within a second of the last message.
+
+    A busy machine may hold up the recorder for longer than that, but hardly at each of five moments.
+    """
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
-        first = subscription.receive(DEADLINE).message.timestamp
-        wait_for(lambda: subscription.receive(DEADLINE).message.timestamp > first + 3_500_000, what="some seconds")
-        recorder.kill()
-        last = subscription.receive(DEADLINE).message.timestamp
-    times = [each.timestamp for topic, _, _, each in read_independently(path) if topic == f"/1/{VLP}"]
-    assert times == sorted(times)
-    # Messages that it had not received when it was killed do not count: a machine may be slow.
-    assert last - times[-1] < 3_000_000
-    assert len(times) > 150
+    costs: list[int] = []
+    while not costs or (costs[-1] >= 1_500_000 and len(costs) < 5):
+        path = tmp_path / f"cut{len(costs)}.mcap"
+        recorder = run_nedbus("record", "-c", endpoint, "-o", str(path), measured=False)
+        wait_for(path.exists, what="the file")
+        with nedbus.connect(endpoint) as bus, bus.subscribe(VLP) as subscription:
+            first = subscription.receive(DEADLINE).message.timestamp
+            while subscription.receive(DEADLINE).message.timestamp <= first + 3_500_000:
+                pass
+            recorder.kill()
+            last = subscription.receive(DEADLINE).message.timestamp
+        times = [each.timestamp for topic, _, _, each in read_independently(path) if topic == f"/1/{VLP}"]
+        assert times == sorted(times)
+        costs.append(last - times[-1] if times else last)
+    assert costs[-1] < 1_500_000
 
 
 def test_file_is_complete_after_every_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
