@@ -10,7 +10,7 @@ from typing import cast
 
 import zenoh
 
-from nedbus.transport import Session
+from nedbus.transport import Session, alive_keys
 
 DEADLINE = 30.0
 """Seconds that a test waits for a condition before it fails."""
@@ -29,6 +29,11 @@ def wait_for_reader(raw: Session, key: str) -> None:
     probe = raw.declare_publisher(key)
     wait_for(lambda: cast("zenoh.MatchingStatus", probe.matching_status).matching, what=f"a subscriber of {key}")
     probe.undeclare()
+
+
+def wait_for_router(raw: Session) -> None:
+    """Wait until the router knows what a session has declared: it answers in the order in which it is told."""
+    alive_keys(raw, "nowhere", timeout=DEADLINE)
 
 
 @contextmanager

@@ -99,7 +99,7 @@ for sample in subscription:
     wait_for(lambda: "ready" in process.out, what=f"the script: {process.err}")
     process.signal(number)
     signalled = time.monotonic()
-    assert process.wait() == -number
+    assert process.wait() == -number, process.err
     assert time.monotonic() - signalled < LIMIT
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -50,6 +50,8 @@ class Client:
             elif content["op"] == "unadvertise":
                 for number in content["channelIds"]:
                     del self.channels[number]
+            elif content["op"] == "status" and "Unknown channel" in content["message"]:
+                self._subscribe([int(content["message"].split()[-1])])  # the SDK advertises it before it knows it
             return content
         if frame[0] == 1:
             number, when = struct.unpack_from("<IQ", frame, 1)
@@ -71,7 +73,9 @@ class Client:
             self.receive()
 
     def subscribe(self, *topics: str) -> None:
-        numbers = [self.topics[topic] for topic in topics]
+        self._subscribe([self.topics[topic] for topic in topics])
+
+    def _subscribe(self, numbers: Sequence[int]) -> None:
         subscriptions = [{"id": number, "channelId": number} for number in numbers]
         self._socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 

@@ -305,7 +305,9 @@ def test_every_message_arrives_as_it_was_logged(where: str) -> None:
             total += bool(sent.payload)
         wait_for(lambda: status_of_source(bus)["published"] >= total, what="all of it")
         while received < total:
+            before = received
             receive(DEADLINE)
+            assert received > before, every.counts
         now = status_of_source(bus)
         assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (total, 0, 11, 0)
         assert (now["not_carried"], now["silent"]) == ([], [])

@@ -24,7 +24,7 @@ from nedbus_msgs import encode
 from tests.first_message import encoding_of
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for, wait_for_reader, wait_for_router
 
 from .answering import answering, reply_with
 from .lossy import Lossy, LossyQueue
@@ -131,6 +131,7 @@ def test_newest_message_is_recovered_by_heartbeat(
     received: list[int] = []
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
     foreign = raw.declare_subscriber(KEY, seen)
+    wait_for_router(raw)
     lossless = LossyQueue()
     other = Receiver(lossy.session, KEY, lossless, housekeeping=housekeeping)
 
