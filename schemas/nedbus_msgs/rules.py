@@ -153,19 +153,6 @@ class InRange(_OfEach):
         return outside if self._unknown is None else f"({outside} and ({value} != {self._unknown!r}))"
 
 
-class OneOf(_OfEach):
-    """A field is one of these numbers."""
-
-    def __init__(self, field: str, *values: int) -> None:
-        super().__init__(field)
-        self._values = values
-        self.reason = f"must be one of {', '.join(map(str, values))}"
-
-    def wrong(self, value: str) -> str:
-        """Compare with each."""
-        return "(" + " and ".join(f"({value} != {each})" for each in self._values) + ")"
-
-
 class NotLater:
     """One time is not later than another."""
 

@@ -190,7 +190,7 @@ def _other_topic(name: object) -> Topic:
     if not isinstance(name, str) or not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
         raise AddressError("topic", name, f"one of {', '.join(TOPICS)}, or another of PX4's in lower_snake_case")
     if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
-        raise AddressError("topic", name, f"one of {', '.join(meant)}, which it nearly is")
+        raise AddressError("topic", name, f"{' or '.join(meant)}, of which it looks like a misspelling")
     return Topic(name, 0.0, "another topic of PX4's", instances=None)
 
 

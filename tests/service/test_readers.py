@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 
+import psutil
 import pytest
 
 import nedbus
@@ -58,10 +59,13 @@ reader = pytest.fixture(name="reader")(subscribe)
 stuck_reader = pytest.fixture(name="stuck")(subscribe)
 
 
-def publish_all(bus: nedbus.Bus, *, count: int = COUNT) -> tuple[nedbus.Publisher, threading.Thread]:
-    """Start to publish messages without losing any, once there is a reader."""
+def publish_all(
+    bus: nedbus.Bus, *, count: int = COUNT, before: Callable[[], object] = lambda: None
+) -> tuple[nedbus.Publisher, threading.Thread]:
+    """Start to publish messages without losing any, once there is a reader, and something was done before."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
+    before()
     thread = threading.Thread(target=publisher.publish_many, args=[numbered(count)], daemon=True)
     thread.start()
     return publisher, thread
@@ -98,9 +102,14 @@ def test_stopped_reader_gets_everything(
         monkeypatch.setattr("nedbus.client.publishing.flow_control.LEASE", float(lease))
     stopped = start("-c", READER, endpoint, str(COUNT), when, *([str(lease)] if lease != LEASE else []))
     wait_for(lambda: "ready" in stopped.out, what="the reader")
-    if when == "before":
-        stopped.popen.send_signal(signal.SIGSTOP)
-    publisher, sending = publish_all(bus)
+
+    def stop() -> None:
+        if when == "before":
+            stopped.popen.send_signal(signal.SIGSTOP)
+
+    publisher, sending = publish_all(bus, before=stop)
+    process = psutil.Process(stopped.popen.pid)  # a lease of 1 s may end before the stop, on a busy machine
+    wait_for(lambda: process.status() == psutil.STATUS_STOPPED, what="the stop")
     wait_for(lambda: not is_read(publisher), what="the end of the lease")
     assert sending.is_alive()
     stopped.popen.send_signal(signal.SIGCONT)
