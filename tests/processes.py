@@ -65,7 +65,8 @@ class Zygote:
                 [sys.executable, "-m", "tests.zygote", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 cwd=Path(__file__).parents[1],
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},  # what has threads cannot be forked
+                # Coverage begins in the forked process, if at all; what has threads cannot be forked.
+                env=unmeasured() | {"OPENBLAS_NUM_THREADS": "1"},
             )
 
     def start(

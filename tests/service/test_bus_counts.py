@@ -322,7 +322,8 @@ def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None
             sys.setprofile(note)
             next(subscription)
             sys.setprofile(None)
-    usual = sorted(called, key=len)[10]
+    waited = [names for names in called if any(name.startswith("Receiver.") for name in names)]  # others came with one
+    usual = sorted(waited, key=len)[len(waited) // 2]
     assert len(usual) <= 22
     classes = {name.partition(".")[0] for name in usual if name[0].isupper()}
     assert classes == {"Subscription", "Receiver", "PendingQueue", "StatefulReader", "Decoder"}
