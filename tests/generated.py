@@ -100,10 +100,15 @@ def page(definition: Definition[Any]) -> str:
     parts += table("Rules", ["fields", "rule"], [row for rule in definition.rules for row in rows_of(rule)])
     older = getattr(cls, "OLDER", {})
     parts += table("Older names", ["older field", "now"], [
-        [f"`{name}`", " and ".join(f"`{new}`" for new in old.new) + ", in other units" * bool(old.up)]
+        [f"`{name}`", " and ".join(map(_place, old.new)) + ", in other units" * bool(old.up)]
         for name, old in older.items()
     ])  # fmt: skip
     return "\n\n".join(parts) + "\n"
+
+
+def _place(place: tuple[str, int | None]) -> str:
+    name, index = place
+    return f"`{name}`" if index is None else f"`{name}[{index}]`"
 
 
 def rows_of(rule: Rule) -> list[list[str]]:

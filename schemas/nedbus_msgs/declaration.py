@@ -65,7 +65,7 @@ class Layout:
 class Older:
     """A field of older layouts, and the fields of the model that have its value now; make it with `older`."""
 
-    new: tuple[str, ...]
+    new: tuple[tuple[str, int | None], ...]
     up: Callable[[Any], Any] | None
     down: Callable[[Any], Any] | None
     type: FieldType | None
@@ -85,5 +85,10 @@ def older(
     `up` and `down` convert a value; without them it is only renamed.
     `type` is PX4's type of the old field where that is another one, and `doc` its meaning.
     """
-    names = (new,) if isinstance(new, str) else new
-    return Older(names, up, down, field_type(type) if type else None, doc)
+    places = tuple(map(_place, (new,) if isinstance(new, str) else new))
+    return Older(places, up, down, field_type(type) if type else None, doc)
+
+
+def _place(text: str) -> tuple[str, int | None]:
+    name, _, index = text.rstrip("]").partition("[")
+    return name, int(index) if index else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
-from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, Self, TypeVar, cast
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
 from .declaration import ALL, EVERY, RELEASES, Layout, Older, Topic
 from .errors import LayoutError
@@ -29,7 +29,8 @@ class Row(tuple[Any, ...]):
     """
 
     __slots__ = ()
-    _fields: tuple[str, ...] = ()
+    DEFINITION: ClassVar[Definition[Any]]
+    _fields: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def _make(cls, values: Iterable[Any]) -> Self:
@@ -43,7 +44,7 @@ class Row(tuple[Any, ...]):
         return f"{type(self).__name__}({values})"
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _row, (_definition_of_row(type(self)), tuple(self))
+        return _row, (self.DEFINITION, tuple(self))
 
 
 class Plan(NamedTuple):
@@ -106,7 +107,10 @@ class Definition(Generic[M_co]):
         numbers = {name: number for number, name in (self._wire or {}).items()}
         found: dict[str, Layout] = {}
         for name, text in self._texts.items():
-            types = self.types if text == EVERY else self._types_of(text, found)
+            try:
+                types = self.types if text == EVERY else self._types_of(text, found)
+            except (KeyError, ValueError) as exc:
+                raise LayoutError(f"layout {name} of {self.name}: {exc}: no field or layout is called so") from None
             found[name] = Layout(name, numbers.get(name), types)
         if not self._wire:
             name = next(
@@ -197,7 +201,7 @@ class Definition(Generic[M_co]):
         return f"<Definition of {self.name}>"
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _definition_of, (self.model,)
+        return attrgetter("DEFINITION"), (self.model,)
 
     def _types_of(self, text: str, before: Mapping[str, Layout]) -> Mapping[str, FieldType]:
         """Parse the fields of a layout, or its changes: `1.13, without a b, c: d e` has d and e behind c."""
@@ -207,7 +211,8 @@ class Definition(Generic[M_co]):
         fields = list(before[base].types.items())
         for change in changes:
             if change.startswith("without "):
-                fields = [field for field in fields if field[0] not in change.split()]
+                for gone in change.split()[1:]:
+                    fields.remove((gone, dict(fields)[gone]))
             else:
                 after, _, names = change.partition(":")
                 place = [name for name, _ in fields].index(after) + 1
@@ -222,16 +227,19 @@ class Definition(Generic[M_co]):
         if name in self.types:
             return name, self.types[name]
         old = self._older[name]
-        base, _, part = old.new[0].partition("[")
-        return name, old.type or (FieldType(self.types[base].base) if part else self.types[base])
+        base, index = old.new[0]
+        return name, old.type or (self.types[base] if index is None else FieldType(self.types[base].base))
 
     def _down(self, name: str, kind: FieldType, values: Mapping[str, Any]) -> object:
-        if name not in self._older:
-            return values.get(name, kind.absent)
-        old = self._older[name]
-        base, _, part = old.new[0].partition("[")
-        value = values[base][int(part[:-1])] if part else values[base]
-        return old.down(value) if old.down else value
+        if self.types.get(name) is kind:
+            return values[name]
+        value = values.get(name, kind.absent)
+        if old := self._older.get(name):
+            base, index = old.new[0]
+            value = values[base] if index is None else values[base][index]
+            value = old.down(value) if old.down else value
+        least, greatest = kind.limits
+        return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
     def make_plan(self, names: Sequence[str]) -> Plan:
         """Make what `plan` returns, and keeps."""
@@ -240,12 +248,11 @@ class Definition(Generic[M_co]):
         converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
         parts: dict[str, list[str | None]] = {}
         for name, old in older.items():
-            for new in old.new:
-                base, _, part = new.partition("[")
+            for base, index in old.new:
                 if base in direct or base in converted:
                     continue
-                if part:
-                    parts.setdefault(base, [None] * self.types[base].count)[int(part[:-1])] = name
+                if index is not None:
+                    parts.setdefault(base, [None] * self.types[base].count)[index] = name
                 elif old.up:
                     converted[base] = name, old.up
                 else:
@@ -257,14 +264,6 @@ class Definition(Generic[M_co]):
 @lru_cache(256)  # all messages of a stream have the same names
 def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
     return definition.make_plan(names)
-
-
-def _definition_of(model: type[Message]) -> Definition[Any]:
-    return model.DEFINITION
-
-
-def _definition_of_row(row: type[Row]) -> Definition[Any]:
-    return cast("Any", row).DEFINITION  # type: ignore[no-any-return]
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:

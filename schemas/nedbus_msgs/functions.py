@@ -6,7 +6,6 @@ from typing import Any, Final, cast
 
 from typing_extensions import TypeVar
 
-from . import messages as _all  # noqa: F401 - so that all messages are known
 from .codecs.msgpack import Newer, codec_of
 from .definition import Definition
 from .message import Message

@@ -5,7 +5,7 @@ A layout is found by its field names or given by its name; never by MESSAGE_VERS
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
 from .declaration import Layout
@@ -33,10 +33,18 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
     plan = definition.plan(fields)
     upgraded = {name: fields[old] for name, old in plan.names.items()}
     if plan.converted or plan.parts:
-        upgraded |= {name: convert(fields[old]) for name, (old, convert) in plan.converted.items()}
+        upgraded |= {name: _converted(convert, fields[old]) for name, (old, convert) in plan.converted.items()}
         for name, olds in plan.parts.items():
             upgraded[name] = tuple(NAN if old is None else fields[old] for old in olds)
     return upgraded
+
+
+def _converted(convert: Callable[[Any], Any], value: object) -> object:
+    """Return a converted value; what is no number stays as it is, for the model to reject."""
+    try:
+        return convert(value)
+    except (TypeError, OverflowError):
+        return value
 
 
 def require_fields(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> None:

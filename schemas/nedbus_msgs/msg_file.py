@@ -58,7 +58,7 @@ def define_msg(name: str, text: str) -> Definition[Message]:
     try:
         return define(
             name,
-            {each.name: each.type for each in fields},
+            ((each.name, each.type) for each in fields),
             meanings={each.name: each.comment for each in fields if each.comment},
             rules=[rule for each in fields for rule in each.rules],
         )
@@ -118,16 +118,13 @@ def _parts(text: str) -> dict[str, list[_Line]]:
 def _flatten(parts: Mapping[str, Sequence[_Line]], message: str, prefix: str, level: int) -> Iterator[MsgField]:
     for line in parts[message]:
         count = re.fullmatch(r"\[(\d{1,3})\]", line.length)
-        if line.base in parts and level < _NESTED and (count or not line.length):
+        if parts.get(line.base) and level < _NESTED and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
                 yield from _flatten(
                     parts, line.base, f"{prefix}{line.name}_" + f"{index}_" * (index is not None), level + 1
                 )
             continue
-        try:
-            kind, name = field_type(line.base + line.length), prefix + line.name
-        except ValueError as exc:
-            raise MsgError(line.number, line.column, str(exc)) from None
+        kind, name = _type_of(line), prefix + line.name
         yield MsgField(name, kind, line.comment, _rules(name, kind, line.comment))
 
 
@@ -135,7 +132,14 @@ def _describe(line: _Line, parts: Mapping[str, object]) -> Described:
     if line.base in parts:
         length = int(line.length.strip("[]") or 0)
         return line.name, NESTED + (ARRAY if length else 0), length, f"{PACKAGE}/{line.base}"
-    return described(line.name, field_type(line.base + line.length))
+    return described(line.name, _type_of(line))
+
+
+def _type_of(line: _Line) -> FieldType:
+    try:
+        return field_type(line.base + line.length)
+    except ValueError as exc:
+        raise MsgError(line.number, line.column, str(exc)) from None
 
 
 def _rules(name: str, kind: FieldType, comment: str) -> tuple[Rule, ...]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
 from pydantic import Field, create_model
 
 from .codecs.msgpack import PAYLOAD_LIMIT, full_width
+from .declaration import EVERY
 from .definition import Definition
 from .message import Message
 from .px4_types import FieldType
@@ -24,7 +25,7 @@ _MOST: Final = 256  # fields of a message; PX4's largest has a third of them
 
 def define(
     name: str,
-    types: Mapping[str, FieldType],
+    fields: Iterable[tuple[str, FieldType]],
     *,
     meanings: Mapping[str, str] | None = None,
     rules: Sequence[Rule] = (),
@@ -37,24 +38,30 @@ def define(
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r:.100} is no name of a message: expected CamelCase of at most 64 characters")
+    types: dict[str, FieldType] = {}
+    for field, kind in fields:
+        if not _FIELD.fullmatch(field):
+            raise ValueError(f"a field cannot be called {field!r:.100}: expected lower_snake_case")
+        if hasattr(Message, field):
+            raise ValueError(f"a field cannot be called {field!r}: a message has a method of that name in Python")
+        if field in types:
+            raise ValueError(f"two fields are called {field!r}, with those of the messages within it")
+        types[field] = kind
     if len(types) > _MOST:
         raise ValueError(f"{len(types)} fields, more than the {_MOST} that a message can have")
-    for field in types:
-        if not _FIELD.fullmatch(field) or (field != "timestamp" and hasattr(Message, field)):
-            raise ValueError(f"a field cannot be called {field!r:.100}: expected lower_snake_case")
     if str(types.get("timestamp")) != "uint64":
         raise ValueError("it has no field 'uint64 timestamp', as every message of PX4 has")
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
     described = meanings or {}
-    fields: dict[str, Any] = {
+    annotated: dict[str, Any] = {
         field: (
             kind.annotation,
             Field(*(() if field == "timestamp" else (kind.absent,)), description=described.get(field)),
         )
         for field, kind in types.items()
     }
-    model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **fields)
-    model.DEFINITION = Definition(model, layouts={PX4: " ".join(types)}, wire={0: PX4}, rules=rules)
+    model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **annotated)
+    model.DEFINITION = Definition(model, layouts={PX4: EVERY}, rules=rules)
     return model.DEFINITION

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import Field, GetCoreSchemaHandler
+from pydantic import GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 NAN: Final = math.nan
@@ -96,12 +96,8 @@ class FieldType:
         """The annotation of a field of this type."""
         if self.length is not None:
             return Annotated[tuple[(FieldType(self.base).annotation,) * self.length], Px4Type(str(self))]  # type: ignore[misc] # as many as it has
-        if self.base == "bool":
-            return Annotated[bool, Px4Type(self.base)]
-        if self.is_float:
-            return Annotated[float, Px4Type(self.base)]
-        least, greatest = self.limits
-        return Annotated[int, Field(ge=least, le=greatest), Px4Type(self.base)]
+        value = bool if self.base == "bool" else float if self.is_float else int
+        return Annotated[value, Px4Type(self.base)]
 
 
 @cache
@@ -114,13 +110,16 @@ def field_type(text: str) -> FieldType:
 
 
 class Px4Type:
-    """Mark a field with PX4's name of its type; floats also read "NaN" and "Infinity" in JSON."""
+    """Mark a field with PX4's name of its type: integers have its limits, floats read "NaN" and "Infinity" in JSON."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         schema = handler(source)
+        if schema["type"] == "int":
+            least, greatest = field_type(self.name).limits
+            return core_schema.int_schema(ge=least, le=greatest)
         if schema["type"] != "float":
             return schema
         names = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
@@ -131,13 +130,13 @@ class Px4Type:
 
 
 Bool = Annotated[bool, Px4Type("bool")]
-Int8 = Annotated[int, Field(ge=-(2**7), le=2**7 - 1), Px4Type("int8")]
-Int32 = Annotated[int, Field(ge=-(2**31), le=2**31 - 1), Px4Type("int32")]
-Int64 = Annotated[int, Field(ge=-(2**63), le=2**63 - 1), Px4Type("int64")]
-Uint8 = Annotated[int, Field(ge=0, le=2**8 - 1), Px4Type("uint8")]
-Uint16 = Annotated[int, Field(ge=0, le=2**16 - 1), Px4Type("uint16")]
-Uint32 = Annotated[int, Field(ge=0, le=2**32 - 1), Px4Type("uint32")]
-Uint64 = Annotated[int, Field(ge=0, le=2**64 - 1), Px4Type("uint64")]
+Int8 = Annotated[int, Px4Type("int8")]
+Int32 = Annotated[int, Px4Type("int32")]
+Int64 = Annotated[int, Px4Type("int64")]
+Uint8 = Annotated[int, Px4Type("uint8")]
+Uint16 = Annotated[int, Px4Type("uint16")]
+Uint32 = Annotated[int, Px4Type("uint32")]
+Uint64 = Annotated[int, Px4Type("uint64")]
 Float64 = Annotated[float, Px4Type("float64")]
 Float32 = Annotated[float, Px4Type("float32")]
 Float32x2 = Annotated[tuple[Float32, Float32], Px4Type("float32[2]")]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Final, Protocol, cast
 
 FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
@@ -140,7 +140,7 @@ class InRange(_OfEach):
         super().__init__(field, is_array=is_array)
         # A value that is rounded to float32 on its way must keep the rule that it kept before.
         self._bounds = min(least, float32(least)), max(greatest, float32(greatest))
-        self._unknown = or_
+        self._unknown = () if or_ is None else tuple(dict.fromkeys((or_, float32(or_))))
         unknown = "" if or_ is None else f", or {or_:g} while it is not known"
         self.reason = f"must be {least:.9g} to {greatest:.9g}{unknown}"
 
@@ -150,7 +150,7 @@ class InRange(_OfEach):
         beyond = [f"({value} < {least!r})"] * math.isfinite(least)
         beyond += [f"({value} > {greatest!r})"] * math.isfinite(greatest)
         outside = f"({' or '.join(beyond)})" if beyond else "(0 > 1)"
-        return outside if self._unknown is None else f"({outside} and ({value} != {self._unknown!r}))"
+        return f"({' and '.join([outside, *(f'({value} != {each!r})' for each in self._unknown)])})"
 
 
 class NotLater:
@@ -213,9 +213,10 @@ def passes_all(rules: Sequence[Rule], at: Place) -> Callable[[Any], bool]:
     return evaluated(f"lambda values: {' and '.join(checks) or True}")
 
 
+@cache
 def evaluated(expression: str) -> Callable[[Any], Any]:
     """Return the function of a lambda that is made here, of numbers and places: nothing of it comes from a peer."""
-    names = {"isfinite": math.isfinite, "squared_norm": _squared_norm}
+    names = {"isfinite": math.isfinite, "squared_norm": _squared_norm, "inf": math.inf}
     code = compile(expression, "<rules>", "eval")  # of a text, eval makes CPython forget a Ctrl-C of another thread
     return cast("Callable[[Any], Any]", eval(code, names))  # noqa: S307 - see above
 

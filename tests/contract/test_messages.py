@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -21,11 +22,13 @@ from nedbus_msgs import (
     ALL,
     MESSAGES,
     RELEASES,
+    DecodeError,
     Definition,
     FieldType,
     InvalidMessageError,
     Message,
     codec_of,
+    encode_with,
     message_of_type_hash,
     schema_of,
     upgrade_fields,
@@ -103,6 +106,37 @@ def test_fields_of_older_layouts_survive_the_model(name: str) -> None:
         back = definition.downgrade(absent | upgrade_fields(definition, fields), layout)
         kept = fields.keys() - dropped
         assert {field: bits(back[field]) for field in kept} == {field: bits(fields[field]) for field in kept}
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "layout", "older"),
+    [
+        ("VehicleStatus", "failure_detector_status", 300, "1.13", "failure_detector_status"),
+        ("SensorGps", "altitude_msl_m", 3e6, "1.14", "alt"),
+        ("SensorGps", "altitude_msl_m", 1e308, "1.14", "alt"),
+    ],
+)
+def test_value_beyond_an_older_type_is_not_provided_there(
+    name: str, field: str, value: float, layout: str, older: str
+) -> None:
+    """A valid message can be sent to any workspace: what its type there does not hold is 0."""
+    definition = MESSAGES[name]
+    message = definition.model(timestamp=1, **{field: value})
+    fields = definition.downgrade(message.__dict__, definition.get_layout(layout))
+    assert fields[older] == 0
+    assert encode_with(definition, fields, definition.get_layout(layout))
+
+
+@pytest.mark.parametrize(
+    ("name", "older"),
+    [("SensorGps", {"lat": None}), ("VehicleOdometry", {"local_frame": {}}), ("SensorGps", {"lat": []})],
+)
+def test_older_field_that_is_no_number_is_rejected(name: str, older: dict[str, object]) -> None:
+    """A peer says which fields its layout has, and sends anything for them: the error is that of any wrong type."""
+    definition = MESSAGES[name]
+    payload = msgpack.packb([99, 1, *older.values()])
+    with pytest.raises(DecodeError, match="Input should be a valid"):
+        codec_of(definition).decode(payload, newer={99: ("timestamp", *older)})
 
 
 def test_layouts_are_told_apart_by_their_names() -> None:

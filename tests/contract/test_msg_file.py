@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from pydantic import ValidationError
 
-from nedbus_msgs import MESSAGES, MsgError, define_msg, definition_text, hash_of, hash_of_msg, read_msg, ros2_type
+from nedbus_msgs import (
+    MESSAGES,
+    MsgError,
+    decode,
+    define_msg,
+    definition_text,
+    encode,
+    hash_of,
+    hash_of_msg,
+    read_msg,
+    ros2_type,
+)
 
 from .strategies import DATA
 
@@ -78,6 +91,9 @@ def test_annotations_are_rules() -> None:
         (f"uint64 timestamp\nSelf a{WITHIN}Self\nSelf a\n", r"line 5, column 1: 'Self' is no type"),
         ("uint64 timestamp\nOther A=1\n", r"line 2, column 1: a constant of type 'Other'"),
         ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: a field cannot be called 'Upper'"),
+        ("uint64 timestamp\nfloat32 copy\n", r"cannot be called 'copy': a message has a method of that name"),
+        (f"uint64 timestamp\nfloat32 a_b\nBar a{WITHIN}Bar\nfloat32 b\n", r"two fields are called 'a_b'"),
+        (f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nC[999] c{WITHIN}C\n", r"line 8, column 1: 'C' is no type"),
         (f"uint64 timestamp\n{MANY}", r"301 fields, more than the 256"),
         ("uint64 timestamp\nfloat64[1000] x\n", r"bytes, more than the 4096"),
         ("uint8 timestamp\n", r"no field 'uint64 timestamp'"),
@@ -89,6 +105,14 @@ def test_text_that_is_no_message_says_where(text: str, reason: str) -> None:
     """The error has line and column, and what is wrong there."""
     with pytest.raises(MsgError, match=reason):
         define_msg("Wrong", text)
+
+
+def test_unknown_value_is_one_as_it_is_sent_too() -> None:
+    """What `@invalid` names passes before and after it is rounded to float32; its bounds may be infinite."""
+    text = "uint64 timestamp\nfloat32 a # @range 1, 5 @invalid 0.1\nfloat32 b # @range 1, 5 @invalid inf\n"
+    definition = define_msg("Gauge", text)
+    message = definition.model.model_validate({"timestamp": 1, "a": 0.1, "b": math.inf})
+    assert decode(encode(message), definition.model) == message
 
 
 def test_messages_within_messages_are_bounded() -> None:

@@ -66,9 +66,9 @@ class QueueAccount(PendingQueue):
     """The account as PendingQueue keeps it, with a clock of the test's."""
 
     def __init__(self, setting: Setting) -> None:
-        self._begins, self._now = setting.begins, 0.0
+        self._begins, self._now, self._since_link = setting.begins, 0.0, 0.0
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
-        super().__init__(setting.mode, decoder, clock=lambda: self._now)
+        super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # steps take no time
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
         self._patience = mock.patch.object(writer_proxy, "_PATIENCE", 1e6)
 
@@ -83,7 +83,7 @@ class QueueAccount(PendingQueue):
         if broken:
             self.on_link()
         else:
-            self._now += 60.0
+            self._since_link += 60.0
 
     def requests(self) -> list[Request]:
         with self._patience:

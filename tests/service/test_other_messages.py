@@ -195,7 +195,9 @@ def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
 
 def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: nedbus.Bus) -> None:
     """What is published can be described, whoever defined it; anything else is an error that names what is known."""
-    definition = define("WheelEncoders", {"timestamp": field_type("uint64"), "wheel_speed": field_type("float32[2]")})
+    definition = define(
+        "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
+    )
     with bus._publishers.publisher(Address("7", "wheel_encoders"), definition) as publisher:
         publisher.publish({"timestamp": 1})
         wait_for(lambda: bus.latest("wheel_encoders"), what="the message")

@@ -109,7 +109,9 @@ def test_vehicle_learns_what_was_read(join: Join) -> None:
 def test_message_without_a_file_is_read(join: Join) -> None:
     """Readers may ask vehicles what any message is, one that has no file here too; other topics need no rule."""
     vehicle, reader = join("vehicle-1"), join("reader")
-    definition = define("WheelEncoders", {"timestamp": field_type("uint64"), "wheel_speed": field_type("float32[2]")})
+    definition = define(
+        "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
+    )
     encoders = vehicle._publishers.publisher(Address("1", "wheel_encoders"), definition)
     attitude = vehicle.publisher("vehicle_attitude", vehicle="1")
     sent = definition.model.model_validate({"timestamp": 1, "wheel_speed": (0.5, 2.0)})

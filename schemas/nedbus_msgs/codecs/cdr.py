@@ -9,6 +9,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import islice
 from typing import Any, Final
 
 from nedbus_msgs.declaration import Layout
@@ -26,7 +27,6 @@ class CdrLayout:
     """One layout in CDR: its body, and the offset of each field in a payload; no payload is longer than `limit`."""
 
     body: struct.Struct
-    types: tuple[tuple[str, FieldType], ...]
     offsets: Mapping[str, int]
     limit: int
 
@@ -52,7 +52,7 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
     if not shortest <= len(payload) <= cdr.limit:
         sizes = f"{shortest}" if cdr.limit == shortest else f"{shortest} to {cdr.limit}"
         raise DecodeError(f"{len(payload)} bytes, where layout {layout.name} has {sizes}", definition.name)
-    return dict(_unflatten(definition, cdr.types, cdr.body.unpack_from(payload, len(HEAD))))
+    return dict(_unflatten(definition, layout.types, cdr.body.unpack_from(payload, len(HEAD))))
 
 
 def encode_with(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> bytes:
@@ -64,25 +64,21 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
     """
     cdr = cdr_layout(layout)
     require_fields(definition, fields, layout)
-    values = [item for name, kind in cdr.types for item in _flatten(definition, name, kind, fields[name])]
+    values = [item for name, kind in layout.types.items() for item in _flatten(definition, name, kind, fields[name])]
     try:
         return HEAD + cdr.body.pack(*values)
     except (OverflowError, struct.error):  # the latter for an int beyond float64
-        large, kind = next((name, kind) for name, kind in cdr.types if not _fits(kind, fields[name]))
+        large, kind = next((name, kind) for name, kind in layout.types.items() if not _fits(kind, fields[name]))
         reason = f"{large}: {fields[large]!r:.40} is beyond the range of {kind}"
         raise EncodeError(reason, definition.name) from None
 
 
+@cache
 def cdr_layout(layout: Layout) -> CdrLayout:
     """Return how a layout lies in a payload: each field at the next multiple of its alignment."""
-    return _cdr_layout(tuple(layout.types.items()))
-
-
-@cache
-def _cdr_layout(types: tuple[tuple[str, FieldType], ...]) -> CdrLayout:
     body, size, unpadded = "<", 0, 0
     offsets = {}
-    for name, kind in types:
+    for name, kind in layout.types.items():
         padding = -size % kind.size
         body += (f"{padding}x" if padding else "") + _format(kind)
         offsets[name] = len(HEAD) + size + padding
@@ -90,7 +86,7 @@ def _cdr_layout(types: tuple[tuple[str, FieldType], ...]) -> CdrLayout:
         unpadded += kind.size * kind.count
     px4_struct = unpadded + -unpadded % 8
     limit = len(HEAD) + max(size, px4_struct + _PX4_EXTRA)
-    return CdrLayout(struct.Struct(body), types, offsets, limit)
+    return CdrLayout(struct.Struct(body), offsets, limit)
 
 
 def _format(kind: FieldType) -> str:
@@ -98,26 +94,27 @@ def _format(kind: FieldType) -> str:
 
 
 def _unflatten(
-    definition: Definition[Any], types: tuple[tuple[str, FieldType], ...], values: tuple[object, ...]
+    definition: Definition[Any], types: Mapping[str, FieldType], values: tuple[object, ...]
 ) -> Iterator[tuple[str, object]]:
     """Yield name and value of each field, given the values that struct unpacked; raise DecodeError for a bad bool."""
-    start = 0
-    for name, kind in types:
-        parts = values[start : start + kind.count]
-        start += kind.count
+    rest = iter(values)
+    for name, kind in types.items():
+        value: Any = next(rest) if kind.length is None else tuple(islice(rest, kind.length))
         if kind.base == "bool":
-            for part in parts:
+            for part in (value,) if kind.length is None else value:
                 if part not in (0, 1):
                     raise DecodeError(f"{name}: {part}, where a bool is 0 or 1", definition.name)
-            parts = tuple(part == 1 for part in parts)
-        yield name, parts[0] if kind.length is None else parts
+            value = value == 1 if kind.length is None else tuple(map(bool, value))
+        yield name, value
 
 
 def _flatten(definition: Definition[Any], name: str, kind: FieldType, value: object) -> tuple[object, ...]:
     """Return a value as struct packs it; raise EncodeError where struct would convert it, or not name the field."""
-    parts = (value,) if kind.length is None else tuple(value) if isinstance(value, tuple | list) else ()
-    if len(parts) == kind.count and all(_is_of(kind, part) for part in parts):
-        return parts
+    if kind.length is None:
+        if _is_of(kind, value):
+            return (value,)
+    elif isinstance(value, tuple | list) and len(value) == kind.length and all(_is_of(kind, part) for part in value):
+        return tuple(value)
     raise EncodeError(f"{name}: {value!r:.40} is not a {kind}", definition.name)
 
 

@@ -15,7 +15,7 @@ from nedbus_msgs.rules import FiniteWhile, NotLater, NotNegative, Within
 
 def _integer(value: float, scale: float) -> int:
     """Return a value in units of 1/scale as an integer; 0 for NaN and infinity, which integers do not have."""
-    return round(value * scale) if math.isfinite(value) else 0
+    return round(value * scale) if math.isfinite(value * scale) else 0
 
 
 class SensorGps(Message):

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec, module_from_spec
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO, Final
@@ -25,6 +26,7 @@ _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
 _READ_COST: Final = 4096  # of any read, in bytes, however short it is
 _BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside what its size makes plausible
+_MOST_FIELDS: Final = 1000  # that are read of a format; a message has fewer
 _NESTED: Final = 3  # levels of messages within messages; PX4 has one
 _INDEX = re.compile(r"\[(\d+)\]")
 _OLDEST: Final = 0x010D  # PX4 1.13, whose layouts are the oldest known
@@ -124,15 +126,15 @@ def _equal(one: UlogColumns, other: UlogColumns) -> bool:
 
 def _describe(log: Any, topic: str) -> Definition[Any]:
     """Return what the formats of a log say of a message; those within it are made fields; ValueError if that fails."""
-    types = dict(_fields(log.message_formats, topic))
-    return define("".join(part.capitalize() for part in topic.split("_")), types)
+    name = "".join(part.capitalize() for part in topic.split("_"))
+    return define(name, islice(_fields(log.message_formats, topic), _MOST_FIELDS))
 
 
 def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:
     for kind, length, field in formats[name].fields:
         if field.startswith("_padding"):
             continue
-        if kind not in formats:
+        if kind not in formats or not formats[kind].fields:
             base = _FLOATS.get(kind, kind.removesuffix("_t"))
             yield f"{prefix}{field}", field_type(f"{base}[{length}]" if length > 0 else base)
         elif level < _NESTED:

@@ -9,7 +9,7 @@ from typing import Any
 
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
-from nedbus_msgs import Definition, MsgError, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
+from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
 
 _log = logging.getLogger(__name__)
 
@@ -27,18 +27,22 @@ def read_definitions(paths: str) -> Definitions:
     found: dict[str, dict[str, Definition[Any]]] = {}
     left_out: list[str] = []
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
-        for file in sorted([*path.glob("*.msg"), *path.glob("*/*.msg")]) or [path]:
+        files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
+        if not files and path.is_dir():
+            reason = "no .msg file is in this folder, nor in those within it: name PX4's folder msg"
+            raise ConfigError(str(path), reason, key="msg")
+        for file in files or [path]:
             try:
                 text = _with_messages_within(file)
-                definition = define_msg(file.stem, text)
+                definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
             except (OSError, UnicodeDecodeError) as exc:
                 raise ConfigError(str(file), getattr(exc, "strerror", None) or "no UTF-8 text", key="msg") from None
-            except MsgError as exc:
+            except ValueError as exc:  # MsgError, and its like
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
                 left_out.append(f"{file.stem} ({exc})")
                 continue
-            found.setdefault(dds_type(ros2_type(definition)), {})[hash_of_msg(file.stem, text)] = definition
+            found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
     if left_out:
         extra = about("damaged", source="px4-zenoh")
         _log.info("px4-zenoh: not carried, of %s: %.2000s", paths, ", ".join(left_out), extra=extra)

@@ -114,9 +114,8 @@ class LayoutLookup:
         if not layouts or len(self._defined) >= _MAX_MESSAGES:
             return False
         try:
-            self._defined[name] = define(
-                name, {field: field_type(kind) for field, kind in layouts[max(layouts)].items()}
-            )
+            fields = ((field, field_type(kind)) for field, kind in layouts[max(layouts)].items())
+            self._defined[name] = define(name, fields)
         except ValueError as exc:
             _log.warning("%s: a publisher describes no message: %s", name, str(exc)[:_MAX_TEXT], extra=about("invalid"))
             return False
