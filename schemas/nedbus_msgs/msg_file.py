@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
@@ -52,6 +53,7 @@ def read_msg(text: str) -> list[MsgField]:
     return list(islice(_flatten(_parts(text), "", "", 0), _MOST))
 
 
+@lru_cache(256)  # its codecs are kept with it
 def define_msg(name: str, text: str) -> Definition[Message]:
     """Return the message that a .msg file describes, range-checked as it is annotated; MsgError for what is none."""
     fields = read_msg(text)

@@ -93,7 +93,10 @@ def test_annotations_are_rules() -> None:
         ("uint64 timestamp\nuint8 Upper\n", r"line 1, column 1: a field cannot be called 'Upper'"),
         ("uint64 timestamp\nfloat32 copy\n", r"cannot be called 'copy': a message has a method of that name"),
         (f"uint64 timestamp\nfloat32 a_b\nBar a{WITHIN}Bar\nfloat32 b\n", r"two fields are called 'a_b'"),
-        (f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nC[999] c{WITHIN}C\n", r"line 8, column 1: 'C' is no type"),
+        (
+            f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nC[999] c{WITHIN}C\n",
+            r"line 8, .* 'C' is no type",
+        ),
         (f"uint64 timestamp\n{MANY}", r"301 fields, more than the 256"),
         ("uint64 timestamp\nfloat64[1000] x\n", r"bytes, more than the 4096"),
         ("uint8 timestamp\n", r"no field 'uint64 timestamp'"),

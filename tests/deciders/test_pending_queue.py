@@ -14,16 +14,17 @@ import zenoh
 
 import nedbus
 from nedbus import Batch, Counts, Mode
-from nedbus.client.receiving import LayoutLookup, PendingQueue
+from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, layout_lookup
 from nedbus.client.receiving import pending_queue as module
 from nedbus.client.receiving.layout_lookup import Schemas
 from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.transport import RawSample
-from nedbus_msgs import DEFAULT, codec_of
+from nedbus_msgs import DEFAULT, codec_of, encode
+from nedbus_msgs.messages import VehicleAttitude
 from tests.first_message import encoding_of
 from tests.waits import DEADLINE
 
-from .raw_samples import INVALID, OTHER_KEY, drain, junk, make_queue, put, raw, timestamps
+from .raw_samples import INVALID, OTHER_KEY, VALID, Payload, drain, junk, make_queue, put, raw, timestamps
 
 STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
 
@@ -284,6 +285,57 @@ def take_batch(pending_queue: PendingQueue) -> Batch:
     batch = pending_queue.pop_batch()
     assert batch is not None
     return batch
+
+
+ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
+
+
+def undescribed(payload: bytes = VALID) -> RawSample:
+    """Return a sample of a message that has no file here, and that no publisher describes."""
+    return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding="application/msgpack;px4_msgs/FooBar")
+
+
+def test_what_a_batch_left_is_read_next() -> None:
+    """A batch has messages of one kind: the others still wait, for a batch, for a sample, and for acknowledgements."""
+    for take in (timestamps, lambda pending_queue: take_batch(pending_queue).messages["timestamp"].tolist()):
+        pending_queue = make_queue("every")
+        put(pending_queue, [raw(0), raw(None, key="nedbus/1/vehicle_attitude", payload=ATTITUDE)])
+        assert len(take_batch(pending_queue)) == 1
+        assert pending_queue.waiting == 1
+        assert pending_queue.wait(0.0)
+        assert take(pending_queue) == [7]
+
+
+def test_batch_goes_past_what_is_invalid() -> None:
+    """What nobody describes is no reason to wait for more, and no message of another kind, whatever its bytes."""
+    for payload in (VALID, VALID[:-1]):
+        pending_queue = make_queue("every")
+        put(pending_queue, [undescribed(payload), raw(0)])
+        assert take_batch(pending_queue).sequence.tolist() == [0]
+        assert pending_queue.pop_batch() is None
+        assert pending_queue.counts == Counts(received=1, invalid=1)
+
+
+def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever reads asks what a message is, and waits; what arrives meanwhile is queued at once."""
+    monkeypatch.setattr(layout_lookup, "_JOIN", DEADLINE)
+    asked, answered = threading.Event(), threading.Event()
+
+    def find(_: Collection[str]) -> Schemas:
+        asked.set()
+        answered.wait(DEADLINE)
+        return {}
+
+    pending_queue = PendingQueue("every", Decoder(LayoutLookup(find), prefix="nedbus"))
+    pending_queue.put([undescribed()])
+    reader = threading.Thread(target=pending_queue.pop_batch)
+    reader.start()
+    assert asked.wait(DEADLINE)
+    pending_queue.put([raw(0)])
+    assert not answered.is_set()
+    assert reader.is_alive()
+    answered.set()
+    reader.join(DEADLINE)
 
 
 def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:

@@ -131,9 +131,9 @@ def test_rate_covers_the_flight() -> None:
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME}, on=20)
     assert table["timestamp"].tolist() == list(range(1_000_000, 1_400_001, 50_000))
     late = array_of("home_position", {"timestamp": 2**63})
-    for rate in (20, 0, -1, math.nan):
-        with pytest.raises(ConfigError, match="on: "):
-            nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate or 1e9)
+    for rate in (20, 0, -1, math.nan, math.inf, "*", None, [-1], [[1]], ["a"], np.int64(0)):
+        with pytest.raises((ConfigError, AddressError), match=r"^on[: ]"):
+            nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate)  # type: ignore[arg-type] # these are the mistakes
 
 
 def test_odd_streams_are_aligned(tmp_path: Path) -> None:

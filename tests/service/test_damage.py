@@ -70,7 +70,10 @@ def damage(data: bytes, rng: random.Random) -> tuple[str, int, bytes]:
 
 def write_recording(path: Path, *, finish: bool) -> Path:
     """Write a flight of two vehicles in a dozen chunks; without `finish` as a power cut leaves it."""
-    messages = [(each.address, upgrade(each.fields)) for each in open_replay("sim:?duration=1").messages]
+    messages = [
+        (each.address, upgrade(each.fields))
+        for each in open_replay("sim:?duration=2&topics=VehicleLocalPosition").messages
+    ]
     writer = RecordingWriter(path)
     for start in range(0, len(messages), 40):
         part = messages[start : start + 40]

@@ -84,6 +84,8 @@ async def read_and_publish() -> None:
         publisher = await bus.publisher("external_ins_local_position", vehicle="mine")
         assert_type(publisher, nedbus.AsyncPublisher)
         await publisher.publish(nedbus.VehicleLocalPosition(timestamp=1))
+        await publisher.publish(nedbus.VehicleAttitude(timestamp=1))
+        await publisher.publish_row(sample.message)
         assert_type(await publisher.flush(), bool)
         assert_type(await bus.latest(), list[nedbus.Sample])
 

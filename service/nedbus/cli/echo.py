@@ -12,7 +12,7 @@ import typer
 
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
-from nedbus_msgs import ANY, Address
+from nedbus_msgs import ANY, Address, Definition
 
 from .follow import Link, follow
 from .format import to_csv, to_csv_head, to_fields, to_json
@@ -78,7 +78,7 @@ def echo(
     form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
     show: Callable[[Sample[Any]], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
-    heads: list[str] = []  # of CSV
+    heads: dict[Definition[Any], str] = {}  # of CSV
 
     def print_one(sample: Sample[Any]) -> bool:
         if interval:
@@ -86,15 +86,15 @@ def echo(
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        if csv_output:
-            head = to_csv_head(sample, fields)
-            if head not in heads and heads:
+        definition = sample.message.DEFINITION
+        if csv_output and definition not in heads:
+            heads[definition] = to_csv_head(sample, fields)
+            if len(set(heads.values())) > 1:
                 raise ConfigError(
                     "--csv", f"a table has one kind of message, and {sample.address} is another: name a topic"
                 )
-            if not heads:
-                heads.append(head)
-                write(head)
+            if len(heads) == 1:
+                write(heads[definition])
         write(show(sample))
         return True
 

@@ -134,7 +134,7 @@ def plot(
         if len(selected) > limit:
             hint = f"of which the first {limit} are drawn: choose with -v, -t, -i"
             write_stderr(f"{source}: {len(selected)} streams, {hint}")
-        streams = [(address, flight.read(address)[0]) for address in selected[:limit]]
+        streams = [(address, messages) for address, (messages, _) in flight.read(selected[:limit]).items()]
         for warning in flight.warnings:
             write_stderr(f"{source}: {warning}")
         streams = [(address, messages) for address, messages in streams if len(messages)]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Row, Selection, VehicleLocalPosition, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Message, Selection, vehicle_name
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
@@ -163,14 +163,14 @@ class AsyncPublisher:
         """How many messages it has published."""
         return self._publisher.published
 
-    async def publish(self, message: VehicleLocalPosition | Mapping[str, object]) -> None:
+    async def publish(self, message: Message | Mapping[str, object]) -> None:
         """Validate a message, or the fields of one by name, and publish it, as `Publisher.publish` does."""
         if self.lossless:
             await asyncio.to_thread(self._publisher.publish, message)
         else:
             self._publisher.publish(message)
 
-    async def publish_row(self, values: Sequence[object] | Row) -> None:
+    async def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate the values of all fields in PX4's order, and publish them, as `Publisher.publish_row` does."""
         if self.lossless:
             await asyncio.to_thread(self._publisher.publish_row, values)

@@ -67,9 +67,9 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
     received = time.time_ns()
     definition = _definition_of(arrivals[0]) or DEFAULT
-    size = codec_of(definition).size
-    blank = bytes(size)  # in the place of another layout, invalid, so that it is decoded by itself
-    payloads = [payload if len(payload) == size else blank for _, payload, _, _ in arrivals]
+    blank = bytes(codec_of(definition).size)  # in the place of another layout, invalid, so that it is decoded by itself
+    own = arrivals[0][0].size  # -1 while it is not known what these are
+    payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
     messages, valid = arrays_of(definition).decode(b"".join(payloads))
     if not valid.all():
         for index in np.flatnonzero(~valid).tolist():

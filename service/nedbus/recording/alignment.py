@@ -80,17 +80,18 @@ def align(
     if method not in _METHODS:
         raise ConfigError("method", f"{method!r} is none of {', '.join(_METHODS)}")
     reference = [on] if isinstance(on, str) else []
+    topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
     if isinstance(flight, Mapping):
+        _require_arrays(flight, topics or ())
         everything = not topics or ANY in topics
         streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
         offset = tell_utc(flight)
     else:
         wants_utc = utc or dataframe == "pandas"
         streams, offset = read_streams(flight, names if topics else None, vehicle=vehicle, utc=wants_utc)
-    for name in names if isinstance(flight, Mapping) else reference:
-        if name not in (ANY, *streams):
-            raise AddressError("topic", name, f"one of {', '.join(streams)}")
+    if isinstance(on, str) and on not in streams:
+        raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps.values())
@@ -104,7 +105,7 @@ def align(
         table["utc"] = (times + offset.offset_us).astype("M8[us]") if offset else np.datetime64("NaT", "us")
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
-        rows, following, weight = _look_up(stamps[name], times, "own" if name == on else method)
+        rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
         padded = np.append(messages, np.zeros(1, messages.dtype))  # with what row -1 is
         for field, kind in _fields(messages):
             padded[field][-1] = np.nan if kind.base.kind == "f" else 0
@@ -114,8 +115,17 @@ def align(
         table[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
         for field, _ in _fields(messages):
             table[f"{name}.{field}"] = values[field]
-            absent[f"{name}.{field}"] = np.append(lacking.get(field, np.zeros(len(messages), bool)), True)[rows]
+            absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe, offset)
+
+
+def _require_arrays(flight: Mapping[str, object], topics: Iterable[str]) -> None:
+    """Raise ConfigError unless these are streams as `read` returns them, AddressError unless they have the topics."""
+    if not flight or not all(isinstance(each, np.ndarray) and each.dtype.names for each in flight.values()):
+        raise ConfigError("flight", "expected a file, or arrays as nedbus.read(file, [...]) returns them")
+    for name in topics:
+        if name not in (ANY, *flight):
+            raise AddressError("topic", name, f"one of {', '.join(flight)}")
 
 
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
@@ -192,12 +202,15 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
 
 def _times(on: float | Sequence[int] | _Ints, stamps: Iterable[_Ints]) -> _Ints:
     """Return times that are given, or those at a rate from the first message to the last one [us]."""
-    if not isinstance(on, float | int):
-        return np.asarray(on).astype(np.int64)
+    given = np.asarray(on)
+    if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
+        raise ConfigError("on", f"{on!r:.60} is none of a stream, a rate above 0 [Hz], and times [us]")
+    if given.ndim:
+        return given.astype(np.int64)
     every = np.concatenate([*stamps, np.empty(0, np.int64)])
-    every, rate = every[every > 0], float(on)  # 0 is no time
+    every, rate = every[every > 0], float(given)  # 0 is no time
     count = np.ptp(every) / 1e6 * rate + 1 if len(every) else 0
-    if not 0 <= count <= _MAX_ROWS:
+    if count > _MAX_ROWS:
         raise ConfigError("on", f"{count:.0f} rows at {rate:g} Hz: expected up to {_MAX_ROWS}, or times")
     first: int = every.min(initial=2**62)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

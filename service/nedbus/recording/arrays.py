@@ -6,7 +6,6 @@ import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, overload
 
@@ -132,8 +131,10 @@ def read_streams(
             found = matching(path, flight.addresses, Selection(*parts))
             chosen |= dict.fromkeys([the_one(path, found, Selection(*parts))] if isinstance(topics, str) else found)
         owner = _one_vehicle(path, chosen or flight.addresses, vehicle)
-        streams = {address.stream: flight.read(address) for address in chosen}
-        offset = flight.utc(owner) if utc else None
+        telling = flight.telling(owner) if utc else []
+        read_once = flight.read({*chosen, *telling})
+        streams = {address.stream: read_once[address] for address in chosen}
+        offset = tell_utc({address.stream: read_once[address][0] for address in telling})
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
     return streams, offset
@@ -150,23 +151,29 @@ def utc_of(
     A GNSS receiver tells it if its `time_utc_usec` is not 0, and `timesync_status` the clock of a companion: that is
     taken for UTC only if it has a date after 2000. Where messages disagree by more than a second there is none.
 
-    Raises AddressError for a file of several vehicles, without the name of one; other errors are those of `read`.
+    Raises AddressError for several vehicles, without the name of one; other errors are those of `read`.
     """
+    vehicle = vehicle_name(vehicle)
     if isinstance(flight, Mapping):
         return tell_utc(flight)
     if not isinstance(flight, str | Path):
-        by_stream = {each.address.stream: each.message for each in flight if vehicle in (ANY, each.vehicle)}
+        samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
+        if samples:
+            _one_vehicle("the samples", (each.address for each in samples), vehicle)
+        by_stream = {each.address.stream: each.message for each in samples}
         return tell_utc({name: to_array([message]) for name, message in by_stream.items()})
-    path, vehicle = Path(flight).expanduser(), vehicle_name(vehicle)
+    path = Path(flight).expanduser()
     with Flight(path) as opened:
-        return opened.utc(_one_vehicle(path, matching(path, opened.addresses, Selection(vehicle=vehicle)), vehicle))
+        owner = _one_vehicle(path, matching(path, opened.addresses, Selection(vehicle=vehicle)), vehicle)
+        found = opened.read(opened.telling(owner))
+    return tell_utc({address.stream: messages for address, (messages, _) in found.items()})
 
 
-def _one_vehicle(path: Path, addresses: Iterable[Address], vehicle: str) -> str:
+def _one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle: str) -> str:
     """Return the vehicle of all these addresses; raise AddressError if there are several."""
     first, *others = sorted({address.vehicle for address in addresses})
     if others:
-        raise AddressError("vehicle", vehicle, f"one of those in {path}: {', '.join([first, *others][:10])}")
+        raise AddressError("vehicle", vehicle, f"one of those in {where}: {', '.join([first, *others][:10])}")
     return first
 
 
@@ -222,11 +229,22 @@ class Flight:
         """Whether damage cost messages of what was read so far."""
         return any(part is not None and part.damaged for part in (self._reader, self._log))
 
-    def read(self, address: Address) -> tuple[MessageArray, Absent]:
-        """Return the messages of an address, and for each field that some of them lack a mask of those."""
-        messages, valid, absent = self._read_ulog(address) if self._reader is None else self._read_mcap(address)
-        if self._reader is not None:
-            self.warnings += (each for each in self._reader.warnings if each not in self.warnings)
+    def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
+        """Return the messages of each address, and for each field that some of them lack a mask of those."""
+        if self._reader is None:
+            return {address: self._valid(address, *self._read_ulog(address)) for address in addresses}
+        read = self._read_mcap(self._reader, addresses)
+        self.warnings += (each for each in self._reader.warnings if each not in self.warnings)
+        return {address: self._valid(address, *read[address]) for address in addresses}
+
+    def telling(self, vehicle: str) -> list[Address]:
+        """Return the addresses of a vehicle whose messages may tell UTC."""
+        own = (each for each in self.addresses if each.vehicle == vehicle)
+        return [each for each in own if not self.definitions[each].types.keys().isdisjoint(TELLING)]
+
+    def _valid(
+        self, address: Address, messages: MessageArray, valid: _Mask, absent: Absent
+    ) -> tuple[MessageArray, Absent]:
         if not valid.all():
             count = f"{np.sum(~valid)} of {len(valid)} messages"
             self.warnings.append(f"{address.stream}: {count} violate the rules and are left out")
@@ -235,11 +253,6 @@ class Flight:
             types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
             messages = messages.view(np.dtype(types, metadata={"missing": tuple(absent)}))
         return messages, absent
-
-    def utc(self, vehicle: str) -> UtcOffset | None:
-        """Return the UTC that the messages of a vehicle tell, None if they do not."""
-        telling = (each for each in self.addresses if not self.definitions[each].types.keys().isdisjoint(TELLING))
-        return tell_utc({each.stream: self.read(each)[0] for each in telling if each.vehicle == vehicle})
 
     def _read_ulog(self, address: Address) -> tuple[MessageArray, _Mask, Absent]:
         topic = next(topic for topic in (self._log.topics if self._log else ()) if topic.address == address)
@@ -261,24 +274,49 @@ class Flight:
         lacking = (name for name in definition.types if name not in plan.provided)
         return messages, valid, {name: np.ones(len(messages), bool) for name in lacking}
 
-    def _read_mcap(self, address: Address) -> tuple[MessageArray, _Mask, Absent]:
-        recorded = self._reader.messages(address) if self._reader else iter(())
-        definition = self.definitions[address]
-        chunks, masks = [arrays_of(definition).absent(0)], [np.empty(0, bool)]
-        lacking: list[frozenset[str]] = []  # of each message
-        by_stream: dict[RecordedStream, frozenset[str]] = {}
-        while chunk := list(islice(recorded, _CHUNK)):
-            messages, valid = _decode(definition, chunk)
-            chunks.append(messages)
-            masks.append(valid)
-            for stream in {each.stream for each in chunk} - by_stream.keys():
-                by_stream[stream] = stream.lacking
-            lacking += [by_stream[each.stream] for each in chunk]
-        fields = frozenset[str]().union(*by_stream.values())
+    def _read_mcap(
+        self, reader: RecordingReader, addresses: Collection[Address]
+    ) -> dict[Address, tuple[MessageArray, _Mask, Absent]]:
+        """Read the file once, for all of these."""
+        found = {address: _Columns(self.definitions[address]) for address in addresses}
+        for recorded in reader.messages(found.keys()):
+            found[recorded.stream.address].add(recorded)
+        return {address: columns.end() for address, columns in found.items()}
+
+
+class _Columns:
+    """Messages of one address of a recording, converted some thousand at a time."""
+
+    def __init__(self, definition: Definition[Any]) -> None:
+        self._definition = definition
+        self._parts = [(arrays_of(definition).absent(0), np.empty(0, bool))]
+        self._waiting: list[RecordedMessage] = []
+        self._lacking: list[frozenset[str]] = []  # of each message
+        self._by_stream: dict[RecordedStream, frozenset[str]] = {}
+
+    def add(self, recorded: RecordedMessage) -> None:
+        self._waiting.append(recorded)
+        if len(self._waiting) == _CHUNK:
+            self._convert()
+
+    def end(self) -> tuple[MessageArray, _Mask, Absent]:
+        if self._waiting:
+            self._convert()
+        arrays, masks = zip(*self._parts, strict=True)
+        fields = frozenset[str]().union(*self._by_stream.values())
         absent = {
-            name: np.array([name in each for each in lacking], bool) for name in definition.types if name in fields
+            name: np.array([name in each for each in self._lacking], bool)
+            for name in self._definition.types
+            if name in fields
         }
-        return np.concatenate(chunks), np.concatenate(masks), absent
+        return np.concatenate(arrays), np.concatenate(masks), absent
+
+    def _convert(self) -> None:
+        self._parts.append(_decode(self._definition, self._waiting))
+        for stream in {each.stream for each in self._waiting} - self._by_stream.keys():
+            self._by_stream[stream] = stream.lacking
+        self._lacking += [self._by_stream[each.stream] for each in self._waiting]
+        self._waiting = []
 
 
 def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -11,7 +11,7 @@ from typing import Any, Self
 from mcap.records import Channel, Message, Schema
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
+from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
 
 from .chunks import ChunkFile
 from .records import READ_ERRORS, records_of
@@ -56,7 +56,7 @@ class RecordingReader:
         self._vehicle = vehicle
         self._file = ChunkFile(self.path)
         self._schemas: dict[int, Schema] = {}
-        self._described: dict[int, Definition[Any]] = {}  # by schema, of messages that have no file here
+        self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         summary = self._file.summary
         if summary is not None:
@@ -96,15 +96,15 @@ class RecordingReader:
         if self.damaged:
             self._counts = self._count()
 
-    def messages(self, only: Address | None = None) -> Iterator[RecordedMessage]:
-        """Yield all messages, or those of one address, in the order of the file."""
+    def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
+        """Yield all messages, or those of some addresses, in the order of the file."""
         for part in self._file.parts(self._channels(only)):
             try:
                 yield from self._messages_of(part, only)
             except READ_ERRORS:
                 self._file.warn("damaged: a chunk has an invalid record; the rest of that chunk is left out", lost=True)
 
-    def _messages_of(self, part: bytes, only: Address | None) -> Iterator[RecordedMessage]:
+    def _messages_of(self, part: bytes, only: Collection[Address] | None) -> Iterator[RecordedMessage]:
         for record in records_of(part):
             if isinstance(record, Schema):
                 self._schemas.setdefault(record.id, record)
@@ -112,7 +112,7 @@ class RecordingReader:
                 self._add(record)
             elif isinstance(record, Message):
                 stream = self._stream(record)
-                if stream is not None and only in (None, stream.address):
+                if stream is not None and (only is None or stream.address in only):
                     yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
 
     def close(self) -> None:
@@ -127,12 +127,14 @@ class RecordingReader:
     ) -> None:
         self.close()
 
-    def _channels(self, only: Address | None = None) -> list[int] | None:
-        """Return the channels of an address, or all that can be read; None before all are known."""
+    def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
+        """Return the channels of some addresses, or all that can be read; None before all are known."""
         if not self._all_known:
             return None
         return [
-            number for number, stream in self._streams.items() if stream is not None and only in (None, stream.address)
+            number
+            for number, stream in self._streams.items()
+            if stream is not None and (only is None or stream.address in only)
         ]
 
     def _count(self) -> dict[RecordedStream, int]:
@@ -170,6 +172,9 @@ class RecordingReader:
         try:
             definition, layout = self._layout(schema)
             address = self._address(channel)
+            expected = BY_TOPIC.get(address.topic, definition)
+            if expected is not definition:
+                raise ValueError(f"messages of type {definition.name}, where {address.topic} has {expected.name}")
         except (AddressError, ValueError) as exc:
             self._file.warn(f"{channel.topic} is left out: {exc}")
             return None
@@ -177,15 +182,14 @@ class RecordingReader:
 
     def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
         """Return the message and the layout that a schema describes; raise ValueError if there is none."""
-        known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
-        if known is None:
-            if schema.id not in self._described:
-                self._described[schema.id] = define_msg(schema.name.rpartition("/")[2], text)
-            return self._described[schema.id], self._described[schema.id].current
-        layout = known.find_layout(field.name for field in read_msg(text))
-        if layout is None:
-            raise ValueError("no known layout has these fields")
-        return known, layout
+        if schema.id not in self._layouts:
+            known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
+            definition = known or define_msg(schema.name.rpartition("/")[2], text)
+            layout = known.find_layout(field.name for field in read_msg(text)) if known else definition.current
+            if layout is None:
+                raise ValueError("no known layout has these fields")
+            self._layouts[schema.id] = definition, layout
+        return self._layouts[schema.id]
 
     def _address(self, channel: Channel) -> Address:
         metadata = channel.metadata

@@ -6,6 +6,7 @@ import re
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.util import find_spec, module_from_spec
 from itertools import islice
 from pathlib import Path
@@ -127,7 +128,12 @@ def _equal(one: UlogColumns, other: UlogColumns) -> bool:
 def _describe(log: Any, topic: str) -> Definition[Any]:
     """Return what the formats of a log say of a message; those within it are made fields; ValueError if that fails."""
     name = "".join(part.capitalize() for part in topic.split("_"))
-    return define(name, islice(_fields(log.message_formats, topic), _MOST_FIELDS))
+    return _define(name, tuple(islice(_fields(log.message_formats, topic), _MOST_FIELDS)))
+
+
+@lru_cache(1024)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
+def _define(name: str, fields: tuple[tuple[str, FieldType], ...]) -> Definition[Any]:
+    return define(name, fields)
 
 
 def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:

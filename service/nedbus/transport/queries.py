@@ -155,7 +155,7 @@ class AliveChanges:
         with while_open():
             subscriber = session.liveliness().declare_subscriber(key_expr, channel, history=True)
         self.missed = False
-        """Whether more tokens changed than are kept until they are taken: all have to be asked for again."""
+        """Whether more tokens changed than are kept until they are taken; cleared by whoever asks for all of them."""
         self.undeclare: Callable[[], object] = subscriber.undeclare
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
 
@@ -165,7 +165,7 @@ class AliveChanges:
         with suppress(zenoh.ZError):  # the session is closed
             while len(changes) < _CHANGES and (sample := self._handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-        self.missed = len(changes) == _CHANGES
+        self.missed |= len(changes) == _CHANGES
         return changes
 
 

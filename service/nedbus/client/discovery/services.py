@@ -45,7 +45,7 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict
             room -= size
     if left_out := len(answers) - len(accepted):
         _log.warning("%d services are left out: their answers are too large", left_out, extra=about("incomplete"))
-    return [status for status in _parse(accepted) if isinstance(status, dict)]
+    return [status for _, status in _parse(accepted) if isinstance(status, dict)]
 
 
 def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
@@ -53,10 +53,13 @@ def find_schemas(messages: Collection[str], *, session: Session, prefix: str) ->
     found: dict[str, dict[int, dict[str, str]]] = {}
     keys = [schema_key(name, prefix=prefix) for name in messages]
     read: Counter[str] = Counter()
+    early: list[RawSample] = []
     for raw in query(session, *keys, timeout=_TIMEOUT, newest=False):
+        read[str(raw.key_expr)] += 1
+        if read[str(raw.key_expr)] <= _MAX_ANSWERS:
+            early.append(raw)
+    for raw, content in _parse(early):
         name = str(raw.key_expr).rpartition("/")[2]
-        read[name] += 1
-        content = next(_parse([raw]), None) if read[name] <= _MAX_ANSWERS else None
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
             match layout:
@@ -122,14 +125,14 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
 
 
-def _parse(answers: Iterable[RawSample]) -> Iterator[object]:
-    """Yield the content of answers; the first that is not JSON is logged, as a peer may send any number."""
+def _parse(answers: Iterable[RawSample]) -> Iterator[tuple[RawSample, object]]:
+    """Yield answers with their content; the first that is not JSON is logged, as a peer may send any number."""
     logged = False
     for raw in answers:
         if len(raw.payload) > _MAX_ANSWER:
             continue
         try:
-            yield json.loads(raw.payload.to_bytes())
+            yield raw, json.loads(raw.payload.to_bytes())
         except (ValueError, RecursionError):
             if not logged:
                 key = str(raw.key_expr)[:_MAX_TEXT]

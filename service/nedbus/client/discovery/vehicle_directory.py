@@ -63,6 +63,7 @@ class VehicleDirectory:
     def _take(self, changes: AliveChanges) -> None:
         taken = changes.take()
         if changes.missed:
+            changes.missed = False
             self._addresses.clear()
             self._next_ask = float("-inf")
         for key, alive in taken:

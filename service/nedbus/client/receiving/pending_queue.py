@@ -175,7 +175,7 @@ class PendingQueue:
             if self.ended:
                 ready = self._acknowledgements.take_all()
             else:
-                taken = self._arrived - len(self._every)
+                taken = self._arrived - self.waiting
                 ready = self._acknowledgements.settle(arrived=self._arrived, taken=taken, drained=drained)
         for request in ready:
             request.reply()
@@ -196,7 +196,7 @@ class PendingQueue:
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
         end = None if timeout is None else time.monotonic() + timeout
-        while not (self._every or self._newest or self.ended):
+        while not (self.waiting or self.ended):
             try:
                 self._tokens.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
             except queue.Empty:
@@ -211,7 +211,11 @@ class PendingQueue:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take
-                if self._every:
+                if self._groups:
+                    arrival = self._groups[0].pop(0)
+                    if not self._groups[0]:
+                        self._groups.popleft()
+                elif self._every:
                     arrival = self._every.popleft()
                 elif self._newest:
                     arrival = self._newest.pop(next(iter(self._newest)))
@@ -232,28 +236,30 @@ class PendingQueue:
         """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
         from nedbus.client.batch import by_message, make_batch
 
-        with self._lock:
-            if not self._groups:
-                if self.newest_only:
-                    arrived = list(self._newest.values())
+        while True:
+            with self._lock:
+                arrived: list[Arrival] = []
+                if not self._groups:
+                    arrived = [*self._newest.values()] or [
+                        self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))
+                    ]
                     self._newest.clear()
-                else:
-                    arrived = [self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))]
-                self._groups.extend(by_message(arrived, self._decoder))
-            taken = self._groups.popleft() if self._groups else []
-            lost = sum(lost for _, _, _, lost in taken)
-            for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
-                lost, stream.unreported = lost + stream.unreported, 0
-        if self._acknowledgements.pending:
-            self.acknowledge(drained=False)
-        if not taken:
-            return None
-        batch = make_batch(taken, self._decoder, lost=lost)
-        if not len(batch):
+            groups = by_message(arrived, self._decoder)  # without the lock: it waits for what a message is, perhaps
+            with self._lock:
+                self._groups.extend(groups)
+                taken = self._groups.popleft() if self._groups else []
+                lost = sum(lost for _, _, _, lost in taken)
+                for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
+                    lost, stream.unreported = lost + stream.unreported, 0
+            if self._acknowledgements.pending:
+                self.acknowledge(drained=False)
+            if not taken:
+                return None
+            batch = make_batch(taken, self._decoder, lost=lost)
+            if len(batch):
+                self._received += len(batch)
+                return batch
             taken[0][0].unreported += lost
-            return None
-        self._received += len(batch)
-        return batch
 
     def _queue(self, arrivals: Sequence[Arrival]) -> None:
         """Queue all; the oldest beyond the capacity are dropped, and those that are superseded."""

@@ -59,6 +59,7 @@ class ThinnedReceiver(Receiver):
 
     def _follow_tokens(self, now: float) -> None:
         if self._changes.missed and (self._tokens is None or self._tokens.ended):
+            self._changes.missed = False
             self._tokens = ask_alive(self._session, self._alive_key, timeout=_TIMEOUT)
         answers = [] if self._tokens is None else self._tokens.take()
         known = [(str(reply.ok.key_expr), True) for reply in answers if reply.ok is not None]
