@@ -2,7 +2,7 @@
 
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
-from .declaration import ALL, RELEASES, Layout, Topic
+from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .definition import Definition, Row
 from .errors import (
     AddressError,
@@ -55,7 +55,6 @@ from .schema import json_schema_of, layout_table_of, schema_of
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
-    DEFAULT_TOPIC,
     Address,
     Selection,
     ack_key,

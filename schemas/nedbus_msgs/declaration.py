@@ -9,6 +9,8 @@ from typing import Any, Final, Literal
 
 from .px4_types import FieldType, field_type
 
+DEFAULT_TOPIC: Final = "vehicle_local_position"
+"""The topic of whoever names none."""
 EVERY: Final = "*"
 """In place of the fields of a layout: those of the model."""
 _KEPT_FOR: Final = 20.0  # s

@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
-from .declaration import ALL, EVERY, RELEASES, Layout, Older, Topic
+from .declaration import ALL, DEFAULT_TOPIC, EVERY, RELEASES, Layout, Older, Topic
 from .errors import LayoutError
 from .px4_types import FieldType, field_type, type_of_marks
 from .rules import Rule
@@ -193,8 +193,10 @@ class Definition(Generic[M_co]):
 
     def explain_unknown_field(self, name: str) -> str:
         """Return what to say of a name that no field has: the names that may have been meant, if there are any."""
-        near = difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
-        hint = f"did you mean {' or '.join(near)}?" if near else "'nedbus schema' lists them"
+        base, bracket, _ = name.partition("[")
+        near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
+        schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
+        hint = f"did you mean {' or '.join(near)}?" if near else f"'{schema}' lists them"
         return f"there is no field {name!r}: {hint}"
 
     def __repr__(self) -> str:

@@ -10,10 +10,9 @@ from typing import Final, cast
 
 from .declaration import Topic
 from .errors import AddressError
-from .registry import TOPICS
+from .registry import MESSAGES, TOPICS
 
 ANY: Final = "*"
-DEFAULT_TOPIC: Final = "vehicle_local_position"
 DEFAULT_PREFIX: Final = "nedbus"
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
@@ -181,14 +180,18 @@ def get_topic(name: object) -> Topic:
 
     Raises AddressError for what is not lower_snake_case, and for a misspelling of a topic that has a file here.
     """
-    known = TOPICS.get(name) if isinstance(name, str) else None
-    return known or _other_topic(name)
+    if not isinstance(name, str):
+        raise AddressError("topic", name, 'one name: several topics need a call each, or "*" where all are read')
+    return TOPICS.get(name) or _other_topic(name)
 
 
 @lru_cache(1024)
-def _other_topic(name: object) -> Topic:
-    if not isinstance(name, str) or not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
-        raise AddressError("topic", name, f"one of {', '.join(TOPICS)}, or another of PX4's in lower_snake_case")
+def _other_topic(name: str) -> Topic:
+    if not _TOPIC.fullmatch(name) or len(name) > _TOPIC_LENGTH:
+        topics = MESSAGES[name].topics if name in MESSAGES else TOPICS
+        base, _, instance = name.partition("/")
+        expected = f"one of {', '.join(topics)}" + ", or another of PX4's in lower_snake_case" * (topics is TOPICS)
+        raise AddressError("topic", name, f"{base}, and {instance} as its instance" if base in TOPICS else expected)
     if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
         raise AddressError("topic", name, f"{' or '.join(meant)}, of which it looks like a misspelling")
     return Topic(name, 0.0, "another topic of PX4's", instances=None)

@@ -13,6 +13,7 @@ from nedbus_msgs import BY_TOPIC, Address
 from tests.messages import VLP
 
 HOME, POSITION, OTHER = Address("1", "home_position"), Address("1", VLP), Address("2", VLP)
+ATTITUDE = Address("1", "vehicle_attitude")
 
 
 class Sky:
@@ -66,3 +67,16 @@ def test_home_is_back_with_its_vehicle() -> None:
     sky.hear(1, POSITION, timestamp=5)
     assert sky.output.addresses == [POSITION]
     assert sky.published[-1] == (POSITION, 5)
+
+
+def test_home_of_before_a_reboot_is_never_back() -> None:
+    """A home is said seconds after the boot: the next boot is known by all that the vehicle said, not by that alone."""
+    sky = Sky()
+    sky.hear(2, HOME, POSITION)
+    for _ in range(30):
+        sky.hear(1, POSITION)
+    sky.hear(4)
+    sky.hear(1, POSITION, timestamp=12_000_000)
+    sky.hear(0, ATTITUDE, timestamp=12_100_000)
+    assert set(sky.output.addresses) == {POSITION, ATTITUDE}
+    assert [address for address, _ in sky.published].count(HOME) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from itertools import repeat
 from pathlib import Path
 
@@ -228,7 +228,7 @@ def test_utc_is_told_or_absent() -> None:
     assert found is not None
     assert (found.source, found.count) == ("sensor_gps/0", 10)
     assert 0 <= found.offset_us - BOOT <= found.spread_us <= 6
-    assert found.at(5) == datetime.fromtimestamp(0, UTC) + (found.at(5) - datetime.fromtimestamp(0, UTC))
+    assert found.at(5) == datetime.fromtimestamp(0, UTC) + timedelta(microseconds=found.offset_us + 5)
     assert nedbus.utc_of({"sensor_gps/0": silent, "timesync_status": companion}) == nedbus.UtcOffset(
         "timesync_status", BOOT + 5, 10, 0
     )

@@ -112,6 +112,21 @@ def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpo
         client.until(lambda: topic not in client.topics)
 
 
+def test_what_is_said_once_is_shown_to_the_first_who_subscribes(
+    run_nedbus: Start, endpoint: str, bus: nedbus.Bus
+) -> None:
+    """A home comes once, and brings its channel: nobody can have subscribed to that before."""
+    url = f"ws://127.0.0.1:{free_port()}"
+    process = run_nedbus("foxglove", "-c", endpoint, "--port", url.rpartition(":")[2], measured=False)
+    wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
+    topic = "/7/home_position"
+    with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:
+        publisher.publish({"timestamp": 2_000_000, "alt": 488.0})
+        client.until(lambda: topic in client.topics)
+        client.subscribe(topic)
+        client.until(lambda: topic in client.data)
+
+
 def test_poses_and_locations(bus: nedbus.Bus) -> None:
     """ENU poses with their frames, and positions on the map, as protobuf of Foxglove's own schemas."""
     here = message(1, x=3.0, y=4.0, z=-5.0, heading=0.0, xy_valid=True, eph=1.0, epv=1.0, **ORIGIN)

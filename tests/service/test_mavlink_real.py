@@ -30,6 +30,19 @@ RESOLUTION: Final = {
     "voltage_v": 1e-3, "remaining": 0.01, "current_a": 0.01,
 }  # fmt: skip
 NOT_IN_THE_LOG: Final = {"time_utc_usec", *(f"onboard_control_sensors_{x}" for x in ("present", "enabled", "health"))}
+FIELDS: Final = {  # that it says of each topic
+    "vehicle_attitude": "q",
+    "vehicle_odometry": "angular_velocity orientation_variance pose_frame position position_variance q quality"
+    " reset_counter velocity velocity_frame velocity_variance",
+    "vehicle_global_position": "alt alt_valid eph epv lat lat_lon_valid lon",
+    "sensor_gps": "altitude_ellipsoid_m altitude_msl_m cog_rad eph epv fix_type hdop latitude_deg longitude_deg"
+    " s_variance_m_s satellites_used time_utc_usec vdop vel_m_s",
+    "vehicle_land_detected": "landed",
+    "battery_status": "discharged_mah remaining voltage_v warning",
+    "home_position": "alt lat lon pitch roll valid_alt valid_hpos x y yaw z",
+    "vehicle_status": "arming_state component_id failsafe hil_state onboard_control_sensors_enabled"
+    " onboard_control_sensors_health onboard_control_sensors_present system_id system_type",
+}
 
 pytestmark = [
     pytest.mark.logs,
@@ -55,7 +68,7 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
         rows[each.address.topic, each.address.instance].append(upgrade_with(BY_TOPIC[each.address.topic], each.fields))
     times = {key: [row.timestamp for row in of_key] for key, of_key in rows.items()}
     vehicle, parser = Vehicle("1", MavlinkOptions.model_validate({"topics": ",".join(TOPICS)})), dialect.MAVLink(None)
-    compared, unlogged = Counter[str](), Counter[str]()
+    compared, unlogged, fields_said = Counter[str](), Counter[str](), defaultdict[str, set[str]](set)
     for time_ns, datagram in read_datagrams(PX4 / "twelve_messages_mavlink.bin.gz"):
         for message in parser.parse_buffer(datagram) or []:
             if not message.get_srcSystem():
@@ -75,6 +88,7 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
                 unlogged[topic] += 1
                 continue
             compared[topic] += 1
+            fields_said[topic] |= fields.keys() - {"timestamp"}
             for name in fields.keys() - NOT_IN_THE_LOG - {"timestamp"}:
                 of_status = topic == "vehicle_global_position" and name not in ("lat", "lon", "alt")
                 if of_status and name in ("eph", "epv"):
@@ -84,6 +98,7 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
                 candidates = [getattr(row, name) for row in of_topic[since:until]]
                 value = getattr(model, name)
                 assert any(is_same(name, value, each) for each in candidates), (topic, now, name, value, candidates)
+    assert fields_said == {topic: set(names.split()) for topic, names in FIELDS.items()}
     # The log has not every attitude, and was closed before the last odometry.
     assert unlogged == {"vehicle_attitude": 472, "vehicle_odometry": 1}
     assert compared == {

@@ -119,7 +119,7 @@ def test_each_topic_has_an_order_of_its_own() -> None:
     assert vehicle.handle(dialect.MAVLink_odometry_message(1_900_000, *odometry), 100.0)
     late = vehicle.handle(dialect.MAVLink_odometry_message(1_800_000, *odometry), 100.0)
     assert isinstance(late, Rejection)
-    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order: time_boot_ms 1800 after 1900")
+    assert (late.where, late.reason) == ("9/vehicle_odometry", "out of order: 1800 ms since boot, after 1900 ms")
     assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
 
 

@@ -28,7 +28,9 @@ from nedbus_msgs import (
     Selection,
     VehicleLocalPosition,
     dds_type,
+    define,
     encode,
+    field_type,
     split_ros2_topic,
     upgrade_with,
 )
@@ -205,6 +207,22 @@ def test_every_message_has_its_layout_of_the_release(
     assert len(received) == len(messages) - len(missing)
     for address in missing:
         assert caplog.text.count(f"{address} is not published to ROS 2: PX4 {release} has no such message") == 1
+
+
+def test_home_of_a_vehicle_that_appears_reaches_ros_2(
+    run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is said once, before the bridge can know of it; of what nobody selected nothing is said."""
+    subscriber = raw.declare_subscriber("0/**", zenoh.handlers.FifoChannel(1000))
+    run_bridge(selection=Selection(ANY, "1"))
+    wait_for_reader(raw, "nedbus/1/home_position")
+    wheel = define("Wheel", [("timestamp", field_type("uint64"))])
+    other = bus._publishers.publisher(Address("2", "wheel_encoders"), wheel)
+    other.publish({"timestamp": 1})
+    bus.publisher("home_position", vehicle="1").publish({"timestamp": 2_000_000, "alt": 488.0})
+    key = TopicKey.parse(str(subscriber.handler.recv().key_expr))
+    assert key.topic == "fmu/out/home_position"
+    assert "wheel_encoders" not in caplog.text
 
 
 def test_last_value_does_not_reach_ros_2(

@@ -37,7 +37,7 @@ def streams() -> dict[str, list[VehicleLocalPosition]]:
     for each in simulate("?duration=140&topics=VehicleLocalPosition"):
         assert set(each.fields) == set(FIELD_TYPES)
         by_stream[each.address.stream].append(upgrade(each.fields))
-    return by_stream
+    return dict(by_stream)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def others() -> dict[str, list[Any]]:
         assert newest
         assert each.fields.keys() == newest.types.keys()
         by_stream[each.address.stream].append(upgrade_with(definition, each.fields))
-    return by_stream
+    return dict(by_stream)
 
 
 def encoded(options: str) -> list[tuple[float, str, bytes]]:

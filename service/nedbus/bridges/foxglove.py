@@ -28,6 +28,7 @@ from nedbus_msgs import (
     VehicleLocalPosition,
     definition_text,
     encode_with,
+    get_topic,
     ros2_type,
 )
 
@@ -51,6 +52,7 @@ class FoxgloveServer:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[Address, foxglove.Channel] = {}
+        self._unseen: dict[Address, tuple[Message, int]] = {}  # the last of what has no rate, until a client subscribes
         self._poses: dict[str, PoseInFrameChannel] = {}
         self._locations: dict[str, LocationFixChannel] = {}
         self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
@@ -73,6 +75,8 @@ class FoxgloveServer:
             while not stop.is_set():
                 if time.monotonic() >= next_poll:
                     self._close_unpublished()
+                    for address, (message, time_ns) in list(self._unseen.items()):
+                        self._show_fields(address, message, time_ns)
                     next_poll = time.monotonic() + _POLL
                 try:
                     self.show(subscription.receive(0.1))
@@ -110,7 +114,10 @@ class FoxgloveServer:
                 f"/{address}", schema=schema, message_encoding="cdr", context=self._context
             )
         if channel.has_sinks():
+            self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
+        elif not get_topic(address.topic).rate:
+            self._unseen[address] = message, time_ns  # it may never come again
 
     def _open_channels(self, vehicle: str) -> None:
         if vehicle not in self._poses:
@@ -138,6 +145,7 @@ class FoxgloveServer:
             return  # without a link the answers are incomplete
         for address in self._fields.keys() - published:
             self._fields.pop(address).close()
+            self._unseen.pop(address, None)
             if address.topic == _ATTITUDE:
                 self._attitudes.pop(address.vehicle, None)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}

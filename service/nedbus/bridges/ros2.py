@@ -19,7 +19,6 @@ from nedbus.log_event import about
 from nedbus.transport import (
     BRIDGED_ENCODING,
     NO_HASH,
-    PX4_TYPES,
     Attachment,
     PublisherToken,
     Session,
@@ -28,7 +27,7 @@ from nedbus.transport import (
     gid_of_token,
     node_token,
     publisher_token,
-    publishers_of_type_key_expr,
+    px4_publishers_key_expr,
     while_open,
 )
 from nedbus_msgs import (
@@ -99,7 +98,11 @@ class Ros2Bridge:
         self._selection = selection or Selection()
         self._layout = layout
         self._domain = domain
-        self._hashed = hashed
+        self._types: dict[str, tuple[Definition[Any], Layout, str]] = {
+            topic: (definition, found, hash_of(found, ros2_type(definition)) if hashed else NO_HASH)
+            for topic, definition in BY_TOPIC.items()
+            if (found := definition.layout_of_release(layout))
+        }  # that the workspace has
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
         self._late_filter = LateFilter()
@@ -107,6 +110,7 @@ class Ros2Bridge:
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
         self._left_out: set[Address] = set()
+        self._held: dict[Address, Sample[Any]] = {}  # the last of what has no rate, until its topic is published
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
@@ -154,11 +158,13 @@ class Ros2Bridge:
             except NoDataError:
                 continue
             # What has no rate holds until the next one comes, however old it is.
-            is_current = not get_topic(sample.topic).rate or self._late_filter.admits(
-                sample, arrived=time.monotonic_ns()
-            )
-            if is_current and self._arbiter.publishes(sample.address):
+            has_rate = get_topic(sample.topic).rate > 0
+            if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
+                continue
+            if self._arbiter.publishes(sample.address):
                 self._put(sample)
+            elif not has_rate and sample.topic in self._types:
+                self._held[sample.address] = sample
 
     def _poll(self) -> None:
         """Say what was held back, query what is on the bus and in ROS 2, and do what the arbiter decides."""
@@ -168,6 +174,7 @@ class Ros2Bridge:
         for address, since in list(self._withdrawn.items()):
             if time.monotonic() - since > _REMEMBERED:
                 del self._withdrawn[address]
+                self._held.pop(address, None)
                 self._late_filter.forget(address)
         addresses = [
             address for addresses in self._bus.vehicles().values() for address in addresses if self._is_bridged(address)
@@ -184,14 +191,11 @@ class Ros2Bridge:
         if decision.action == "publish":
             self._open(address)
             self._withdrawn.pop(address, None)
-            _log.info(
-                "%s -> /%s, %s of layout %s",
-                address,
-                topic,
-                ros2_type(self._message(address)[0]),
-                self._message(address)[1].name,
-                extra=about("bridged", address),
-            )
+            definition, layout, _ = self._types[address.topic]
+            name = ros2_type(definition)
+            _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
+            if address in self._held:
+                self._put(self._held.pop(address))
         elif decision.action == "conflict":
             _log.warning(
                 "%s is not published: %s has the topic /%s already: set --namespace",
@@ -221,7 +225,7 @@ class Ros2Bridge:
     def _other_nodes(self) -> dict[TopicKey, str]:
         """Return the name of another node for each topic that one publishes, by one query: there may be thousands."""
         nodes, own = dict[TopicKey, str](), self._zid
-        for text in alive_keys(self._session, publishers_of_type_key_expr(self._domain, PX4_TYPES), timeout=0.5):
+        for text in alive_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
                 token = PublisherToken.parse(text)
                 if token.session != own:
@@ -243,7 +247,7 @@ class Ros2Bridge:
 
     def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]
-        definition, layout = self._message(sample.address)
+        definition, layout, _ = self._types[sample.topic]
         payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
         attachment = bytes(Attachment(publisher.sequence, time.time_ns(), publisher.gid))
@@ -251,27 +255,19 @@ class Ros2Bridge:
             publisher.publisher.put(payload, attachment=attachment)
 
     def _key(self, address: Address) -> TopicKey:
-        definition, layout = self._message(address)
-        name = ros2_type(definition)
-        type_hash = hash_of(layout, name) if self._hashed else NO_HASH
-        return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(name), type_hash)
-
-    def _message(self, address: Address) -> tuple[Definition[Any], Layout]:
-        """Return the message of an address that is bridged, and its layout in the workspace."""
-        definition = BY_TOPIC[address.topic]
-        layout = definition.layout_of_release(self._layout)
-        return definition, layout or definition.current
+        definition, _, type_hash = self._types[address.topic]
+        return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(ros2_type(definition)), type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether ROS 2 can have an address: the workspace has its message."""
-        definition = BY_TOPIC.get(address.topic)
-        if definition and definition.layout_of_release(self._layout):
-            return self._selection.matches(address)
+        """Return whether an address is wanted, and ROS 2 can have it: the workspace has its message."""
+        if not self._selection.matches(address):
+            return False
+        if address.topic in self._types:
+            return True
         if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
             self._left_out.add(address)
-            reason = (
-                f"PX4 {self._layout} has no such message" if definition else "nothing here says what it is in px4_msgs"
-            )
+            known = address.topic in BY_TOPIC
+            reason = f"PX4 {self._layout} has no such message" if known else "nothing says what it is in px4_msgs"
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
         return False
 

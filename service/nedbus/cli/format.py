@@ -86,9 +86,9 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
     source = "" if sample.source is None else f", from {sample.source}"
     stored = ", only stored" if sample.stored else ""
-    lines = [f"{sample.address}{age}{source}{stored}"]
+    missing, lines = sample.missing, [f"{sample.address}{age}{source}{stored}"]
     lines += [
-        f"  {name}: {to_value(sample, name)}" + (" (not provided)" if name in sample.missing else "")
+        f"  {name}: {to_value(sample, name)}" + (" (not provided)" if name in missing else "")
         for name in fields or sample.message.DEFINITION.types
     ]
     return "\n".join([*lines, "---"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from difflib import get_close_matches
 from typing import Annotated, Any, Final
 
 import typer
@@ -14,6 +14,7 @@ from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_s
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
     ANY,
+    BY_TOPIC,
     DEFAULT_TOPIC,
     MESSAGES,
     TOPICS,
@@ -50,6 +51,7 @@ _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED"
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
+_SIMILAR: Final = 0.8  # of a name from which one is taken for a misspelling of it
 _MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a service
 _MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
@@ -165,16 +167,20 @@ def schema(
 
 
 def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
-    with suppress(AddressError, ConnectError):
+    reason = "nor is it a topic that is published"
+    try:
         get_topic(topic)  # "*" is none
         with open_bus() as bus:
             for sample in bus.latest(topic):
                 message: Message = sample.message
                 return message.DEFINITION
-    known = ", ".join(MESSAGES)
-    raise ConfigError(
-        "message", f"there is no file for {topic!r}, nor is it a topic that is published: {known} are known"
-    )
+    except AddressError:
+        pass
+    except ConnectError as exc:
+        reason = f"and nobody to ask: {exc}"
+    near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(MESSAGES)} are known"
+    raise ConfigError("message", f"there is no file for {topic!r}, {reason}: {hint}")
 
 
 def _chunks(address: Address) -> dict[str, object]:

@@ -214,15 +214,23 @@ class SourceOutput:
 
     def _bring_back(self, message: SourceMessage) -> None:
         """Publish again what has no rate of a vehicle that is back: it would not send it; not after a reboot."""
-        for address, stream in self._streams.items():
-            last = stream.last
-            if last is None or stream.publisher is not None or address.vehicle != message.address.vehicle:
+        vehicle = message.address.vehicle
+        known = [
+            (address, stream, stream.last)
+            for address, stream in self._streams.items()
+            if address.vehicle == vehicle and stream.last is not None
+        ]
+        rebooted = message.rebooted or _time_of(message) < max((_time_of(last) for *_, last in known), default=0)
+        for address, stream, last in known:
+            if stream.publisher is not None or get_topic(address.topic).rate:
                 continue
-            before, now = (cast("int", each.fields.get("timestamp", 0)) for each in (last, message))
-            if before <= now and not get_topic(address.topic).rate:
-                with suppress(AddressInUseError):
-                    self.claim(address, last.definition)
-                    self.publish(replace(last, lost=0))
+            if rebooted:
+                stream.last = None  # it no longer holds
+                continue
+            with suppress(AddressInUseError):
+                self.claim(address, last.definition)
+                _log.info("%s: %s is back", self._name, address, extra=about("back", address, source=self._name))
+                self.publish(replace(last, lost=0))
 
     def _now(self) -> int:
         """Return monotonic ns: rates and ages do not follow the wall clock."""
@@ -247,6 +255,10 @@ class SourceOutput:
             )
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._registry.reject(message.address, report)
+
+
+def _time_of(message: SourceMessage) -> int:
+    return cast("int", message.fields.get("timestamp", 0))
 
 
 def _rule_of(error: InvalidMessageError) -> str:

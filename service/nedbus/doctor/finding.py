@@ -11,7 +11,7 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 """All states, the worst last."""
 
 _MAX_FINDINGS: Final = 10  # of one check that are listed one by one: any peer may claim to be a thousand vehicles
-_MAX_NAME: Final = 100  # characters of what a peer sent
+_MAX_NAME: Final = 140  # characters of what a peer sent; an address has up to 133
 
 
 @dataclass(frozen=True, slots=True)

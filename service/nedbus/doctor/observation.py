@@ -11,7 +11,6 @@ from itertools import islice
 from typing import Final
 
 from nedbus.transport import (
-    PX4_TYPES,
     PublisherToken,
     RawSample,
     RouterState,
@@ -19,7 +18,7 @@ from nedbus.transport import (
     alive_keys,
     ask_routers,
     follow_heartbeats,
-    publishers_of_type_key_expr,
+    px4_publishers_key_expr,
     query,
 )
 from nedbus_msgs import (
@@ -175,7 +174,7 @@ def _alive(session: Session, prefix: str) -> list[Address]:
 def _ros2_publishers(session: Session) -> list[PublisherToken]:
     """Return the publishers of ROS 2's keys with this message, other than our own bridge."""
     found = []
-    for text in alive_keys(session, publishers_of_type_key_expr(None, PX4_TYPES), timeout=_TIMEOUT):
+    for text in alive_keys(session, px4_publishers_key_expr(None), timeout=_TIMEOUT):
         try:
             token = PublisherToken.parse(text)
         except DecodeError:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
+_EXPECTED: Final = "expected a file, or arrays as nedbus.read(file, [...]) returns them"
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # by the unit of an angle
 _MAX_ROWS: Final = 10_000_000  # of a table at a rate: a damaged timestamp must not fill the memory
@@ -87,6 +88,8 @@ def align(
         everything = not topics or ANY in topics
         streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
         offset = tell_utc(flight)
+    elif not isinstance(flight, str | Path):
+        raise ConfigError("flight", _EXPECTED)
     else:
         wants_utc = utc or dataframe == "pandas"
         streams, offset = read_streams(flight, names if topics else None, vehicle=vehicle, utc=wants_utc)
@@ -122,7 +125,7 @@ def align(
 def _require_arrays(flight: Mapping[str, object], topics: Iterable[str]) -> None:
     """Raise ConfigError unless these are streams as `read` returns them, AddressError unless they have the topics."""
     if not flight or not all(isinstance(each, np.ndarray) and each.dtype.names for each in flight.values()):
-        raise ConfigError("flight", "expected a file, or arrays as nedbus.read(file, [...]) returns them")
+        raise ConfigError("flight", _EXPECTED)
     for name in topics:
         if name not in (ANY, *flight):
             raise AddressError("topic", name, f"one of {', '.join(flight)}")

@@ -123,6 +123,9 @@ def read_streams(
     path, vehicle = Path(path).expanduser(), vehicle_name(vehicle)
     chosen: dict[Address, None] = {}
     names = [ANY] if topics is None else [topics] if isinstance(topics, str) else topics
+    for name in names:
+        if not isinstance(name, str):
+            raise AddressError("topic", name, "the name of a topic or a stream")
     wanted = {name.partition("/")[0] for name in names}
     with Flight(path, topics=None if ANY in wanted and names is topics else wanted | TOPICS.keys()) as flight:
         for name in names:

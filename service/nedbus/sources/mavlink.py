@@ -10,11 +10,12 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from nedbus.errors import SourceError
+from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
+from .mavlink_fields import SAID
 from .mavlink_link import Link, Peer, check_link, open_link
 from .mavlink_vehicle import Vehicle
 from .options import MavlinkOptions
@@ -41,6 +42,10 @@ class MavlinkSource:
 
     def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         check_link(link)
+        known = {topic for topic, _ in SAID.values()}
+        if known.isdisjoint(options.chosen_topics or known):
+            reason = f"MAVLink says nothing of these topics, but of {', '.join(sorted(known))}"
+            raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
         self._sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)

@@ -169,7 +169,7 @@ class Vehicle:
         instance = (message.id if kind == "BATTERY_STATUS" else 0) if TOPICS[topic].instances else None
         address = Address(self._name, topic, instance)
         if timestamp < (last := self._last.get(address, 0)):
-            reason = f"out of order: time_boot_ms {timestamp // 1000} after {last // 1000}"
+            reason = f"out of order: {timestamp // 1000} ms since boot, after {last // 1000} ms"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
         if topic == DEFAULT_TOPIC or DEFAULT_TOPIC not in self._topics:

@@ -23,6 +23,7 @@ class McapSource:
         self._vehicle = options.vehicle
         self._default_vehicle = context.vehicle
         self._topics = options.chosen_topics
+        self._absent_from = options.absent_from
         self.finite = not options.loop
         self.loop = options.loop
         self.speed = None if options.speed == "max" else options.speed
@@ -36,7 +37,8 @@ class McapSource:
         addresses = sorted({stream.address for stream in counts})
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
-            raise SourceError(self._path, "no message of these topics is in this recording")
+            found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "none of PX4's topics"
+            raise SourceError(self._path, f"no message of these topics is in this recording, which has {found}")
         if self._vehicle is not None and len(vehicles) > 1:
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
         total = sum(counts.values())
@@ -45,7 +47,7 @@ class McapSource:
             addresses=tuple(sorted({self._rename(address) for address in addresses})),
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
-            warnings=tuple(reader.warnings),
+            warnings=(*reader.warnings, *self._absent_from({each.topic for each in addresses}, "this recording")),
             definitions={
                 stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
             },
@@ -82,4 +84,4 @@ class McapSource:
             return SourceMessage(due, address, {}, error=f"message {number} of the recording: {exc}")
         for name in recorded.stream.missing & definition.all_fields:
             fields.pop(name, None)
-        return SourceMessage(due, address, fields, definition=None if address.topic in BY_TOPIC else definition)
+        return SourceMessage(due, address, fields, definition=definition)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Set
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -46,12 +46,16 @@ def _parse_topics(text: object) -> object:
     """Parse `TOPIC,TOPIC`, where the name of a message stands for all of its topics."""
     if not isinstance(text, str):
         return text
-    names = [part.strip() for part in text.split(",")]
-    topics = [topic for name in names for topic in (MESSAGES[name].topics if name in MESSAGES else [name])]
-    for topic in topics:
-        if topic != ANY:
-            get_topic(topic)
-    return tuple(topics)
+    names = tuple(part.strip() for part in text.split(","))
+    for name in names:
+        if name not in (ANY, *MESSAGES):
+            get_topic(name)
+    return names
+
+
+def _topics_of(name: str) -> Set[str]:
+    """Return the topics that a name stands for: those of a message, or itself."""
+    return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
 Vehicle = Annotated[str, AfterValidator(_check_vehicle)]
@@ -70,7 +74,14 @@ class Options(BaseModel):
     @property
     def chosen_topics(self) -> Collection[str] | None:
         """The topics to deliver: by default those that have a file here; None is all, whatever they are."""
-        return None if ANY in self.topics else self.topics or TOPICS
+        if ANY in self.topics:
+            return None
+        return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
+
+    def absent_from(self, topics: Collection[str], where: str) -> list[str]:
+        """Return a warning of what was asked for by name, and is none of these topics."""
+        absent = [name for name in self.topics if name != ANY and _topics_of(name).isdisjoint(topics)]
+        return [f"no message of {', '.join(absent)} is in {where}"] if absent else []
 
 
 class ReplayOptions(Options):

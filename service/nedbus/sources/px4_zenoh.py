@@ -24,10 +24,10 @@ from nedbus.transport import (
     Session,
     check_endpoints,
     open_client,
-    publishers_of_type_key_expr,
+    px4_publishers_key_expr,
     while_open,
 )
-from nedbus_msgs import BY_TOPIC, Address, decode_with
+from nedbus_msgs import Address, decode_with
 
 from .options import Px4ZenohOptions
 from .px4_absences import Absences
@@ -74,10 +74,9 @@ class Px4ZenohSource:
                 closing.callback(session.close)
             node = Px4ZenohNode(session)
             decoder = _Decoder(StreamRegistry(self._options, vehicle=self._vehicle, given=self._given), node)
-            inbox = _Inbox(self._name)
-            closing.callback(inbox.close)
             with while_open():
-                inbox.subscribe(session, PX4_TYPES, domain=self._options.domain)
+                inbox = _Inbox(self._name, session, domain=self._options.domain)
+            closing.callback(inbox.close)
             closing.callback(node.close)
             yield None
             last: Absence | None = None
@@ -108,47 +107,35 @@ class Px4ZenohSource:
 
 
 class _Inbox:
-    """What arrived and waits to be decoded, in order.
+    """The messages that arrived and wait to be decoded, in order, and the tokens of those who publish them.
 
     Zenoh puts it into channels in Rust, which threads of ours empty: a callback would wait for the interpreter's lock.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, session: Session, *, domain: int | None) -> None:
         self.pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         self._name = name
-        self._subscribers: list[zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = []
-        self._tokens: list[zenoh.Handler[zenoh.Sample]] = []
-        self._threads: list[threading.Thread] = []
         self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
         self._reported = Counter[tuple[str, str]]()
-
-    def subscribe(self, session: Session, dds_type: str, *, domain: int | None) -> None:
-        """Receive the messages of a type, and before them the tokens of those who publish them."""
-        tokens = session.liveliness().declare_subscriber(
-            publishers_of_type_key_expr(domain, dds_type),
-            zenoh.handlers.RingChannel(_MAX_PENDING_TOKENS),
-            history=True,
-        )
-        self._subscribers.append(tokens)
-        self._tokens.append(tokens.handler)
-        key_expr = f"{'*' if domain is None else domain}/**/{dds_type}/*"
+        publishers = px4_publishers_key_expr(domain)
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_PENDING_TOKENS)
+        tokens = session.liveliness().declare_subscriber(publishers, ring, history=True)
+        key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
         messages = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_CHANNEL))
-        self._subscribers.append(messages)
-        thread = threading.Thread(target=self._receive, args=[messages.handler], name="nedbus-px4", daemon=True)
-        thread.start()
-        self._threads.append(thread)
+        self._subscribers = tokens, messages
+        self._tokens: zenoh.Handler[zenoh.Sample] = tokens.handler
+        self._thread = threading.Thread(target=self._receive, args=[messages.handler], name="nedbus-px4", daemon=True)
+        self._thread.start()
 
     def tokens(self) -> Iterator[zenoh.Sample]:
         """Yield the liveliness tokens that changed; raise SourceError if some were dropped."""
-        for handler in self._tokens:
-            with while_open():
-                for _ in range(_MAX_PENDING_TOKENS):
-                    token = handler.try_recv()
-                    if token is None:
-                        break
-                    yield token
-                else:
-                    raise SourceError(self._name, "publishers come and go faster than they can be followed")
+        with while_open():
+            for _ in range(_MAX_PENDING_TOKENS):
+                token = self._tokens.try_recv()
+                if token is None:
+                    return
+                yield token
+        raise SourceError(self._name, "publishers come and go faster than they can be followed")
 
     def overflow(self) -> Iterator[Rejection]:
         """Yield how many messages were dropped since the last call."""
@@ -162,8 +149,7 @@ class _Inbox:
         for subscriber in self._subscribers:
             with suppress(zenoh.ZError):  # its session may be closed already
                 subscriber.undeclare()
-        for thread in self._threads:
-            thread.join(_JOIN)
+        self._thread.join(_JOIN)
 
     def _receive(self, handler: zenoh.Handler[zenoh.Sample]) -> None:
         with suppress(zenoh.ZError):  # undeclared
@@ -218,8 +204,7 @@ class _Decoder:
         if rebooted:
             extra = about("rebooted", stream.address, source="px4-zenoh")
             _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
-        definition = None if stream.address.topic in BY_TOPIC else stream.definition
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=stream.definition)
 
     def follow(self, sample: zenoh.Sample) -> None:
         """Note that a publisher appeared, or is gone, by its liveliness token."""

@@ -48,7 +48,8 @@ class SimulatorSource:
             each for each in streams if each.ticks and (self._topics is None or each.address.topic in self._topics)
         ]
         if not chosen:
-            asked, known = ", ".join(self._topics or ()), ", ".join(sorted({each.address.topic for each in streams}))
+            asked = ", ".join(sorted(self._topics or ()))
+            known = ", ".join(sorted({each.address.topic for each in streams}))
             raise SourceError("sim", f"a simulated vehicle does not have {asked}, but {known}")
         total = None if self._ticks is None else sum(len(each.ticks) for each in chosen)
         return ReplayRun(

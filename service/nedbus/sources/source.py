@@ -19,7 +19,7 @@ class SourceMessage:
     `lost`: messages that were lost between the vehicle and the source, just before this one.
     `rebooted`: this is the first message after the vehicle rebooted.
     `error`: why it cannot be decoded, if so; it has no fields then.
-    `definition`: that of its message, where the topic has no file.
+    `definition`: that of its message, None for that of its topic.
     """
 
     due: float

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, unquote, urlencode
 
 from pydantic import ValidationError
 
-from nedbus.errors import ConfigError
+from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import needs
 from nedbus.recording import SUFFIXES, format_of
 from nedbus.transport import Tls
@@ -172,4 +172,6 @@ def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
     field = kind.options.model_fields.get(name)
     if field is None:
         return f"there is no option {name!r}: choose from {', '.join(kind.options.model_fields)}", name
+    if isinstance(cause := detail.get("ctx", {}).get("error"), AddressError) and name == "topics":
+        return str(cause), name
     return f"{name}={detail['input']} is invalid: expected {field.description}", name

@@ -34,12 +34,11 @@ class _Track:
     def messages(self) -> Iterator[SourceMessage]:
         """Yield the rows."""
         address, definition, names = self.topic.address, self.topic.definition, tuple(self.topic.columns)
-        described = definition if self.topic.is_described else None
         for start in range(0, len(self.due), _CHUNK):
             rows = slice(start, start + _CHUNK)
             columns = [python_values(definition, name, column[rows]) for name, column in self.topic.columns.items()]
             for due, row in zip(self.due[rows].tolist(), zip(*columns, strict=True), strict=True):
-                yield SourceMessage(due, address, dict(zip(names, row, strict=True)), definition=described)
+                yield SourceMessage(due, address, dict(zip(names, row, strict=True)), definition=definition)
 
 
 class UlogSource:
@@ -49,7 +48,7 @@ class UlogSource:
         self._path = Path(path).expanduser()
         self._vehicle = options.vehicle
         self._default_vehicle = context.vehicle
-        self._topics = options.chosen_topics
+        self._options = options
         self.finite = not options.loop
         self.loop = options.loop
         self.speed = None if options.speed == "max" else options.speed
@@ -57,7 +56,8 @@ class UlogSource:
 
     def open(self) -> ReplayRun:
         """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
-        log = read_ulog(self._path, topics=self._topics, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        chosen = self._options.chosen_topics
+        log = read_ulog(self._path, topics=chosen, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
         topics, warnings = log.topics, list(log.warnings)
         clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
         for topic, clock in zip(topics, clocks, strict=True):
@@ -67,6 +67,7 @@ class UlogSource:
             unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
             if unknown and _is_newer(topic):
                 warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than this version")
+        warnings += self._options.absent_from({topic.address.topic for topic in topics}, "this log")
         dues, gaps = _pace(clocks)
         if gaps:
             warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")

@@ -29,7 +29,7 @@ from .rmw_zenoh import (
     gid_of_token,
     node_token,
     publisher_token,
-    publishers_of_type_key_expr,
+    px4_publishers_key_expr,
     subscription_token,
 )
 from .router import RouterConfig, open_router, read_router_config, router_endpoints, router_max_sessions
@@ -130,7 +130,7 @@ __all__ = [
     "open_router",
     "probe_writes",
     "publisher_token",
-    "publishers_of_type_key_expr",
+    "px4_publishers_key_expr",
     "query",
     "read_access_rules",
     "read_router_config",

@@ -141,9 +141,9 @@ PX4_TYPES: Final = "px4_msgs$*"
 """The DDS types of PX4's messages, as a chunk of a key expression; those of its translation node too."""
 
 
-def publishers_of_type_key_expr(domain: int | None, dds_type: str) -> str:
-    """Return the key expression for the tokens of all publishers of a type, in one domain or in all."""
-    return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{dds_type}/*/*"
+def px4_publishers_key_expr(domain: int | None) -> str:
+    """Return the key expression for the tokens of all publishers of PX4's messages, in one domain or in all."""
+    return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"
 
 
 def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:

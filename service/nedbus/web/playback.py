@@ -73,8 +73,9 @@ def _encode(fields: Mapping[str, object]) -> bytes | str:
         return exc.reason
 
 
-def _time_of(fields: Mapping[str, object]) -> int:
-    return cast("int", fields["timestamp"])
+def _time_of(fields: Mapping[str, object]) -> int | str:
+    """Return PX4's time of a message, or why it is none."""
+    return cast("int", fields["timestamp"]) if "timestamp" in fields else "timestamp: Field required"
 
 
 class _Unread(NamedTuple):

@@ -89,7 +89,14 @@ class Publisher:
                 raise TypeError(f"{self.address} carries {self.definition.name}, not {type(message).__name__}")
             self._put(self._codec.encode(message), message.__pydantic_fields_set__)
         else:
-            self._put(self._codec.encode_fields(message), message.keys())
+            try:
+                payload = self._codec.encode_fields(message)
+            except (TypeError, ValueError):
+                if isinstance(message, Mapping):
+                    raise
+                reason = f"expected a {self.definition.name}, or a dict of its fields, not {type(message).__name__}"
+                raise TypeError(reason) from None
+            self._put(payload, message.keys())
 
     def publish_row(self, values: Sequence[object] | Message) -> None:
         """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and publish them.
@@ -109,8 +116,9 @@ class Publisher:
         from nedbus_msgs.arrays import arrays_of
 
         arrays, size = arrays_of(self.definition), self._codec.size
-        if messages.dtype != arrays.dtype:
-            raise TypeError(f"the array must have the dtype of {self.definition.name}: convert it with astype")
+        if getattr(messages, "dtype", None) != arrays.dtype:
+            hint = "nedbus.to_array makes it of messages, and astype of an array with its fields"
+            raise TypeError(f"{self.address} needs an array with the dtype of {self.definition.name}: {hint}")
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
         for start in range(0, len(payloads), size):

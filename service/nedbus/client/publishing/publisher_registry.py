@@ -73,7 +73,8 @@ class PublisherRegistry:
         """
         definition = definition or BY_TOPIC.get(address.topic)
         if definition is None:
-            raise AddressError("topic", address.topic, "one whose message has a file, or a definition of its message")
+            expected = f"one of {', '.join(BY_TOPIC)}: nothing here says what its message is"
+            raise AddressError("topic", address.topic, expected)
         with self._lock:
             if address in self._publishers:
                 raise AddressInUseError(address)
