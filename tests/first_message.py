@@ -46,7 +46,6 @@ ENCODING: Final = _encoding_of(DEFAULT, None)
 encoding_of = partial(_encoding_of, DEFAULT)
 provenance_of = partial(_provenance_of, DEFAULT)
 to_row = arrays_of(DEFAULT).to_row
-require_valid = arrays_of(DEFAULT).require_valid
 
 
 def encode_cdr_array(array: MessageArray) -> npt.NDArray[np.void]:
@@ -68,11 +67,6 @@ def layout_of_type_hash(text: str) -> str | None:
     """Return the name of the layout with this hash."""
     found = message_of_type_hash(text)
     return found[1].name if found else None
-
-
-def upgraded_names(names: Sequence[str]) -> dict[str, str]:
-    """Return which of these names provides each field."""
-    return dict(DEFAULT.plan(names).names)
 
 
 _FIRST: Any = VehicleLocalPosition

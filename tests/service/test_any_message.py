@@ -89,8 +89,13 @@ def test_message_of_unknown_encoding_says_so(
 ) -> None:
     """Without a message in its encoding nobody can be asked what it is."""
     with client.subscribe("wheel_encoders") as subscription:
+        wait_for_reader(raw, "nedbus/7/wheel_encoders")
         raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
-        with pytest.raises(nedbus.NoDataError):
-            subscription.receive(0.5)
-        assert subscription.counts.invalid == 1
+
+        def is_counted() -> bool:
+            with pytest.raises(nedbus.NoDataError):
+                subscription.receive(0.05)
+            return subscription.counts.invalid == 1
+
+        wait_for(is_counted, what="it to be counted")
     assert "nothing says which message it is: its encoding is 'text/plain'" in caplog.text

@@ -310,6 +310,9 @@ def test_definition_that_is_none_is_refused(tmp_path: Path, text: str, where: st
     parse_source(f"px4-zenoh:?msg={tmp_path}").open_source(vehicle="1")
     with pytest.raises(ConfigError, match=r"other\.msg: No such file"):
         parse_source(f"px4-zenoh:?msg={tmp_path},{tmp_path}/other.msg").open_source(vehicle="1")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match=r"empty: no \.msg file is in this folder"):
+        parse_source(f"px4-zenoh:?msg={tmp_path}/empty").open_source(vehicle="1")
 
 
 def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:

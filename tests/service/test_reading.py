@@ -6,8 +6,10 @@ import re
 import shutil
 import sys
 import tracemalloc
+from collections.abc import Iterator
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -305,6 +307,33 @@ def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch)
     assert isinstance(scope["estimates"], pd.DataFrame)
     assert pd.read_csv(flight.with_name("flight.csv"))["x"].tolist() == [2.5]
     assert 0.0 < float(str(scope["rms"])) < 30.0
+
+
+def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A recording with positions on the topic of attitudes: they are not read as attitudes, and the log says why."""
+    path, addresses = tmp_path / "a.mcap", [Address("1", "vehicle_attitude"), Address("1", VLP)]
+    with RecordingWriter(path) as writer:
+        streams = [(address, Provenance("sim")) for address in addresses]
+        writer.write(to_array([message(1), message(2)]), DEFAULT, streams, logged=(1, 2), published=(1, 2))
+    assert nedbus.addresses_of(path) == addresses[1:]
+    nedbus.read(path)
+    assert "messages of type VehicleLocalPosition, where vehicle_attitude has VehicleAttitude" in caplog.text
+
+
+def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many topics are wanted, and with the messages that tell UTC."""
+    path = tmp_path / "flight.mcap"
+    convert_replay("sim:?duration=20", path)
+    passes: list[object] = []
+    read = recording.RecordingReader.messages
+
+    def note(*arguments: Any) -> Iterator[Any]:
+        passes.append(arguments)
+        return read(*arguments)
+
+    monkeypatch.setattr(recording.RecordingReader, "messages", note)
+    assert len(nedbus.read(path, ["*"], dataframe="pandas")) > 10
+    assert len(passes) == 1
 
 
 @pytest.mark.parametrize("sampled", [True, False])

@@ -10,8 +10,12 @@ from typing import Any
 import pytest
 
 from nedbus.errors import NedbusError
+from nedbus.recording import RecordingWriter
 from nedbus.web.fleet import TRUTH
 from nedbus.web.playback import Player, Recording
+from nedbus_msgs import Address, Provenance
+from nedbus_msgs.arrays import to_array
+from nedbus_msgs.messages import VehicleAttitude
 from tests.messages import VLP
 from tests.waits import wait_for
 from tests.web import write_flight
@@ -129,6 +133,18 @@ def test_of_other_messages_only_the_time_is_kept(tmp_path: Path, clock: SimpleNa
     line = next(line for line in player.fleet.picture.lines if line.address.topic == "vehicle_attitude")
     assert line.health.rate == pytest.approx(10, rel=0.1)
     assert (line.condition, line.stream.written, line.health.messages) == ("ok", 0, 100)
+
+
+def test_message_without_a_time_is_rejected(tmp_path: Path) -> None:
+    """A recording may say that its source gave no timestamp: that message is invalid, and those behind it are read."""
+    file, attitude = tmp_path / "a.mcap", Address("1", "vehicle_attitude")
+    messages = to_array([VehicleAttitude(timestamp=number) for number in (1, 2)])
+    with RecordingWriter(file) as writer:
+        streams = [(attitude, Provenance("sim", frozenset(missing))) for missing in (["timestamp"], [])]
+        writer.write(messages, VehicleAttitude.DEFINITION, streams, logged=(1, 2), published=(1, 2))
+    opened = Recording(file)
+    wait_for(lambda: len(opened.entries) == 2, what="the recording")
+    assert opened.entries == [(attitude, "timestamp: Field required"), (attitude, 2)]
 
 
 def test_damaged_recording_is_an_error(tmp_path: Path) -> None:

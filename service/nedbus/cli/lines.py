@@ -87,7 +87,7 @@ class Lines:
 
 
 def shorten_address(address: str, width: int) -> str:
-    """Return an address without the middle of its topic that does not fit; the four topics of positions remain different."""
+    """Return an address without the middle of its topic that does not fit; the topics of positions stay different."""
     vehicle, _, topic = address.partition("/")
     room = max(_HEAD + 1 + _TAIL, width - len(vehicle) - 1)
     if len(topic) <= room:
