@@ -88,11 +88,15 @@ class LayoutLookup:
             self._ask_if_due()
 
     def _ask_if_due(self) -> None:
+        self._unknown = {each for each in self._unknown if not self._is_known(*each)}  # meanwhile, perhaps
         if self._unknown and self._now() >= self._next_ask and not self._closed:
             self._next_ask = float("inf")  # while it is open
             unknown, self._unknown = self._unknown, set()
             self._thread = threading.Thread(target=self._run, args=(unknown,), name="nedbus-layouts", daemon=True)
             self._thread.start()
+
+    def _is_known(self, name: str, layout: int | None) -> bool:
+        return name in self._defined if layout is None else layout in self._newer.get(name, ())
 
     def _run(self, unknown: Collection[tuple[str, int | None]]) -> None:
         found: Schemas = {}
