@@ -118,6 +118,21 @@ def test_signal_ends_a_script_that_waits_for_a_router(start: Start, how: str, ti
     assert process.wait() == -signal.SIGINT, process.err
 
 
+def test_signal_that_asyncio_sleeps_through_ends_the_wait_for_a_router(start: Start) -> None:
+    """A signal that comes as the event loop falls asleep does not wake it, as one that another thread takes."""
+    code = """
+import asyncio, nedbus, signal, socket, threading
+gone = socket.create_server(("127.0.0.1", 0))
+def interrupt():
+    gone.accept()[0].close()
+    signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+threading.Thread(target=interrupt).start()
+asyncio.run(nedbus.connect_async(f"tcp/127.0.0.1:{gone.getsockname()[1]}", timeout=None).__aenter__())
+"""
+    process = start("-c", code, measured=False)
+    assert process.wait() == -signal.SIGINT, process.err
+
+
 def test_vehicle_of_a_killed_script_is_gone(start: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """SIGKILL closes nothing, and still the vehicle disappears from the list."""
     code = """

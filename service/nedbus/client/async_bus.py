@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
@@ -23,6 +23,9 @@ from .subscription import AsyncSubscription
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
+
+_WAKE: Final = 1.0
+"""Seconds after which a wait for a router looks for a Ctrl-C."""
 
 
 class AsyncBus:
@@ -115,8 +118,11 @@ class AsyncBus:
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
+        opening = asyncio.create_task(asyncio.to_thread(self._open_bus, cancelled))
         try:
-            self._bus = await asyncio.to_thread(self._open_bus, cancelled)
+            while not opening.done():  # asyncio may sleep through a Ctrl-C that comes as it falls asleep: wake it
+                await asyncio.wait({opening}, timeout=_WAKE)
+            self._bus = opening.result()
         except asyncio.CancelledError:
             cancelled.set()  # the thread would try on, and Python waits for it
             raise
