@@ -58,6 +58,22 @@ def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> N
     router.close()
 
 
+def test_wait_that_is_cancelled_leaves_nothing() -> None:
+    """A program that gives up, and goes on without a router, hears no more of the thread that tried."""
+    said: list[object] = []
+
+    async def scenario() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: said.append(context))
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(nedbus.connect_async(free_endpoint(), timeout=None).__aenter__(), 0.1)
+        while len(asyncio.all_tasks()) > 1:
+            await asyncio.sleep(0.01)
+        gc.collect()
+
+    asyncio.run(scenario())
+    assert not said
+
+
 def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Several endpoints are several chances; NEDBUS_CONNECT is for scripts that should not name a router."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:

@@ -125,6 +125,7 @@ class AsyncBus:
             self._bus = opening.result()
         except asyncio.CancelledError:
             cancelled.set()  # the thread would try on, and Python waits for it
+            opening.cancel()  # nobody is to hear that it gave up
             raise
         return self
 
