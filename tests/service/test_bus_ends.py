@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import gc
 import signal
+import sys
 import threading
 import weakref
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
-from typing import cast
+from typing import Any, Final, cast
 
 import pytest
 import zenoh
@@ -24,8 +26,10 @@ from tests.processes import Start
 from tests.waits import DEADLINE, wait_for
 
 from .answering import answering
-from .publishing import publish
+from .publishing import publish, wait_for_subscriber
 from .test_bus import BOTH
+
+_STEPS: Final = 100  # more than there are in a read that waits
 
 
 def test_nothing_listening_is_a_clear_error() -> None:
@@ -56,6 +60,47 @@ def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> N
         router = open_router(listen=(where,))
         assert waiting.result(DEADLINE)
     router.close()
+
+
+@pytest.mark.parametrize("read", [lambda subscription: subscription.receive(DEADLINE), next])
+def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
+    endpoint: str, bus: nedbus.Bus, read: Callable[[nedbus.Subscription[Any]], nedbus.Sample[Any]]
+) -> None:
+    """A read that is interrupted, wherever it is, keeps neither the next one nor the close from ending.
+
+    CPython looks for signals where a function of Python begins, and where one of C has returned.
+    """
+    publisher, interrupted = bus.publisher(VLP, vehicle="1"), list[int]()
+
+    def interrupt_all() -> None:
+        with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
+            wait_for_subscriber(publisher)
+            for step in range(1, _STEPS):
+                steps = iter(range(step))
+
+                def note(_: object, event: str, __: object, steps: Iterator[int] = steps) -> None:
+                    if event in ("call", "c_return") and next(steps, None) is None:
+                        raise KeyboardInterrupt
+
+                soon = threading.Timer(0.003, publish, [publisher, 2 * step])  # while it waits
+                soon.start()
+                sys.setprofile(note)
+                try:
+                    read(subscription)
+                except KeyboardInterrupt:
+                    interrupted.append(step)
+                finally:
+                    sys.setprofile(None)
+                soon.join()
+                publish(publisher, 2 * step + 1)
+                while read(subscription).message.timestamp <= 2 * step:
+                    pass
+
+    reading = threading.Thread(target=interrupt_all, daemon=True)
+    reading.start()
+    reading.join(DEADLINE)
+    assert not reading.is_alive(), interrupted
+    assert len(interrupted) > 25
 
 
 def test_wait_that_is_cancelled_leaves_nothing() -> None:

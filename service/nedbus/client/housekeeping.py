@@ -10,6 +10,8 @@ from typing import Final
 
 from nedbus.log_event import about
 
+from .wakeup import Wakeup
+
 _log = logging.getLogger(__name__)
 
 _SHORTEST: Final = 0.002  # s between two turns
@@ -29,7 +31,7 @@ class Housekeeping:
     def __init__(self) -> None:
         self._jobs: list[Job] = []
         self._turn = threading.RLock()  # held while jobs are called
-        self._woken = threading.Event()
+        self._woken = Wakeup()
         self._closed = False
         self._thread: threading.Thread | None = None
 
@@ -61,7 +63,6 @@ class Housekeeping:
     def _run(self) -> None:
         failed: set[int] = set()
         while not self._closed:
-            self._woken.clear()
             with self._turn:
                 pauses = [self._call(job, failed) for job in self._jobs]
             self._woken.wait(max(_SHORTEST, min(pauses, default=_FAILED)))

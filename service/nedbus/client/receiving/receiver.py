@@ -18,6 +18,7 @@ import zenoh
 
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import CLOSED, read_parameters
+from nedbus.client.wakeup import Wakeup
 from nedbus.log_event import about
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
 from nedbus_msgs import ack_key
@@ -66,12 +67,12 @@ class Receiver:
         self._thinned = thinned
         self._changing = threading.Lock()
         self._closed = False
-        self._receiving = threading.Lock()  # whoever has it empties the ring
+        self._receiving = threading.RLock()  # whoever has it empties the ring; a reader may keep it by a Ctrl-C
         self._by_reader = False  # the reader has waited by itself since the pump looked
         self._reader_waits = False  # for the ring
         self._reader: int | None = None  # the thread that did so last
         self._busy = False
-        self._needed = threading.Event()  # the pump is
+        self._needed = Wakeup()  # the pump is
         self._pump: threading.Thread | None = None
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
@@ -163,9 +164,7 @@ class Receiver:
         try:
             while not self._closed:
                 if self._by_reader:
-                    self._needed.clear()
-                    if self._by_reader and not self._closed:  # type: ignore[redundant-expr]  # by another thread
-                        self._needed.wait()
+                    self._needed.wait()
                     continue
                 with self._receiving:
                     self._receive()
