@@ -41,6 +41,7 @@ class Reader:
     alive: bool = True
     closed: bool = False
     stopped: float | None = None  # since when
+    stops_in_answer: bool = False  # between its next answer, and the word that this was all
 
     def is_linked(self, now: float) -> bool:
         return self.alive and (self.stopped is None or now - self.stopped < LEASE)
@@ -181,6 +182,9 @@ class World:
         query.ended = True
 
     def _reply(self, query: Query, reader: Reader, payload: bytes) -> None:
-        query.waiting.remove(reader)
+        if reader.stops_in_answer:
+            reader.stops_in_answer, reader.stopped = False, self.now
+        else:
+            query.waiting.remove(reader)
         sample = SimpleNamespace(payload=Payload(payload))
         query.replies.append(SimpleNamespace(ok=sample, replier_id=reader.name))

@@ -217,6 +217,19 @@ def test_reader_that_is_stopped_at_any_time_is_waited_for(
     assert world.published - reader.read < LIMIT
 
 
+@pytest.mark.parametrize("others", [[], ["fast"]])
+@pytest.mark.parametrize("back", [0.1, 60.0])
+def test_reader_that_is_stopped_as_it_answers_is_known(
+    world: World, control: FlowControl, others: list[str], back: float
+) -> None:
+    """Nobody else is waited for when it is back: the request that it held up had its answer."""
+    reader = Reader("back", stops_in_answer=True)
+    world.readers += [reader, *map(Reader, others)]
+    world.plan(LEASE + back, lambda: setattr(reader, "stopped", None))
+    assert WINDOW / 2 < lead_over(world, control, reader, LEASE + back - 0.01) < LIMIT
+    assert world.now < LEASE + back + 20_000 / 10_000.0
+
+
 def test_reader_that_ended_beside_a_stuck_one_is_given_up_after_5_seconds(world: World, control: FlowControl) -> None:
     """It had answered the request that is still open: the stuck one may have been stopped, not this one."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")

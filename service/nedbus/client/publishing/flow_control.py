@@ -60,6 +60,7 @@ class ReaderTable:
     def __init__(self) -> None:
         self._there: set[str] = set()
         self.away: dict[str, float] = {}  # until when each is waited for
+        self._suspects: set[str] = set()  # who had answered the last request, when one froze that could be any of them
 
     def note(self, answers: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Note all answers to one request: whether a reader is closed, by its id; `now` in seconds.
@@ -68,10 +69,15 @@ class ReaderTable:
         """
         if answers.keys() - self._there - self.away.keys():
             self.away.pop(_UNKNOWN, None)
-        gone = self._there - answers.keys() or ({_UNKNOWN} if froze else set())
+        gone, until = self._there - answers.keys(), now + (THAW if froze else RETURN)
+        if gone & self._suspects:  # it had answered, but not said that this was all
+            until = self.away.pop(_UNKNOWN, until)
+        self._suspects = set()
+        if froze and not gone:
+            gone, self._suspects = {_UNKNOWN}, set(answers)
         self._there = {reader for reader, is_closed in answers.items() if not is_closed}
-        self.away = {reader: until for reader, until in self.away.items() if until > now and reader not in answers}
-        self.away |= dict.fromkeys(gone, now + (THAW if froze else RETURN))
+        self.away = {reader: end for reader, end in self.away.items() if end > now and reader not in answers}
+        self.away |= dict.fromkeys(gone, until)
 
     def wait_for_link(self, now: float) -> None:
         """Let no time run while the publisher has no router, or has just joined one, `now` in seconds."""
@@ -169,14 +175,15 @@ class FlowControl:
         request, is_stale, self._polled = self._request, now - self._polled > _STALE, now
         if request is None or not request.poll(now):
             return
+        froze = now - request.last_answer > LEASE / 2
         if not is_stale:
-            self._readers.note(request.answers, froze=now - request.last_answer > LEASE / 2, now=now)
+            self._readers.note(request.answers, froze=froze, now=now)
         routers = self._routers()
         if self._needs_router and (not routers or routers != request.routers):
             self._readers.wait_for_link(now)
         self._request, self._ask_at = None, now
         if self._readers.away:
-            self._ask_at += _AGAIN
+            self._ask_at += 0.0 if froze else _AGAIN  # at once, before who froze can be back
         else:
             self._acknowledged[request.read] = request.number
 
