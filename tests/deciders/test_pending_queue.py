@@ -7,6 +7,7 @@ import tracemalloc
 import weakref
 from collections.abc import Collection, Sequence
 from contextlib import suppress
+from typing import Any
 
 import msgpack
 import pytest
@@ -15,6 +16,7 @@ import zenoh
 import nedbus
 from nedbus import Batch, Counts, Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, layout_lookup
+from nedbus.client.receiving import decoder as decoder_module
 from nedbus.client.receiving import pending_queue as module
 from nedbus.client.receiving.layout_lookup import Schemas
 from nedbus.client.receiving.pending_queue import CAPACITY
@@ -296,6 +298,20 @@ ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
 def undescribed(payload: bytes = VALID) -> RawSample:
     """Return a sample of a message that has no file here, and that no publisher describes."""
     return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding="application/msgpack;px4_msgs/FooBar")
+
+
+def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who receives and who acknowledges hear of a key at the same moment: what one knows of its publishers both do."""
+    decoder, met = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), list[object]()
+
+    def meet_meanwhile(*arguments: Any) -> Any:
+        monkeypatch.setattr(decoder_module, "codec_of", codec_of)
+        met.append(decoder.stream(OTHER_KEY))
+        return codec_of(*arguments)
+
+    monkeypatch.setattr(decoder_module, "codec_of", meet_meanwhile)
+    met.append(decoder.stream(OTHER_KEY))
+    assert met[0] is met[1]
 
 
 def test_what_a_batch_left_is_read_next() -> None:

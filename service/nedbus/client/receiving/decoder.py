@@ -103,7 +103,7 @@ class Decoder:
             if address.topic in BY_TOPIC:
                 stream.carry(codec_of(BY_TOPIC[address.topic]))
             if len(self._streams) < MAX_KEYS:
-                self._streams[key] = stream
+                stream = self._streams.setdefault(key, stream)  # another thread may have met it meanwhile
         return stream
 
     def learn(self, batch: Iterable[RawSample]) -> None:
