@@ -312,7 +312,7 @@ def dues(path: Path, *logged: float) -> list[float]:
         ([0, 1, 2, 3, 4], [0, 1, 2, 3, 4]),  # two vehicles whose clocks differ by an hour: side by side
         ([0, 10800, 10801, 10802], [0, 0, 1, 2]),  # the last value of three hours ago comes first
         ([0, 1, 1.7e10, 2, 3], [0, 1, 1, 1, 2]),  # a stray time
-        ([5, 6, 5.5, 7], [0, 1, 1, 2]),  # one that was recorded late
+        ([5, 6, 5.5, 7], [0, 0.5, 1, 2]),  # one that was written late
         ([5000, 5001, 0, 1], [0, 1, 1, 2]),  # the recorder's clock was set
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -16,7 +17,7 @@ from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Provenance, desc
 from nedbus_msgs.arrays import arrays_of
 
 from .formats import check_recording
-from .writer import RecordingWriter
+from .writer import Encoded, RecordingWriter
 
 _log = logging.getLogger(__name__)
 
@@ -75,12 +76,14 @@ def _write(
     with RecordingWriter(path, chunk_size=_CHUNK_SIZE) as writer:
 
         def write_pending() -> None:
+            encoded: list[Encoded] = []
             for definition, waiting in pending.items():
                 addresses, provenances, written, logged = zip(*waiting, strict=True)
                 published = [min(message.timestamp * 1000, _MAX_TIME) for message in written]
                 streams = zip(addresses, provenances, strict=True)
                 array = arrays_of(definition).of(written)
-                writer.write(array, definition, streams, logged=logged, published=published)
+                encoded += writer.encode(array, definition, streams, logged=logged, published=published)
+            writer.add(sorted(encoded, key=itemgetter(0)))  # whoever replays the file reads it from begin to end
             pending.clear()
 
         for done, each in enumerate(messages, 1):

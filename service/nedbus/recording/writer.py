@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import repeat
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +27,9 @@ _MAX_PENDING: Final = 2**24  # bytes that wait for a flush
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
 )
+
+Encoded = tuple[int, int, bytes, int, int]
+"""A message in a file: when it was recorded [ns], its channel, payload, when it was published [ns], its number."""
 
 
 class RecordingWriter:
@@ -70,21 +73,38 @@ class RecordingWriter:
         sequence: Iterable[int] = repeat(0),
     ) -> None:
         """Write messages of one kind, each with its address and provenance, when it was recorded and published [ns]."""
+        self.add(self.encode(messages, definition, streams, logged=logged, published=published, sequence=sequence))
+
+    def encode(
+        self,
+        messages: MessageArray,
+        definition: Definition[Any],
+        streams: Iterable[tuple[Address, Provenance]],
+        *,
+        logged: Iterable[int],
+        published: Iterable[int],
+        sequence: Iterable[int] = repeat(0),
+    ) -> Iterator[Encoded]:
+        """Yield messages of one kind as `add` takes them: those of several kinds can be sorted by their time."""
         encoded: dict[Layout, tuple[int, bytes]] = {}  # size of a payload, and all payloads
-        add = self._writer.add_message
+        for index, stream, log_time, time, number in zip(
+            range(len(messages)), streams, logged, published, sequence, strict=False
+        ):
+            channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
+            if layout not in encoded:
+                payloads = arrays_of(definition).encode_cdr(messages, layout)
+                encoded[layout] = payloads.itemsize, payloads.tobytes()
+            size, data = encoded[layout]
+            yield log_time, channel, data[index * size : (index + 1) * size], time, max(0, number) % 2**32
+
+    def add(self, encoded: Iterable[Encoded]) -> None:
+        """Write encoded messages, in this order."""
         try:
-            for index, stream, log_time, time, number in zip(
-                range(len(messages)), streams, logged, published, sequence, strict=False
-            ):
-                channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
-                if layout not in encoded:
-                    payloads = arrays_of(definition).encode_cdr(messages, layout)
-                    encoded[layout] = payloads.itemsize, payloads.tobytes()
-                size, data = encoded[layout]
-                add(channel, log_time, data[index * size : (index + 1) * size], time, max(0, number) % 2**32)
+            for log_time, channel, data, time, number in encoded:
+                self._writer.add_message(channel, log_time, data, time, number)
+                self.messages += 1
         except OSError as exc:
             raise OutputError(self.path, exc) from exc
-        self.messages += len(messages)
 
     def flush(self) -> None:
         """Sync everything to the disk, so that a power cut loses none of it."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from heapq import heappop, heappush
 from typing import Final
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
@@ -13,6 +14,7 @@ from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
 
 _MAX_GAP: Final = 60 * 10**9  # ns: a longer step is a damaged time, or a pause, and not waited for
+_REORDERED: Final = 8192  # messages among which those of several kinds are put in order
 
 
 class McapSource:
@@ -66,7 +68,7 @@ class McapSource:
     def _messages(self) -> Iterator[SourceMessage]:
         latest, due = None, 0
         with self._reader() as reader:
-            for number, recorded in enumerate(reader.messages(), 1):
+            for number, recorded in _in_order(enumerate(reader.messages(), 1)):
                 if not self._delivers(recorded.stream):
                     continue
                 step = 0 if latest is None else recorded.logged - latest
@@ -85,3 +87,23 @@ class McapSource:
         for name in recorded.stream.missing & definition.all_fields:
             fields.pop(name, None)
         return SourceMessage(due, address, fields, definition=definition)
+
+
+def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
+    """Yield messages as they were recorded: a file has some hundred of one kind, and then those of another.
+
+    Where time goes back by more than _MAX_GAP, a damaged time or another clock, all before comes first.
+    """
+    waiting: list[tuple[int, int, RecordedMessage]] = []
+    newest = 0
+    for number, recorded in messages:
+        if recorded.logged < newest - _MAX_GAP:
+            while waiting:
+                yield heappop(waiting)[1:]
+            newest = 0
+        newest = max(newest, recorded.logged)
+        heappush(waiting, (recorded.logged, number, recorded))
+        if len(waiting) > _REORDERED:
+            yield heappop(waiting)[1:]
+    while waiting:
+        yield heappop(waiting)[1:]
