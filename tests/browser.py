@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
@@ -15,12 +15,100 @@ from tests.waits import wait_for
 
 PATIENCE: Final = 60.0  # s: a page takes its time where other programs use the processor
 _NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
+VEHICLE: Final = ".row[data-do=vehicle]"
+"""The rows of the list."""
+PARTS: Final = ("head", "find", "list", "tool", "map", "time", "why", "nums", "plots", "more")
+"""All parts of the page, by their classes."""
 _SOURCE: Final = """name => {
   for (const model of Bokeh.documents[0]?.all_models ?? [])
     if (model.type == "ColumnDataSource" && name in model.data)
       return Object.fromEntries(Object.entries(model.data).map(([key, values]) =>
         [key, Array.from(values, value => typeof value == "number" && isNaN(value) ? "NaN" : value)]))
   return {}
+}"""
+
+
+_ROWS: Final = """rows => rows.map(row => ({
+  vehicle: row.dataset.with, grade: row.children[0].className, state: row.children[2].textContent,
+  chosen: row.getAttribute("aria-selected") == "true",
+}))"""
+_ALL: Final = """
+const all = (root, found = []) => {
+  for (const each of root.querySelectorAll("*")) {
+    found.push(each)
+    if (each.shadowRoot) all(each.shadowRoot, found)
+  }
+  return found
+}
+"""
+_LAYOUT: Final = f"""names => {{ {_ALL}
+  const problems = [], boxes = {{}}, elements = all(document)
+  const {{scrollWidth, scrollHeight}} = document.documentElement
+  if (scrollWidth > innerWidth) problems.push(`the page is ${{scrollWidth}} wide`)
+  if (innerWidth > 800 && scrollHeight > innerHeight) problems.push(`the page is ${{scrollHeight}} high`)
+  for (const name of names) {{
+    const part = elements.find(each => each.matches(`div.${{name}}`) && each.shadowRoot)
+    const box = boxes[name] = part?.getBoundingClientRect()
+    if (!box || box.width < 100 || box.height < 16) problems.push(`${{name}} is ${{box?.width}} x ${{box?.height}}`)
+    else if (box.left < 0 || box.right > innerWidth + 0.5) problems.push(`${{name}} goes beyond the page`)
+    else {{
+      const inside = all(part.shadowRoot)
+      const isFilled = inside.some(each =>
+        each.matches("canvas, input") || (each.matches(".bk-clearfix") && each.innerText.trim()))
+      if (!isFilled) problems.push(`${{name}} is empty`)
+    }}
+  }}
+  for (const [name, one] of Object.entries(boxes)) for (const [other, two] of Object.entries(boxes)) {{
+    if (name >= other || !one || !two) continue
+    const wide = Math.min(one.right, two.right) - Math.max(one.left, two.left)
+    const high = Math.min(one.bottom, two.bottom) - Math.max(one.top, two.top)
+    if (wide > 1 && high > 1) problems.push(`${{name}} lies on ${{other}} by ${{wide}} x ${{high}}`)
+  }}
+  return problems
+}}"""
+_CONTRAST: Final = f"""names => {{ {_ALL}
+  const parse = colour => colour.match(/[\\d.]+/g).map(Number)
+  const luminance = colour => {{
+    const [r, g, b] = colour.map(part => part / 255).map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b
+  }}
+  const ground = element => {{
+    for (let at = element; at; at = at.parentElement ?? at.getRootNode().host) {{
+      const colour = parse(getComputedStyle(at).backgroundColor)
+      if (colour.length < 4 || colour[3] > 0) return colour.slice(0, 3)
+    }}
+    return [255, 255, 255]
+  }}
+  const found = []
+  for (const name of names) for (const part of all(document).filter(each => each.matches(`div.${{name}}`)))
+    for (const each of part.shadowRoot ? all(part.shadowRoot) : []) {{
+      if (each.matches("style") || ![...each.childNodes].some(node => node.nodeType == 3 && node.data.trim())) continue
+      const text = parse(getComputedStyle(each).color).slice(0, 3)
+      const [high, low] = [luminance(text), luminance(ground(each))].sort((a, b) => b - a)
+      found.push([name, each.textContent.trim().slice(0, 30), (high + 0.05) / (low + 0.05)])
+    }}
+  return found
+}}"""
+_LABELS: Final = """() => {
+  const models = [...Bokeh.documents[0].all_models]
+  const figure = models.find(each => each.type == "Figure" && each.match_aspect)
+  const view = Bokeh.index.find_one(figure), pen = document.createElement("canvas").getContext("2d")
+  if (!view) return []
+  pen.font = "11px helvetica"
+  const {data} = models.find(each => each.type == "ColumnDataSource" && "label" in each.data)
+  return Array.from(data.label, (label, index) => {
+    const wide = pen.measureText(label).width, beside = data.offset[index] - (data.align[index] == "right" ? wide : 0)
+    const x = view.frame.x_scale.compute(data.east[index]) + beside
+    const y = view.frame.y_scale.compute(data.north[index]) - 5
+    return [label, x, y, x + wide, y + 11]
+  }).filter(each => each[0])
+}"""
+_PLACE: Final = """([x, y]) => {
+  const figure = [...Bokeh.documents[0].all_models].find(each => each.type == "Figure" && each.match_aspect)
+  const view = Bokeh.index.find_one(figure)
+  if (!view) return null
+  const box = view.el.getBoundingClientRect()
+  return [box.x + view.frame.x_scale.compute(x), box.y + view.frame.y_scale.compute(y)]
 }"""
 
 
@@ -65,19 +153,57 @@ class Tab:
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     @property
-    def streams(self) -> list[dict[str, Any]]:
-        """The rows of the table."""
-        return self.rows("what is wrong")
+    def listed(self) -> list[dict[str, Any]]:
+        """The rows of the list, in its order: vehicle, grade, state, and whether it is chosen."""
+        found: list[dict[str, Any]] = self.page.locator(VEHICLE).evaluate_all(_ROWS)
+        return found
 
     @property
     def states(self) -> dict[str, str]:
-        """The states in the table by vehicle, where each has one stream."""
-        return {row["vehicle"]: row["state"] for row in self.streams}
+        """The states in the list by vehicle."""
+        return {row["vehicle"]: row["state"] for row in self.listed}
+
+    @property
+    def chosen(self) -> list[str]:
+        return [row["vehicle"] for row in self.listed if row["chosen"]]
 
     @property
     def marks(self) -> dict[str, dict[str, Any]]:
         """The markers on the map, by vehicle."""
-        return {row["label"].partition(" ")[0]: row for row in self.rows("shape")}
+        return {row["name"]: row for row in self.rows("shape")}
+
+    @property
+    def asked(self) -> dict[str, str]:
+        """What stands behind "?" in the address."""
+        return dict(parse_qsl(urlsplit(self.url).query))
+
+    @property
+    def url(self) -> str:
+        """The address that a person sees; playwright's own is that of a while ago."""
+        return str(self.page.evaluate("location.href"))
+
+    def part(self, name: str) -> str:
+        """Return the text of a part of the page, as a person sees it."""
+        return self.page.locator(f"div.{name} .bk-clearfix").first.inner_text()
+
+    def misplaced(self) -> list[str]:
+        """Return what is wrong with the places of all parts: empty, beyond the page, or on each other."""
+        found: list[str] = self.page.evaluate(_LAYOUT, list(PARTS))
+        return found
+
+    def contrasts(self, *names: str) -> list[tuple[str, str, float]]:
+        """Return each text of these parts with its contrast to what is under it."""
+        return [(name, text, value) for name, text, value in self.page.evaluate(_CONTRAST, list(names))]
+
+    def labels(self) -> list[tuple[str, float, float, float, float]]:
+        """Return the labels on the map: text, left, top, right and bottom [pixels]."""
+        return [(text, left, top, right, low) for text, left, top, right, low in self.page.evaluate(_LABELS)]
+
+    def tap(self, east: float, north: float) -> None:
+        """Tap the map there [m]."""
+        place = self.page.evaluate(_PLACE, [east, north])
+        if place is not None:
+            self.page.mouse.click(*place)
 
     def shows(self, text: str) -> bool:
         """Tell whether a person sees this text."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 from nedbus_msgs import VehicleLocalPosition
 
 VLP: Final = "vehicle_local_position"
-VALID: Final[dict[str, object]] = {
+VALID: Final[dict[str, Any]] = {
     **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True),
     **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "heading"), 0.0),
 }

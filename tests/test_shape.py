@@ -21,8 +21,8 @@ from tests.processes import Start
 ROOT = Path(__file__).parents[1]
 # From the lowest to the highest: each may import those before it, through their __init__.
 FLOORS = [
-    "errors", "extras", "whole_file", "log_event", "transport", "settings", "client", "recording", "sources", "daemon",
-    "monitoring", "doctor", "bridges", "web", "cli",
+    "errors", "extras", "whole_file", "log_event", "transport", "settings", "events", "client", "recording", "sources",
+    "daemon", "monitoring", "doctor", "bridges", "web", "cli",
 ]  # fmt: skip
 MESSAGE_FILES = sorted(path.stem for path in ROOT.glob("schemas/nedbus_msgs/messages/[a-z]*.py"))
 # Packages that only these files import, by folder; nothing else says who may use Zenoh.
@@ -41,13 +41,14 @@ ONLY_BY_FOLDER = {
         "nedbus_msgs": "arrays", "nedbus_msgs/codecs": "arrays", "nedbus/client": "batch", "nedbus/sources": "ulog",
         "nedbus/recording": "ulog arrays alignment utc plot", "nedbus/web": "stream tracks background plots",
     },
-    "bokeh": {"nedbus/web": "background map_plot playback plots send serve server style table tracks viewer"},
+    "bokeh": {"nedbus/web": "background map_plot playback plots send serve server style timeline tracks viewer"},
     "tornado": {"nedbus/web": "server"},
     "PIL": {"nedbus/web": "background"},
     "pydantic": {
         "nedbus_msgs": "message px4_types validation other", "nedbus_msgs/codecs": "msgpack",
         "nedbus_msgs/messages": " ".join(MESSAGE_FILES), "nedbus/settings": "model load",
         "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
+        "nedbus/events": "report",
     },
     "pydantic_core": {
         "nedbus_msgs": "px4_types message validation", "nedbus_msgs/codecs": "msgpack",
@@ -70,7 +71,8 @@ ONLY_BY_FOLDER = {
     "cryptography": {"nedbus/transport": "pki pki_renewal"},
     "rich": {"nedbus/cli": "progress files live_table logs"},
     "typer": {
-        "nedbus/cli": "app bridges files pki options query echo health serve run http pki_fleet check doctor web",
+        "nedbus/cli": "app bridges files pki options query echo health serve run http pki_fleet check doctor web "
+        "events",
     },
 }  # fmt: skip
 ONLY = {

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import queue
+import re
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from html import unescape
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
+from urllib.parse import parse_qsl
 
 import pytest
 from bokeh.document import Document
@@ -16,10 +21,12 @@ from bokeh.models import ColumnDataSource, Model
 from bokeh.models.widgets import Div
 
 import nedbus
-from nedbus.client import Monitor, Sample
+from nedbus.client import Monitor, Sample, stream_state
+from nedbus.events import Account
 from nedbus.recording import RecordingWriter
 from nedbus.web import Where, serve_live
-from nedbus.web.fleet import Fleet, Line, Picture
+from nedbus.web.chronicle import Chronicle
+from nedbus.web.fleet import Fleet, Line, Picture, Row
 from nedbus.web.stream import Stream
 from nedbus.web.viewer import Viewer
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Provenance, Selection
@@ -29,25 +36,38 @@ from tests.waits import DEADLINE, repeating
 
 WING: Final = Address("wing", VLP)
 QUAD: Final = Address("quad", VLP)
-NOON: Final = 1_700_000_000.0  # s since the epoch
+NOON: Final = 1_700_000_000.0
+"""Seconds since the epoch: 22:13:20 UTC."""
+_ROW: Final = re.compile(
+    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)" aria-selected="(?P<chosen>\w+)">'
+    r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
+    r'<span class="quiet">(?P<since>[^<]*)</span><span class="mode">(?P<mode>[^<]*)</span>'
+    r'<span>(?P<battery>[^<]*)</span><span class="gps">(?P<gps>[^<]*)</span></div>'
+)
 
 
 class Sky:
-    """A fleet and its health, at a time that the test sets."""
+    """A fleet, its health and what happened to it, at a time that the test sets; what a page shows, but for a bus."""
 
     def __init__(self) -> None:
         self.fleet = Fleet()
         self.monitor = Monitor()
+        self.account = Account()
+        self.chronicle = Chronicle(self.account)
         self.time = NOON
 
     def add(self, address: Address = WING, **fields: object) -> None:
-        """Receive a message now."""
+        """Receive a message now; fields are of the position, or of any other message."""
         stamp = round((self.time - NOON) * 1e6) + 1_000_000
-        fields = {name: value for name, value in {**VALID, **fields}.items() if value is not None}
         other = BY_TOPIC[address.topic]
-        heard = message(stamp, **fields) if other is DEFAULT else other.model.model_validate({"timestamp": stamp})
+        if other is DEFAULT:
+            heard = message(stamp, **{name: value for name, value in {**VALID, **fields}.items() if value is not None})
+        else:
+            known = {name: value for name, value in fields.items() if name in other.model.model_fields}
+            heard = other.model.model_validate({"timestamp": stamp, **known})
         sample = Sample(heard, address, round(self.time * 1e9))
         self.monitor.add(sample, received=sample.received)
+        self.account.add(address, heard, self.time)
         self.fleet.add(sample, self.time)
 
     def fly(self, seconds: float, *addresses: Address, rate: int = 10, **fields: object) -> None:
@@ -57,11 +77,26 @@ class Sky:
             for address in addresses or (WING,):
                 self.add(address, **fields)
 
-    def look(self, **known: Any) -> Picture:
-        return self.fleet.look(self.time, self.monitor.snapshot(round(self.time * 1e9)), **known)
+    def look(
+        self, *, alive: list[Address] | None = None, link: str = "", own: str = "", is_behind: bool = False
+    ) -> Picture:
+        """Look at all vehicles now, as the page does twice a second."""
+        healths = self.monitor.snapshot(round(self.time * 1e9))
+        arrival = {
+            address: stream_state(health, alive=None if alive is None else address in alive, connected=not link).name
+            for address, health in healths.items()
+        }
+        self.account.look(self.time, arrival, link=link, is_behind=is_behind)
+        states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
+        return self.fleet.look(self.time, healths, states, alive=alive, link=link, own=own)
+
+    def row(self, vehicle: str = "wing", **known: Any) -> Row:
+        row = self.look(**known).row(vehicle)
+        assert row is not None
+        return row
 
     def line(self, address: Address = WING, **known: Any) -> Line:
-        return next(line for line in self.look(**known).lines if line.address == address)
+        return next(line for line in self.row(address.vehicle, **known).lines if line.address == address)
 
     def stream(self, address: Address = WING) -> Stream:
         return self.fleet.streams[address]
@@ -70,6 +105,11 @@ class Sky:
 @pytest.fixture
 def sky() -> Sky:
     return Sky()
+
+
+def addresses_of(picture: Picture) -> list[Address]:
+    """Return the addresses of all streams that are shown."""
+    return sorted(line.address for row in picture.rows for line in row.lines)
 
 
 def write_flight(folder: Path, topics: Mapping[str, Callable[[float], Mapping[str, object]]], *, seconds: int) -> Path:
@@ -93,39 +133,87 @@ def models_of(document: Document, kind: type[Model]) -> list[Any]:
 
 
 class Shown:
-    """What a viewer's document shows, as a person reads it."""
+    """What a viewer's document shows, as a person reads it; `asked`: what stands behind "?" in its address."""
 
-    def __init__(self, fleet: Fleet, **options: Any) -> None:
+    def __init__(self, fleet: Fleet, world: Chronicle, *, asked: str = "", **options: Any) -> None:
         self.document = Document()
-        self._viewer = Viewer(self.document, fleet, **options)
+        arguments = {name: [value.encode()] for name, value in parse_qsl(asked.removeprefix("?"))}
+        request = SimpleNamespace(request=SimpleNamespace(arguments=arguments))
+        self.document._session_context = lambda: request  # type: ignore[assignment]  # what a browser asked for
+        self.viewer = Viewer(self.document, fleet, world, **options)
+        self._numbers = count()
 
     def update(self) -> None:
-        """Send all that is new."""
+        """Send all that is new to a browser that draws all of it."""
         for _ in range(10):
-            self._viewer.update()
+            self.viewer.update()
+            self.viewer._drawn.value = str(self.viewer._sent)
+
+    def say(self, action: object, value: object = "") -> None:
+        """Do what the script of the page does at a click or a key."""
+        self.say_raw(json.dumps([action, value, next(self._numbers)]))
+
+    def say_raw(self, said: str) -> None:
+        """Let a browser say anything."""
+        self.viewer._said.value = said
+        self.update()
+
+    def search(self, text: str) -> None:
+        self.viewer._search.value_input = text
+        self.update()
+
+    def part(self, name: str) -> str:
+        """Return the text of one part of the page, as HTML."""
+        return next(str(div.text) for div in models_of(self.document, Div) if name in div.css_classes)
 
     @property
     def text(self) -> str:
         return "\n".join(str(div.text) for div in models_of(self.document, Div))
 
     @property
-    def chosen(self) -> Address | None:
-        return self._viewer.chosen
+    def chosen(self) -> str | None:
+        return self.viewer.chosen
+
+    @property
+    def address(self) -> str:
+        """What stands behind "?" in the address that the browser shows."""
+        return str(self.viewer._address.value)
+
+    @property
+    def listed(self) -> dict[str, dict[str, str]]:
+        """The rows of the list by vehicle, in its order."""
+        found = (match.groupdict() for match in _ROW.finditer(self.part("list")))
+        return {row["vehicle"]: {name: unescape(text) for name, text in row.items()} for row in found}
 
     @property
     def vehicles(self) -> list[str]:
-        """The vehicles of the table, in its order."""
-        return [row["vehicle"] for row in self.rows("what is wrong")]
+        return list(self.listed)
+
+    @property
+    def grades(self) -> dict[str, str]:
+        """The grades in the list by vehicle."""
+        return {name: row["grade"] for name, row in self.listed.items()}
 
     @property
     def states(self) -> dict[str, str]:
-        """The states in the table by vehicle, where each has one stream."""
-        return {row["vehicle"]: row["state"] for row in self.rows("what is wrong")}
+        """The states in the list by vehicle."""
+        return {name: row["text"] for name, row in self.listed.items()}
 
     @property
     def marks(self) -> dict[str, dict[str, Any]]:
-        """The markers on the map by their labels."""
-        return {row["label"]: row for row in self.rows("shape")}
+        """The markers on the map by vehicle."""
+        return {row["name"]: row for row in self.rows("shape")}
+
+    @property
+    def plotted(self) -> dict[str, Any]:
+        """The points of the chosen vehicle in the plots."""
+        return dict(self.viewer._plots.chosen.data)
+
+    @property
+    def moments(self) -> tuple[float, float]:
+        """From when to when the plots are [s]."""
+        span: Any = self.viewer._plots_range
+        return span.start / 1e3, span.end / 1e3
 
     def rows(self, column: str) -> list[dict[str, Any]]:
         """Return the rows of what has a column of this name."""

@@ -83,26 +83,28 @@ if TYPE_CHECKING:
         SourceError,
         UnknownLayoutError,
     )
+    from .events import AccountReport, Condition, Event, VehicleReport
     from .recording import UtcOffset, addresses_of, align, missing_of, read, utc_of
     from .transport import Session, Tls
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "ANY", "DTYPE", "TOPICS", "Address", "AddressError", "AddressInUseError", "AsyncBus", "AsyncPublisher",
-    "AsyncSubscription", "Batch", "Bus", "ClosedError", "ConfigError", "ConnectError", "Continuous", "Counts",
-    "DecodeError", "EncodeError", "ForkError", "GlobalPosition", "Health", "Histogram", "InvalidMessageError",
-    "LayoutError", "ListenError", "MapProjection", "Message", "MessageArray", "Mode", "Monitor", "NedbusError",
-    "NoDataError", "NoOrigin", "OutputError", "PkiError", "Provenance", "Publisher", "Quantity", "RejectionReport",
-    "Rejections", "ResetTracker", "Row", "Sample", "Selection", "Session", "SourceError", "StreamHealth",
-    "Subscription", "Tls", "Topic", "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition",
-    "addresses_of", "align", "connect", "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd", "frd_to_flu",
-    "missing_of", "ned_to_enu", "read", "to_array", "to_global", "to_local", "to_message", "utc_of",
-    "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
+    "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "AsyncBus",
+    "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError",
+    "ConnectError", "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition",
+    "Health", "Histogram", "InvalidMessageError", "LayoutError", "ListenError", "MapProjection", "Message",
+    "MessageArray", "Mode", "Monitor", "NedbusError", "NoDataError", "NoOrigin", "OutputError", "PkiError",
+    "Provenance", "Publisher", "Quantity", "RejectionReport", "Rejections", "ResetTracker", "Row", "Sample",
+    "Selection", "Session", "SourceError", "StreamHealth", "Subscription", "Tls", "Topic", "UnknownLayoutError",
+    "UtcOffset", "Vector", "VehicleLocalPosition", "VehicleReport", "addresses_of", "align", "connect",
+    "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "read",
+    "to_array", "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned", "variances_ned_to_enu",
+    "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
 # `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.
-_MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.client")
+_MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client")
 _WITH_NUMPY = {
     "DTYPE": "nedbus_msgs.arrays",
     "MessageArray": "nedbus_msgs.arrays",

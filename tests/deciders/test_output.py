@@ -8,6 +8,7 @@ from typing import Any, cast
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.clock import Clock
 from nedbus.daemon.output import SourceOutput
+from nedbus.events import Account
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address
 from tests.messages import VLP
@@ -23,7 +24,9 @@ class Sky:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
         registry = SimpleNamespace(is_alive=lambda _: False, publisher=self._open)
         clock = SimpleNamespace(now=lambda: self.now)
-        self.output = SourceOutput("px4", "px4-zenoh:", cast("PublisherRegistry", registry), cast("Clock", clock))
+        self.output = SourceOutput(
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), cast("Clock", clock), Account()
+        )
 
     def hear(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
         """Let time pass, hear something of each of these, and look who is silent."""

@@ -13,6 +13,7 @@ from nedbus.client import PublisherRegistry
 from nedbus.daemon.status import SourceStatus
 from nedbus.daemon.worker import Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
+from nedbus.events import Account
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition, decode
@@ -142,7 +143,9 @@ class Ran:
         self.ends = 0
         self.registry = FakeRegistry(clock)
         given = cast("Source", source), cast("PublisherRegistry", self.registry)
-        self.worker = Worker("ulog:flight.ulg", *given, clock=clock, retry=retry, on_end=self._count_end)
+        self.worker = Worker(
+            "ulog:flight.ulg", *given, clock=clock, account=Account(), retry=retry, on_end=self._count_end
+        )
 
     def _count_end(self) -> None:
         self.ends += 1

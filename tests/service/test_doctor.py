@@ -30,9 +30,10 @@ from nedbus_msgs import dds_type, encode, status_key
 from tests.certificates import files_of, pki, secure_endpoint, tls_of, write_config
 from tests.command_line import run_command
 from tests.first_message import ROS2_TYPE
-from tests.messages import VLP, message
+from tests.messages import VALID, VLP, message
 from tests.ports import free_endpoint, free_port
 from tests.processes import Start
+from tests.ulogs import write_log
 from tests.waits import DEADLINE, repeating, wait_for
 
 __all__ = ["pki"]
@@ -216,6 +217,78 @@ def test_what_services_report(raw: Session, endpoint: str) -> None:
         findings = look(endpoint)
     found(findings, "source", "warning", "more of the same kind")
     found(findings, "source", "wrong", "the disk is gone")
+
+
+@contextmanager
+def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -> Iterator[None]:
+    """Answer as a service does that remembers these vehicles."""
+    server = QueryServer(session)
+    report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
+    server.answer_json(status_key(name), dict, events=lambda _: report)
+    with closing(server):
+        yield
+
+
+def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None:
+    """What is bad is wrong, what is to be watched a warning; who is well, or was switched off, is no finding.
+
+    Of two services that remember a vehicle the one counts that hears it. The peers answer as services do.
+    """
+    silent = {"severity": "bad", "text": "no position", "kinds": ["silent"]}
+    with (
+        remembering(
+            raw,
+            "first",
+            sick={"severity": "bad", "text": "failsafe", "since": 9990.0, "kinds": ["failsafe"]},
+            doubtful={"severity": "watch", "text": "dead reckoning", "since": 9880.0, "kinds": ["dead_reckoning"]},
+            well={"severity": "info", "text": "ok"},
+            off={**silent, "since": 1.0},
+            gone={**silent, "since": 9999.0},
+            moved={**silent, "since": 9999.0},
+        ),
+        remembering(raw, "second", moved={"severity": "info", "text": "ok"}),
+    ):
+        findings = look(endpoint)
+        of_one = look(endpoint, vehicle="doubtful")
+    wrong = found(findings, "vehicle", "wrong", r"sick: failsafe, since 02:46:30\.0 UTC \(10\.0 s\)")
+    assert wrong.advice.startswith("'nedbus why --vehicle sick'")
+    found(findings, "vehicle", "warning", "doubtful: dead reckoning, since .*2 min")
+    found(findings, "vehicle", "wrong", "gone: no position")
+    assert not [each for each in findings if each.subject in ("well", "off", "moved")]
+    assert {each.subject for each in of_one if "nedbus why" in each.advice} == {"doubtful"}
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"vehicles": {"7; reboot": {"severity": "bad", "text": "evil"}}},
+        {"vehicles": {"7": {"severity": "bad", "text": "evil", "since": math.nan}}},
+        {"vehicles": {"7": {"severity": "bad", "text": "evil", "since": -math.inf}}},
+        {"vehicles": {"7": {"severity": "bad", "text": "evil"}}, "now": 1e300},
+        {"vehicles": {"7": {"severity": "evil", "text": "evil"}}},
+        {"vehicles": [7]},
+    ],
+    ids=["name", "nan", "inf", "now", "severity", "list"],
+)
+def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[str, object]) -> None:
+    """Nothing of it is said, and no check is lost; the peer answers in place of a service."""
+    server = QueryServer(raw)
+    report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **told}
+    server.answer_json(status_key("x"), dict, events=lambda _: report)
+    with closing(server), reporting(raw, sources=[source(state="failed", error="the disk is gone")]):
+        findings = look(endpoint)
+    found(findings, "source", "wrong", "the disk is gone")
+    assert not [each for each in findings if "evil" in each.seen or "could not be examined" in each.seen]
+
+
+def test_vehicle_of_a_real_service_that_is_not_well(run_nedbus: Start, tmp_path: Path) -> None:
+    """What a service of another process remembers of a vehicle, whose log this test writes, is found."""
+    endpoint = free_endpoint()
+    log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
+    run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
+    with nedbus.connect(endpoint, timeout=DEADLINE) as bus:
+        wait_for(lambda: bus.accounts() and bus.accounts()[0].vehicles, what="the vehicle")
+    found(look(endpoint), "vehicle", "wrong", "sick: xy not valid, since ")
 
 
 @pytest.mark.parametrize("now", [10**400, math.nan, -math.inf, True, "noon", None, []], ids=lambda now: str(now)[:5])

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -16,10 +17,12 @@ import pytest
 import nedbus
 from nedbus.daemon import Daemon
 from nedbus.settings import load_settings
+from nedbus_msgs import Address
 from tests.command_line import Ended, run_command
-from tests.messages import VLP, message
+from tests.messages import VALID, VLP, message
 from tests.ports import free_port
 from tests.processes import Start
+from tests.ulogs import UlogWriter
 from tests.waits import DEADLINE, wait_for
 
 Judge = Callable[..., Ended]
@@ -107,6 +110,82 @@ def test_report_is_json(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
         report = json.loads(health("--json", "--max-age", "60").out)
         missed = health("--json", "--services", "5")
     assert report.pop("vehicles")["1"] < 60
-    assert report == {"healthy": True, "reason": None, "services": 1, "sources": 1}
+    assert report == {"healthy": True, "reason": None, "faults": [], "services": 1, "sources": 1}
     assert missed.exit_code == 1
     assert json.loads(missed.out)["reason"].startswith("1 of 5 services answer")
+
+
+def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Judge) -> None:
+    """--expect names vehicles, --vehicles counts them, on all hosts: also those that a script publishes."""
+    with serving(endpoint, "sim:"), bus.publisher(VLP, vehicle="script") as publisher:
+        wait_for(lambda: health("--expect", "1", "--vehicles", "1").exit_code == 0, what="the simulated vehicle")
+        shown = health("--expect", "1,7, 8", "--vehicles", "3")
+        assert (shown.exit_code, shown.out) == (1, "")
+        assert shown.err.splitlines() == [
+            "nedbus: vehicle 7 is missing: nobody publishes it",
+            "nedbus: vehicle 8 is missing: nobody publishes it",
+            "nedbus: 1 of 3 vehicles are heard: 1",
+        ]
+        publisher.publish(message(1))
+        options = "--expect", "1,script", "--vehicles", "2", "--max-age", "60"
+        wait_for(lambda: health(*options).exit_code == 0, what="both vehicles")
+        shown = health(*options, "--valid", "xy,z")
+        assert shown.err == "nedbus: vehicle script: xy, z not valid\n"
+
+
+def test_validity_and_what_happened(endpoint: str, tmp_path: Path, health: Judge) -> None:
+    """--valid judges what is now, --within what was: a line on stderr for each fault, and all of them in --json."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for tenth in range(10, 60):
+        good = VALID | {"xy_valid": tenth < 30, "dead_reckoning": tenth >= 20}
+        writer.add(VLP, message(tenth * 100_000, **good))
+    log = writer.write(tmp_path / "flight.ulg")
+    with serving(endpoint, f"ulog:{log}?speed=20") as daemon:
+        wait_for_state(daemon, "done")
+        assert health("--max-age", "600").exit_code == 0
+        assert health("--max-age", "600", "--valid", "z,vz").exit_code == 0
+        shown = health("--max-age", "600", "--valid", "xy,z")
+        assert shown.exit_code == 1
+        assert re.fullmatch(r"nedbus: vehicle 1: xy not valid, since \d\d:\d\d:\d\d\.\d UTC \(.*s\)\n", shown.err)
+        shown = health("--max-age", "600", "--valid", "xy", "--within", "600", "--json")
+        report = json.loads(shown.out)
+        assert (shown.exit_code, report["healthy"], report["reason"]) == (1, False, report["faults"][0])
+        texts = [re.sub(r"\d\d:\d\d:\d\d\.\d UTC|[\d.]+ m?s", "T", fault) for fault in report["faults"]]
+        assert texts == [
+            "vehicle 1: xy not valid, since T (T)",
+            "vehicle 1: dead reckoning, at T, T ago",
+            "vehicle 1: xy not valid, at T, T ago",
+        ]
+        assert len(shown.err.splitlines()) == 3
+        assert health("--max-age", "600", "--expect", "1", "--within", "0").exit_code == 0
+
+
+def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
+    """A vehicle that its service no longer hears is one, without any option; others are judged beside it."""
+    with serving(endpoint, "sim:") as daemon:
+        wait_for(lambda: health().exit_code == 0, what="health")
+        daemon.account.add(Address("2", VLP), message(1, **VALID), time.time() - 100)
+        wait_for(lambda: daemon.account.state("2", time.time()).severity == "bad", what="silence")
+        shown = health()
+        assert shown.exit_code == 1
+        assert re.fullmatch(
+            r"nedbus: vehicle 2: silent: no vehicle_local_position for 1\d\d\.\d s, since .* UTC .*\n", shown.err
+        )
+        assert health("--expect", "1").exit_code == 0
+        assert health("--vehicle", "1").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("--expect", "1,a b"), "nedbus: vehicle 'a b' is not valid"),
+        (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected some of xy, z, vxy, vz\n"),
+    ],
+)
+def test_wrong_expectation_is_explained(health: Judge, arguments: tuple[str, ...], text: str) -> None:
+    """In one line, before anything is asked, with exit code 2."""
+    shown = health(*arguments)
+    assert shown.exit_code == 2
+    assert shown.err.startswith(text)
+    assert len(shown.err.splitlines()) == 1

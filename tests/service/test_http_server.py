@@ -16,7 +16,7 @@ from tests.http_pages import Pages
 from tests.waits import DEADLINE, wait_for
 
 GO = threading.Event()
-PATHS = ("/metrics", "/healthz", "/readyz", "/status")
+PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_nothing_can_be_changed(server: Pages) -> None:
 def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, status: int, elsewhere: int) -> None:
     """A page of somebody else whose name leads here cannot read the status, and on loopback nothing at all.
 
-    Where other hosts may ask, a Prometheus and probes get metrics, health and readiness under any name.
+    Where other hosts may ask, a Prometheus and probes get metrics, health, readiness and vehicles under any name.
     """
     local, public = others
     for path in PATHS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import socket
@@ -9,7 +10,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,20 +26,23 @@ from nedbus.cli.http import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.status import SourceStatus, State, StreamStatus
+from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, families, service_pages
 from nedbus.monitoring.exposition import build_info, metrics_page
 from nedbus.monitoring.families import MAX_STREAMS, Stream, stream_families
+from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.transport import Session
-from nedbus_msgs import VehicleLocalPosition, encode
+from nedbus_msgs import Address, VehicleLocalPosition, encode
+from nedbus_msgs.messages import VehicleStatus
 from tests.command_line import run_command
 from tests.http_pages import Pages, read_families
 from tests.messages import VALID, VLP, message
 from tests.ports import free_endpoint, free_port
 from tests.processes import Process, Start
 from tests.prometheus import start_promtool
-from tests.ulogs import UlogWriter
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.ulogs import UlogWriter, write_log
+from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 
 # A service where the extra `metrics` is not installed.
 WITHOUT_CLIENT = "import sys; sys.modules['prometheus_client'] = None; from nedbus.cli import main; main()"
@@ -128,6 +132,92 @@ def test_pages_of_an_exporter(
     assert "Traceback" not in caplog.text
 
 
+def test_vehicles_page_of_a_service(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+    """/vehicles is 503 with a line for each vehicle that is bad; who is well has a line with 200.
+
+    The peers are a real service in another process, and a replay of a log that this test writes.
+    """
+    times = range(100_000, 300_000_000, 100_000)
+    well = write_log(tmp_path / "well.ulg", times, **VALID)
+    serve(f"ulog:{well}?vehicle=7")
+    wait_for(lambda: pages.values("nedbus_vehicle_state", vehicle="7", state="ok") == [1], what="the vehicle")
+    assert pages.ask("/vehicles") == (200, "7 ok\n")
+    assert pages.values("nedbus_vehicle_condition") == []
+    assert sum(pages.values("nedbus_vehicle_state", vehicle="7")) == 1
+
+
+def test_vehicle_that_is_not_well(serve: Serve, pages: Pages, tmp_path: Path) -> None:
+    """What holds is told by /vehicles and by metrics; /healthz and /readyz are of the service, and stay 200.
+
+    The peers are a real service in another process, and replays of logs that this test writes.
+    """
+    times = range(100_000, 300_000_000, 100_000)
+    logs = {
+        "lost": write_log(tmp_path / "lost.ulg", times, **{**VALID, "xy_valid": False, "dead_reckoning": True}),
+        "doubtful": write_log(tmp_path / "doubtful.ulg", times, **{**VALID, "dead_reckoning": True}),
+    }
+    serve(*[f"ulog:{log}?vehicle={name}" for name, log in logs.items()])
+    wait_for(lambda: len(pages.values("nedbus_vehicle_condition")) == 3, what="what holds")
+    found = {
+        (each.labels["vehicle"], each.labels["condition"])
+        for each in pages.families()["nedbus_vehicle_condition"].samples
+    }
+    assert found == {("lost", "xy_invalid"), ("lost", "dead_reckoning"), ("doubtful", "dead_reckoning")}
+    assert pages.values("nedbus_vehicle_state", vehicle="lost", state="bad") == [1]
+    assert pages.values("nedbus_vehicle_state", vehicle="doubtful", state="watch") == [1]
+    status, text = pages.ask("/vehicles")
+    assert status == 503
+    assert re.fullmatch(r"vehicle lost: xy not valid, since [\d:.]+ UTC \(.*\)\n", text)
+    assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
+
+
+def test_vehicles_of_an_exporter(bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+    """An exporter judges what it reads by the same states, and counts events; a real publisher is the peer."""
+    with nedbus.connect(endpoint) as reader, exporting(reader) as pages, ExitStack() as closing:
+        wait_for_reader(raw, f"nedbus/7/{VLP}")
+        position, state = bus.publisher(VLP, vehicle="7"), bus.publisher("vehicle_status", vehicle="7")
+        numbers, failsafe = itertools.count(1), threading.Event()
+
+        def publish() -> None:
+            number = 20_000 * next(numbers)
+            position.publish(message(number, **VALID))
+            state.publish(VehicleStatus.model_validate({"timestamp": number, "failsafe": failsafe.is_set()}))
+
+        closing.enter_context(repeating(publish))
+        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="the vehicle")
+        (before,) = pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")
+        failsafe.set()
+        wait_for(lambda: pages.ask("/vehicles")[1].startswith("vehicle 7: failsafe, since "), what="failsafe")
+        assert pages.values("nedbus_vehicle_condition", vehicle="7", condition="failsafe") == [1]
+        assert pages.values("nedbus_vehicle_events_total", vehicle="7", severity="bad")[0] > before
+        failsafe.clear()
+        wait_for(lambda: pages.ask("/vehicles") == (200, "7 ok\n"), what="its end")
+
+
+def test_what_peers_say_is_one_line() -> None:
+    """A reason quotes what somebody sent: it adds no line to /vehicles; no peer, as no source passes such a text on."""
+    told = VehicleReport("watch", "rejected: \n8 ok\x1b[2J", 1.0, ("rejected",))
+    page = vehicles_page(AccountReport("service", "host", 2.0, vehicles={"7": told}))
+    assert page == Page.text("7 rejected:  8 ok [2J, since 00:00:01.0 UTC (1.0 s)")
+    forgotten = VehicleReport("bad", "no position", 1.0, ("silent",))
+    assert vehicles_page(AccountReport("service", "host", 5000.0, vehicles={"7": forgotten})).status == 200
+    assert vehicles_page(AccountReport("service", "host", 50.0, vehicles={"7": forgotten})).status == 503
+    assert vehicles_page(AccountReport("service", "host", 50.0)) == Page.text("no vehicle is known")
+
+
+@pytest.mark.parametrize("every", [1, 3])
+def test_flag_that_goes_to_and_fro_is_a_condition(every: int) -> None:
+    """A scrape that meets a moment at which it is not set misses nothing, until it has settled; messages are made."""
+    account, address = Account(), Address("7", VLP)
+    for number in range(100):
+        is_valid = number // every % 2 == 0
+        account.add(address, message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}), 0.02 * number)
+        if number > 5 * every:
+            assert account.state("7", 0.02 * number).text.startswith("xy not valid")
+    account.look(10.0, {address: "ok"})
+    assert account.state("7", 10.0).severity == ("info" if is_valid else "bad")
+
+
 def test_metrics_pass_the_linter(serve: Serve, pages: Pages, start: Start, tmp_path: Path) -> None:
     """`promtool check metrics` finds nothing to say: names, units, types and help are as Prometheus wants them."""
     serve("sim:", f"mavlink:udpin:127.0.0.1:{free_port()}")
@@ -192,6 +282,7 @@ def test_without_a_router_is_not_ready(serve: Serve, run_nedbus: Start, pages: P
     router.kill()
     no_router = (503, f"no router answers at {where}\n")
     wait_for(lambda: {each.ask("/readyz") for each in both} == {no_router}, what="its end")
+    assert exported.ask("/vehicles") == no_router  # it knows nothing of any
     assert pages.values("nedbus_sessions", role="client") == exported.values("nedbus_connected") == [0]
 
 

@@ -39,7 +39,7 @@ def url() -> Iterator[str]:
             "127.0.0.1", 0, lambda document: document.add_root(Div(text="a word")), pages=texts, origins=origins
         )
         tell(server.url)
-        server.run(stop, lambda: None, 1000)
+        server.run(stop)
 
     with in_thread(serve) as url:
         yield url

@@ -7,21 +7,24 @@ from typing import Any
 
 import pytest
 
-from nedbus.web.fleet import TRUTH
+from nedbus.events import Account, Times
+from nedbus.web.chronicle import Chronicle
+from nedbus.web.fleet import TRUTH, places_at
 from nedbus.web.stream import COLUMNS, POINTS, Stream
-from nedbus.web.style import to_clock
 from nedbus_msgs import Address, MapProjection
 from tests.messages import VLP
-from tests.web import NOON, QUAD, WING, Sky, sky
+from tests.web import NOON, QUAD, WING, Sky, addresses_of, sky
 
 __all__ = ["sky"]  # a fixture
 
 ORIGIN = {"ref_lat": 47.397742, "ref_lon": 8.545594, "ref_alt": 488.0}
 ZURICH: dict[str, Any] = {"xy_global": True, "z_global": True, **ORIGIN}
+SECOND_EKF = Address("wing", "estimator_local_position", 1)
+GROUND_TRUTH = Address("wing", TRUTH)
 
 
 def column(stream: Stream, name: str) -> list[float]:
-    values: list[float] = stream.points(0, stream.written)[:, COLUMNS.index(name)].tolist()
+    values: list[float] = stream.minute.points(0, stream.minute.written)[:, COLUMNS.index(name)].tolist()
     return values
 
 
@@ -29,67 +32,150 @@ def column(stream: Stream, name: str) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    ("fields", "condition", "words"),
+    ("fields", "grade", "text", "words"),
     [
-        ({}, "ok", ""),
-        ({"xy_valid": False}, "invalid", "xy invalid"),
-        ({"z_valid": False, "v_z_valid": False}, "invalid", "z vz invalid"),
-        ({"dead_reckoning": True}, "dead reckoning", "dead reckoning"),
-        ({"dead_reckoning": True, "v_xy_valid": False}, "invalid", "vxy invalid, dead reckoning"),
-        ({"heading_good_for_control": False}, "ok", ""),
+        ({}, "ok", "ok", "ok"),
+        ({"xy_valid": False}, "bad", "xy not valid", "xy invalid"),
+        ({"z_valid": False, "v_z_valid": False}, "bad", "z not valid", "z vz invalid"),
+        ({"dead_reckoning": True}, "watch", "dead reckoning", "dead reckoning"),
+        ({"dead_reckoning": True, "v_xy_valid": False}, "bad", "vxy not valid", "vxy invalid, dead reckoning"),
+        ({"heading_good_for_control": False}, "ok", "ok", "ok"),
     ],
 )
-def test_condition_is_what_the_flags_say(sky: Sky, fields: dict[str, Any], condition: str, words: str) -> None:
-    """A stream that comes is in the condition that its flags of the last second say."""
+def test_state_is_what_the_flags_say(sky: Sky, fields: dict[str, Any], grade: str, text: str, words: str) -> None:
+    """A vehicle is in the worst state that the flags of its position say, from the first message on or later."""
     sky.fly(3, **fields)
-    assert (sky.line().condition, sky.line().words) == (condition, words)
+    assert (sky.row().grade, sky.row().text, sky.line().words) == (grade, text, words)
+    sky.fly(3)
+    assert (sky.row().grade, sky.row().text, sky.line().words) == ("ok", "ok", "ok")
+    began = sky.time + 0.1
+    sky.fly(3, **fields)
+    assert (sky.row().grade, sky.row().text, sky.line().words) == (grade, text, words)
+    assert sky.row().since == (pytest.approx(began, abs=0.01) if fields and grade != "ok" else None)
 
 
-def test_slow_stream_is_slow(sky: Sky) -> None:
-    """A stream at less than half of its usual rate is slow, with both rates in words."""
-    sky.fly(20, rate=20)
+@pytest.mark.parametrize("other", [SECOND_EKF, GROUND_TRUTH, Address("wing", "estimator_local_position", 0)], ids=str)
+@pytest.mark.parametrize("begins_later", [True, False])
+def test_other_estimates_do_not_speak_for_a_vehicle(sky: Sky, other: Address, begins_later: bool) -> None:
+    """An EKF instance that is bad, slow or silent, or a bad ground truth, leaves the vehicle ok, also if it is first.
+
+    The stream itself says in the details what is wrong with it.
+    """
+    if not begins_later:
+        sky.fly(1, other, xy_valid=False)
+    sky.fly(2)
+    for fields in ({"xy_valid": False, "dead_reckoning": True}, {"z_valid": False, "v_z_valid": False}):
+        for _ in range(30):
+            sky.fly(0.1)
+            sky.add(other, **fields)
+        row = sky.row()
+        assert (row.grade, row.text, row.conditions, row.main.address) == ("ok", "ok", (), WING)
+        assert "invalid" in sky.line(other).words
+    sky.fly(30)
+    assert sky.line(other, alive=[WING]).state.name == "gone"
+    assert sky.row(alive=[WING]).grade == "ok"
+
+
+def test_slow_stream_is_watched(sky: Sky) -> None:
+    """At less than half of its usual rate a position is to be watched, with both rates; another stream is not.
+
+    While the page itself does not read in time nothing is known of rates.
+    """
+    attitude = Address("wing", "vehicle_attitude")
+    sky.fly(20, WING, attitude, rate=20)
+    for _ in range(3):
+        sky.fly(1, rate=20)
+        sky.add(attitude)
+    assert sky.line(attitude).state.name == "slow"
+    assert sky.row().grade == "ok"
     sky.fly(3, rate=5)
-    assert (sky.line().condition, sky.line().words[:16]) == ("slow", "5.0 Hz, usually ")
+    assert (sky.row().grade, sky.row().text[:22]) == ("watch", "slow: 5.0 Hz, usually ")
+    assert sky.row(own="this page does not read in time").grade == "ok"
 
 
-def test_condition_holds_since_it_began(sky: Sky) -> None:
-    """`since` is when a condition was seen first; of silence it is the last message, whatever the silence is called."""
+def test_page_that_is_behind_blames_no_vehicle(sky: Sky) -> None:
+    """While messages wait unread no vehicle falls silent or goes, as nobody knows; what flags said before holds on."""
+    sky.fly(3, WING)
+    sky.fly(1, QUAD, xy_valid=False)
+    sky.time += 10
+    for _ in range(3):
+        sky.time += 0.5
+        picture = sky.look(alive=[], is_behind=True, own="slow")
+    assert {row.vehicle: row.text for row in picture.rows} == {"quad": "xy not valid", "wing": "ok"}
+    assert sky.account.overload is not None
+    assert not [event for event in sky.chronicle.events if event.kind in ("silent", "gone")]
+    sky.time += 6
+    sky.look(alive=[])
+    assert sky.account.overload is None
+    assert sky.row(alive=[]).text.startswith("gone: ")
+
+
+def test_state_holds_since_it_began(sky: Sky) -> None:
+    """`since` is when a state began; of silence it is the last message, whatever the silence is called."""
     sky.fly(3)
-    assert sky.line().condition == "ok"
-    sky.fly(2.5, dead_reckoning=True)
+    assert (sky.row().text, sky.row().since) == ("ok", None)
+    sky.fly(0.1, dead_reckoning=True)
     began = sky.time
-    assert (sky.line().condition, sky.line().since) == ("dead reckoning", began)
     sky.fly(2, dead_reckoning=True)
-    assert sky.line().since == began
+    assert (sky.row().text, sky.row().since) == ("dead reckoning", began)
     last = sky.time
-    sky.time += 1.5
-    assert sky.line().condition == "dead reckoning"
-    assert sky.line(alive=[]).condition == "gone"
-    assert sky.line(alive=[]).since == pytest.approx(last)
+    sky.time += 2.5
+    gone = sky.row(alive=[])
+    assert (gone.grade, gone.brief) == ("bad", "gone")
+    assert gone.since == pytest.approx(last, abs=0.01)
     sky.time += 3
-    silent = sky.line(alive=[WING])
-    assert (silent.condition, silent.words) == ("stale", "nothing for 4.5 s, dead reckoning")
-    assert silent.since == pytest.approx(last)
-    sky.time += 60
-    cut = sky.line(link="no link")
-    assert (cut.condition, cut.words.partition(",")[0]) == ("disconnected", "no link")
-    assert cut.since == pytest.approx(last)
+    assert sky.row(alive=[]).since == pytest.approx(last, abs=0.01)
+    assert not sky.row(alive=[]).is_here
+    sky.fly(2)
+    assert sky.row().is_here
+    last = sky.time
+    sky.time += 10
+    silent = sky.row(alive=[WING])
+    assert (silent.grade, silent.brief) == ("bad", "silent")
+    assert silent.since == pytest.approx(last, abs=0.01)
+    assert sky.line(alive=[WING]).words == "stale: nothing for 10.0 s, 1 gaps"
+
+
+def test_link_that_is_cut_blames_no_vehicle(sky: Sky) -> None:
+    """Without a link vehicles keep their last state, none of them is here, and the picture says why."""
     sky.fly(3)
-    assert (sky.line().condition, sky.line().since) == ("ok", sky.time)
+    sky.time += 60
+    row = sky.row(alive=[], link="no link to tcp/ground:7447")
+    assert (row.grade, row.is_here, row.main.state.name) == ("ok", False, "disconnected")
+    assert sky.fleet.picture.link == "no link to tcp/ground:7447"
 
 
 def test_worst_comes_first(sky: Sky) -> None:
-    """Lines are ordered by condition, then by address."""
-    addresses = [Address(name, VLP) for name in ("a", "b", "c", "d")]
+    """Vehicles are ordered by what is wrong, then by name, whose numbers count: uav-2 is before uav-10."""
+    flags: dict[str, dict[str, object]] = {
+        "uav-10": {}, "uav-2": {}, "uav-1": {}, "Z": {}, "uav-30": {"xy_valid": False}, "uav-4": {"z_valid": False},
+        "uav-20": {"dead_reckoning": True}, "7": {}, "12": {},
+    }  # fmt: skip
     for _ in range(30):
         sky.time += 0.1
-        for address, fields in zip(addresses, ({}, {"xy_valid": False}, {"dead_reckoning": True}, {}), strict=True):
-            sky.add(address, **fields)
-    picture = sky.look(alive=addresses[:3])
-    assert [line.address.vehicle for line in picture.worst_first()] == ["b", "c", "a", "d"]
-    sky.time += 2
-    assert [line.address.vehicle for line in sky.look(alive=addresses[:3]).worst_first()] == ["d", "b", "c", "a"]
-    assert picture.rate == pytest.approx(40, rel=0.1)
+        for name, fields in flags.items():
+            sky.add(Address(name, VLP), **fields)
+    picture = sky.look()
+    order = [row.vehicle for row in picture.rows]
+    assert order[:3] == ["uav-4", "uav-30", "uav-20"]
+    assert order[3:] == ["7", "12", "Z", "uav-1", "uav-2", "uav-10"]
+    assert picture.rate == pytest.approx(90, rel=0.1)
+
+
+def test_vehicle_that_left_long_ago_is_last(sky: Sky) -> None:
+    """One that goes is the worst of all; ten minutes later nobody looks for it any more, and it is below all others."""
+    sky.fly(3, WING, QUAD)
+    left = sky.time
+    sky.fly(3, WING, dead_reckoning=True)
+    assert [row.vehicle for row in sky.look(alive=[WING]).rows] == ["quad", "wing"]
+    while sky.time < left + 590:
+        sky.fly(1, WING, rate=2)
+    assert [row.vehicle for row in sky.look(alive=[WING]).rows] == ["quad", "wing"]
+    sky.fly(20, WING, rate=2)
+    picture = sky.look(alive=[WING])
+    assert [(row.vehicle, row.grade) for row in picture.rows] == [("wing", "ok"), ("quad", "bad")]
+    sky.fly(30, WING, QUAD)
+    assert [row.grade for row in sky.look(alive=[WING, QUAD]).rows] == ["ok", "ok"]
 
 
 def test_only_so_many_streams_are_shown(sky: Sky, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,16 +184,15 @@ def test_only_so_many_streams_are_shown(sky: Sky, monkeypatch: pytest.MonkeyPatc
     names = [Address(f"v{number}", VLP) for number in range(5)]
     sky.fly(1, *names)
     picture = sky.look()
-    assert ([line.address for line in picture.lines], picture.left_out) == (names[:3], 2)
+    assert (addresses_of(picture), picture.left_out) == (names[:3], 2)
     sky.time += 61
     sky.fly(0.1, names[3])
     picture = sky.look()
-    assert ([line.address for line in picture.lines], picture.left_out) == (names[1:4], 1)
+    assert (addresses_of(picture), picture.left_out) == (names[1:4], 1)
     sky.time += 61
     sky.fly(0.1, names[0])
     picture = sky.look()
-    assert ([line.address for line in picture.lines], picture.left_out) == ([names[0], *names[2:4]], 1)
-    assert sky.line(names[0]).since == sky.time
+    assert (addresses_of(picture), picture.left_out) == ([names[0], *names[2:4]], 1)
 
 
 def test_positions_come_before_other_messages(sky: Sky, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,23 +200,41 @@ def test_positions_come_before_other_messages(sky: Sky, monkeypatch: pytest.Monk
     monkeypatch.setattr("nedbus.web.fleet.MAX_STREAMS", 2)
     attitude, battery = Address("wing", "vehicle_attitude"), Address("wing", "battery_status", 0)
     sky.fly(2, attitude, battery)
-    assert [(line.address, line.condition) for line in sky.look().lines] == [(battery, "ok"), (attitude, "ok")]
+    assert addresses_of(sky.look()) == [battery, attitude]
+    assert sky.row().grade == "ok"
     sky.fly(2, WING, attitude, QUAD, battery)
     picture = sky.look()
-    assert ([line.address for line in picture.lines], picture.left_out) == ([QUAD, WING], 2)
-    assert sky.stream().written
+    assert (addresses_of(picture), picture.left_out) == ([QUAD, WING], 2)
+    assert sky.stream().minute.written
+
+
+def test_other_messages_tell_facts(sky: Sky) -> None:
+    """Mode, arming, battery and GPS are of a vehicle's own messages; another battery, or an unknown charge, is none."""
+    sky.fly(1)
+    assert (sky.row().facts.mode, sky.row().facts.battery, sky.row().facts.gps) == ("", "", "")
+    sky.add(Address("wing", "vehicle_status"), nav_state=4, arming_state=2)
+    sky.add(Address("wing", "battery_status", 0), remaining=0.834)
+    sky.add(Address("wing", "battery_status", 1), remaining=0.1)
+    sky.add(Address("wing", "sensor_gps", 0), fix_type=2, satellites_used=5)
+    facts = sky.row().facts
+    assert (facts.mode, facts.armed, facts.battery, facts.gps) == ("Hold", "armed", "83 %", "2D · 5")
+    sky.add(Address("wing", "vehicle_gps_position"), fix_type=3, satellites_used=14)
+    sky.add(Address("wing", "battery_status", 0), remaining=-1.0)
+    sky.add(Address("wing", "vehicle_status"), nav_state=200, arming_state=1)
+    facts = sky.row().facts
+    assert (facts.mode, facts.armed, facts.battery, facts.gps) == ("200", "disarmed", "", "3D · 14")
 
 
 def test_last_valid_place_is_told(sky: Sky) -> None:
     """Where a vehicle was last is where it was valid last; beside it its latitude and longitude, if it has them."""
     sky.fly(1, xy_valid=False, x=9.0)
-    assert "never had a valid position" in sky.line().where
+    assert "never had a valid position" in sky.row().where
     sky.fly(1, x=3.0, y=-4.0, z=-5.0)
     sky.fly(1, xy_valid=False, x=77.0, y=77.0)
-    assert sky.line().where == "3.0 m north, -4.0 m east, altitude 5.0 m"
+    assert sky.row().where == "3.0 m north, -4.0 m east, altitude 5.0 m"
     sky.fly(1, **ZURICH, x=10.0, z=-12.0)
     sky.fly(1, **ZURICH, xy_valid=False, x=77.0)
-    assert sky.line().where == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
+    assert sky.row().where == "10.0 m north, 0.0 m east, altitude 500.0 m (47.397832, 8.545594)"
 
 
 # Places, lines and their breaks
@@ -144,7 +247,7 @@ def test_vehicles_with_origins_share_one(sky: Sky) -> None:
     sky.fly(1, WING, **ZURICH, x=1.0, y=2.0)
     sky.fly(1, QUAD, **{**ZURICH, "ref_lat": north[0], "ref_lon": north[1]}, x=1.0, y=2.0)
     sky.fly(1, lost, x=1.0, y=2.0)
-    places = {line.address.vehicle: line.stream.valid for line in sky.look().lines}
+    places = {row.vehicle: row.main.stream.valid for row in sky.look().rows}
     assert all(places.values())
     assert places["wing"] == pytest.approx((2.0, 1.0, 488.0, True), abs=1e-3)
     assert places["quad"] == pytest.approx((52.0, 101.0, 488.0, True), abs=0.05)
@@ -157,14 +260,14 @@ def test_invalid_position_is_no_place(sky: Sky) -> None:
     before = sky.stream().valid
     sky.fly(1, xy_valid=False, z_valid=False, v_xy_valid=False, v_z_valid=False, x=9.0, y=9.0, z=9.0, vx=9.0, vz=9.0)
     stream = sky.stream()
-    for name, value in (("north", 1.0), ("east", 2.0), ("height", 3.0), ("vx", 4.0), ("climb", 5.0)):
+    for name, value in (("north", 1.0), ("east", 2.0), ("height", 3.0), ("speed", 4.0), ("climb", 5.0)):
         assert column(stream, name)[0] == value
         assert math.isnan(column(stream, name)[-1])
     assert stream.valid == before
 
 
 def test_reset_breaks_the_line(sky: Sky) -> None:
-    """A reset of xy or z, or a new origin, breaks the track before it; a valid one of xy is marked where it led."""
+    """A reset of xy or z, or a new origin, breaks both histories before it."""
     sky.fly(1, x=1.0)
     sky.fly(1, x=5.0, y=1.0, xy_reset_counter=1, delta_xy=(4.0, 1.0))
     stream = sky.stream()
@@ -172,34 +275,62 @@ def test_reset_breaks_the_line(sky: Sky) -> None:
     broken = norths.index(5.0) - 1
     assert math.isnan(norths[broken])
     assert norths[broken - 1] == 1.0
-    assert [(east, north) for _, east, north in stream.resets] == [(1.0, 5.0)]
-    written = stream.written
+    assert [math.isnan(east) for east in stream.long.points(0, stream.long.written)[:, 1]] == [False, True, False]
+    written = stream.minute.written
     sky.fly(0.1, x=5.0, z=-9.0, xy_reset_counter=1, z_reset_counter=1, delta_z=-9.0)
     sky.fly(0.1, x=5.0, z=-9.0, xy_reset_counter=1, z_reset_counter=1, **ZURICH)
-    assert stream.written == written + 4
-    sky.fly(1, xy_valid=False, xy_reset_counter=2)
-    assert len(stream.resets) == 1
+    assert stream.minute.written == written + 4
 
 
 def test_history_is_of_ten_points_a_second(sky: Sky) -> None:
-    """At 100 Hz the history has a minute, and a change of a flag at once, however short."""
+    """At 100 Hz the history has a minute, and a change of a flag at once; the longer one about a point a second."""
     sky.fly(2, rate=100)
-    assert 18 <= sky.stream().written <= 22
-    before = sky.stream().written
+    minute, long = sky.stream().minute, sky.stream().long
+    assert 18 <= minute.written <= 22
+    before = minute.written
     sky.fly(0.01, rate=100, xy_valid=False)
     sky.fly(0.01, rate=100)
-    assert sky.stream().written == before + 2
+    assert minute.written == before + 2
     sky.fly(70, rate=20)
-    points = sky.stream().points(0, sky.stream().written)
+    points = minute.points(0, minute.written)
     assert len(points) == POINTS
     assert 58 <= (points[-1, 0] - points[0, 0]) / 1e3 <= 70
+    assert 64 <= long.written <= 74
+
+
+@pytest.mark.parametrize("rate", [50, 250])
+def test_truth_with_a_new_reference_time_each_message_is_whole(sky: Sky, rate: int) -> None:
+    """PX4's simulators give the ground truth a ref_timestamp that changes with each message: it has a minute, unbroken.
+
+    The origin, which is the same, neither breaks the line nor makes a point of each message.
+    """
+    for number in range(70 * rate):
+        sky.time += 1 / rate
+        sky.add(GROUND_TRUTH, **ZURICH, x=number / rate, ref_timestamp=1_000_000 + number)
+    minute = sky.stream(GROUND_TRUTH).minute
+    points = minute.points(0, minute.written)
+    assert len(points) == POINTS
+    assert 57 <= (points[-1, 0] - points[0, 0]) / 1e3 <= 66
+    assert not [north for north in column(sky.stream(GROUND_TRUTH), "north") if math.isnan(north)]
+
+
+def test_place_of_a_moment_is_of_the_histories(sky: Sky) -> None:
+    """The place of an event is the nearest valid point, of the last minute or of the longer history, if any."""
+    begin = sky.time
+    for second in range(200):
+        sky.fly(1, x=float(second))
+    for ago in (5, 120):
+        (place,) = places_at(sky.stream(), [sky.time - ago])
+        assert place is not None
+        assert place.north == pytest.approx(199 - ago, abs=1.1)
+    assert places_at(sky.stream(), [begin - 5]) == [None]
+    assert places_at(None, [begin]) == [None]
 
 
 @pytest.mark.parametrize("late", [0.0, 0.2, -0.2])
 def test_distance_to_the_truth_is_of_one_moment(sky: Sky, late: float) -> None:
     """The ground truth is moved with its velocity to the estimate's time; beside one that is too old there is none."""
-    truth = Address("wing", TRUTH)
-    sky.add(truth, x=100.0, vx=20.0, vy=-10.0, z=-50.0)
+    sky.add(GROUND_TRUTH, x=100.0, vx=20.0, vy=-10.0, z=-50.0)
     sky.time += late
     sky.add(x=100.0 + 20.0 * late + 3.0, y=-10.0 * late, z=-54.0)
     assert sky.stream().error == pytest.approx(5.0, abs=1e-3)
@@ -210,7 +341,7 @@ def test_distance_to_the_truth_is_of_one_moment(sky: Sky, late: float) -> None:
 
 def test_distance_needs_one_frame(sky: Sky) -> None:
     """An estimate with an origin is not compared with a truth without one, nor is one that is not valid."""
-    sky.add(Address("wing", TRUTH))
+    sky.add(GROUND_TRUTH)
     sky.add(**ZURICH)
     assert math.isnan(sky.stream().error)
     sky.add(QUAD)
@@ -220,8 +351,11 @@ def test_distance_needs_one_frame(sky: Sky) -> None:
     assert math.isnan(sky.stream().error)
 
 
-def test_clock_is_of_the_recording_or_of_the_host() -> None:
-    """Times since the start of a recording are minutes and seconds; others are of this host's clock."""
-    assert to_clock(75.25) == "1:15.2"
-    assert to_clock(119.99) == "2:00.0"
-    assert to_clock(NOON).count(":") == 2
+def test_clock_is_utc_or_since_the_start() -> None:
+    """Times are UTC live, and of a recording that tells it; else minutes and seconds since its start."""
+    recorded = Chronicle(Account(), times=Times())
+    assert recorded.moment(75.25) == "1:15.2"
+    assert recorded.moment(119.99) == "2:00.0"
+    recorded.start = NOON
+    assert recorded.moment(600.0) == "22:23:20"
+    assert Chronicle(Account()).moment(NOON) == "22:13:20"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ import nedbus
 from nedbus.transport import Session
 from nedbus.web import Where
 from nedbus_msgs import Address
-from tests.browser import PATIENCE, Tab, browser, open_tabs
-from tests.messages import VALID, VLP
+from tests.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
+from tests.messages import VALID, VLP, message
 from tests.ports import free_port
 from tests.processes import Process, Start
-from tests.waits import wait_for, wait_for_reader
+from tests.waits import repeating, wait_for, wait_for_reader
 from tests.web import flying, serving_live, write_flight
 
 __all__ = ["browser"]  # a fixture
@@ -83,47 +84,120 @@ def until_states(page: Tab, **states: str) -> None:
 
 
 def until_order(page: Tab, *vehicles: str) -> None:
-    until(lambda: [row["vehicle"] for row in page.streams] == list(vehicles), f"the order {vehicles}")
+    until(lambda: [row["vehicle"] for row in page.listed] == list(vehicles), f"the order {vehicles}")
 
 
 # What is shown
 
 
 def test_simulated_flight_fills_the_page(url: str, tab: Open, run_nedbus: Start, endpoint: str) -> None:
-    """Every element is filled from a flight: counts, rows, the map with its track, and the plots beside the truth."""
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?vehicle=wing&topics=VehicleLocalPosition")
-    page = tab()
+    """Every part is filled from a flight: counts, the row, the map with its track, numbers, and plots with the truth.
+
+    `nedbus serve` flies its simulator, whose second EKF is none of the vehicle's.
+    """
+    run_nedbus("serve", "--connect", endpoint, "-s", "sim:?vehicle=wing")
+    page = tab(width=1280, height=800)
     page.open(url)
-    page.wait_for_text("1 vehicle")
-    until(lambda: len(page.streams) == 5, "all five streams")
-    topics = {"local position", "ground truth", "external INS", "EKF 0", "EKF 1"}
-    assert {row["topic"] for row in page.streams} == topics
-    until(lambda: {row["state"] for row in page.streams} <= {"ok", "slow"}, "all to be well")
-    page.wait_for_text("external INS")
-    main = next(row for row in page.streams if row["topic"] == "local position")
-    assert main["source"] == "sim"
-    assert float(main["Hz"]) > 0
-    until(lambda: any(row["off truth"].endswith(" m") for row in page.streams), "the distance to the truth")
+    until(lambda: list(page.states) == ["wing"], "the vehicle")
+    until(lambda: "1 ok" in page.part("head"), "it to be well")
+    assert page.page.title() == "nedbus"
+    until(lambda: page.chosen == ["wing"], "the vehicle")
+    assert page.asked == {}
     assert page.marks["wing"]["shape"] == "circle"
-    until(lambda: len(points(page.source("valid"))) > 10, "the track")
-    until(lambda: len(page.source("climb")["time"]) > 10, "the plots")
-    before = page.source("climb")["time"][-1]
-    until(lambda: page.source("climb")["time"][-1] > before, "new points")
+    until(lambda: len(points(page.source("valid0"), "valid0")) > 10, "the track")
+    until(lambda: len(page.source("speed").get("time", ())) > 10, "the plots")
+    before = page.source("speed")["time"][-1]
+    until(lambda: page.source("speed")["time"][-1] > before, "new points")
+    until(lambda: "NaN" not in page.source("speed")["error"][-3:], "the distance to the truth")
     page.wait_for_text("messages/s")
     page.wait_for_text("metres from 47.39")
+    assert "-" not in page.part("nums").split("\n")
+    page.page.locator("[data-do=streams]").click()
+    page.wait_for_text("vehicle_local_position_groundtruth")
     canvases = page.page.locator(".bk-Figure").all()
     assert len(canvases) == 5
     assert all(box["width"] > 100 and box["height"] > 50 for each in canvases if (box := each.bounding_box()))
-    for query, ground in (("", "rgb(15, 20, 25)"), ("/?theme=light", "rgb(255, 255, 255)")):
-        if query:
-            page.open(url + query)
-        assert page.page.evaluate("getComputedStyle(document.body).backgroundColor") == ground
 
 
-def points(tracks: dict[str, list[Any]], kind: str = "valid") -> list[tuple[float, float]]:
-    """Return the points of all tracks that are drawn."""
+def points(tracks: dict[str, list[Any]], kind: str) -> list[tuple[float, float]]:
+    """Return the points of all tracks of a kind that are drawn."""
     pairs = zip(tracks.get("east", []), tracks.get(kind, []), strict=True)
     return [(east, north) for east, north in pairs if "NaN" not in (east, north)]
+
+
+SIZES = ((390, 844), (1280, 800), (1920, 1080))
+
+
+@pytest.fixture
+def fifty(bus: nedbus.Bus) -> Iterator[None]:
+    """Fly 50 vehicles at one message a second each; some of them are not well."""
+    flags: dict[int, dict[str, object]] = {7: {"xy_valid": False}, 23: {"dead_reckoning": True}, 42: {"z_valid": False}}
+    publishers = [bus.publisher(VLP, vehicle=f"uav-{number}") for number in range(1, 51)]
+    ticks = count(1)
+
+    def publish() -> None:
+        tick = next(ticks)
+        number, index = tick % 50 + 1, tick % 50
+        place = {"x": 8.0 * (index // 10), "y": 12.0 * (index % 10), "vx": 3.0}
+        wrong = flags.get(number, {}) if tick > 100 else {}
+        publishers[index].publish(message(20_000 * tick, **{**VALID, **place, **wrong}))
+
+    with repeating(publish):
+        yield
+
+
+@pytest.mark.usefixtures("fifty")
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_page_fits_every_screen(url: str, tab: Open, theme: str) -> None:
+    """With 50 vehicles, on a phone, a laptop and a wide screen, dark and light: nothing is cut off, or on another.
+
+    All parts have something in them, all text has a contrast of 4.5, and labels on the map do not lie on each other.
+    The worst vehicles are first in the list, and counted in the title.
+    """
+    page = tab(width=SIZES[0][0], height=SIZES[0][1])
+    page.open(f"{url}/?theme={theme}")
+    until(lambda: [row["grade"] for row in page.listed] == ["bad"] * 2 + ["watch"] + ["ok"] * 47, "all vehicles")
+    until(lambda: page.page.title() == "(2 bad) nedbus", "the title")
+    names = [row["vehicle"] for row in page.listed]
+    others = [f"uav-{number}" for number in range(1, 51) if number not in (7, 23, 42)]
+    assert names == ["uav-7", "uav-42", "uav-23", *others]
+    page.page.locator(VEHICLE).first.click()
+    until(lambda: page.chosen == ["uav-7"] and "xy not valid since" in page.part("why"), "its sentence")
+    page.page.locator("[data-do=streams]").click()
+    for width, height in SIZES:
+        page.page.set_viewport_size({"width": width, "height": height})
+        wait_for_none(page.misplaced, f"{width}x{height}, {theme}")
+        wait_for_none(lambda: on_each_other(page), f"labels at {width}x{height}, {theme}")
+        assert "uav-7 xy not valid" in [label[0] for label in page.labels()]
+    texts = page.contrasts("head", "list", "why", "nums", "tool", "more")
+    assert {name for name, _, _ in texts} == {"head", "list", "why", "nums", "tool", "more"}
+    assert len(texts) > 300
+    assert [each for each in texts if each[2] < 4.5] == []
+
+
+def wait_for_none(problems: Callable[[], list[str]], what: str) -> None:
+    """Wait until there is no problem, and tell those that stay."""
+    last: list[str] = []
+
+    def are_none() -> bool:
+        last[:] = problems()
+        return not last
+
+    try:
+        wait_for(are_none, what=what, seconds=PATIENCE)
+    except AssertionError:
+        pytest.fail(f"{what}: {'; '.join(last)}")
+
+
+def on_each_other(page: Tab) -> list[str]:
+    """Return the labels on the map that lie on each other."""
+    labels = page.labels()
+    return [
+        f"{one[0]} on {other[0]}"
+        for index, one in enumerate(labels)
+        for other in labels[:index]
+        if min(one[3], other[3]) - max(one[1], other[1]) > 1 and min(one[4], other[4]) - max(one[2], other[2]) > 1
+    ] or ([] if len(labels) > 5 else ["too few labels"])
 
 
 def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
@@ -138,12 +212,16 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
         key = Address("wing", VLP).rejected_key()
         wait_for_reader(raw, key)
         raw.put(key, json.dumps({"reason": HOSTILE, HOSTILE: HOSTILE}))
-        until(lambda: page.source("why")["why"] == [HOSTILE], "the report")
-        page.wait_for_text("<img src=x")
         page.wait_for_text("1 rejected")
-        page.page.locator(".slick-row", has_text="<img src=x").click()
+        page.page.locator("[data-do=streams]").click()
+        until(lambda: HOSTILE in page.part("more"), "the reason")
+        until(lambda: HOSTILE[:20] in page.part("why"), "the event")
+        until(lambda: HOSTILE[:20] in str(page.source("row").get("words")), "its mark")
+        page.page.get_by_placeholder("search").fill(HOSTILE)
+        until(lambda: page.states == {}, "the list to be empty")
+        page.page.get_by_placeholder("search").fill("")
         raw.put(key, json.dumps({"reason": [HOSTILE]}))
-        until(lambda: len(page.source("why")["why"]) == 2, "another report")
+        page.wait_for_text("2 rejected")
         assert page.page.evaluate("window.hacked") is None
         assert page.page.locator("img").count() == 0
         assert page.page.evaluate("document.body.innerHTML.includes('onerror')") is False
@@ -153,66 +231,67 @@ def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str
 
 
 def test_viewers_choose_for_themselves(url: str, tab: Open, fly: Fly, raw: Session) -> None:
-    """Two pages follow the same fleet; a click on a row, or a tap on a marker, chooses that vehicle there.
+    """Two pages follow the same fleet; a click in the list, a tap on a marker, or a key chooses a vehicle there alone.
 
-    Rows stay under the pointer. Whatever a browser does to its document, the other page goes on as it was, and nothing
-    is sent to the network.
+    What happened before can be looked at, in one page as well. Whatever a browser does to its document, the other page
+    goes on as it was, and nothing is sent to the network.
     """
     fly("a")
     other = fly("b", x=30.0, y=30.0)
-    first, second = pages = tab(), tab()
+    first, second = pages = tab(width=1280, height=800), tab(width=1280, height=800)
     for page in pages:
         page.open(url)
-    for page in pages:
         until_states(page, a="ok", b="ok")
-        page.wait_for_text("a/vehicle_local_position")
-    row = first.page.locator(".nedbus-streams .slick-row", has_text="local position").nth(1)
-
-    def choose() -> bool:
-        row.click()  # which a table that is drawn anew in that moment does not notice
-        return first.shows("b/vehicle_local_position")
-
-    until(choose, "the words about b")
-    until(lambda: first.source("climb")["north"][-1:] == [30.0], "the plots of b")
+        until(lambda page=page: page.chosen == ["a"], "the first vehicle")  # type: ignore[misc]  # bound here
+    first.page.locator(VEHICLE, has_text="b").click()
+    until(lambda: first.chosen == ["b"], "the choice")
+    until(lambda: "30.0 m" in first.part("nums"), "the numbers of b")
     other["xy_valid"] = False
     until_order(second, "b", "a")
-    assert second.shows("a/vehicle_local_position")
-    until(lambda: first.states["b"] == "invalid", "the state of b")
-    assert [row["vehicle"] for row in first.streams] == ["a", "b"]
-    first.page.mouse.move(200, 400)
-    until_order(first, "b", "a")
-    assert first.shows("b/vehicle_local_position")
+    until(lambda: second.chosen == ["b"], "the worst, where nobody has chosen")
+    second.page.locator(f"{VEHICLE}[data-with=a]").click()
+    until(lambda: second.chosen == ["a"], "the choice there")
+    until_states(first, a="ok", b="xy not valid")
+    assert first.page.title() == "(1 bad) nedbus"
 
     def tap() -> bool:
-        place = second.page.evaluate(
-            """() => {
-              const figure = [...Bokeh.documents[0].all_models].find(each => each.type == "Figure" && each.match_aspect)
-              const view = Bokeh.index.find_one(figure)
-              if (!view) return null
-              const {x_scale, y_scale} = view.frame, box = view.el.getBoundingClientRect()
-              return [box.x + x_scale.compute(30), box.y + y_scale.compute(30)]
-            }"""
-        )
-        if place is not None:
-            second.page.mouse.click(*place)
-        return second.shows("b/vehicle_local_position")
+        second.tap(30, 30)  # which a map that is drawn anew in that moment does not notice
+        with suppress(AssertionError):
+            wait_for(lambda: second.chosen == ["b"], what="the choice", seconds=3)
+        return second.chosen == ["b"]
 
-    until(tap, "the choice")
+    until(tap, "the choice by a tap")
+    second.page.keyboard.press("j")
+    until(lambda: second.chosen == ["a"], "the choice by a key")
+    until(lambda: "xy not valid since" in first.part("why"), "the sentence")
+    other["xy_valid"] = True
+    until(lambda: ", over)" in first.part("why"), "the end of it")
+    first.page.keyboard.press("p")
+    first.page.get_by_text("back to now").wait_for()
+    until(lambda: set(first.asked) == {"vehicle", "time"}, "the address")
+    third = tab(width=1280, height=800)
+    third.open(first.url)
+    third.page.get_by_text("back to now").wait_for()
+    until(lambda: (third.asked, third.chosen) == (first.asked, ["b"]), "the same moment")
+    third.page.close()
+    first.page.get_by_text("back to now").click()
+    until(lambda: first.asked == {"vehicle": "b"}, "the present")
+    until(lambda: second.asked == {"vehicle": "a"}, "the other page to be as it was")
     heard: set[str] = set()
     watcher = raw.declare_subscriber("**", lambda sample: heard.add(str(sample.key_expr)))
     assert second.page.evaluate(
         """() => {
           for (const model of Bokeh.documents[0].all_models) {
             if (model.type == "Div") model.text = "changed here"
-            if (model.type == "Toggle") model.active = !model.active
+            if (model.type == "TextInput") model.value = "changed here"
             if (model.type == "ColumnDataSource") model.selected.indices = [-7, 1e9]
           }
           return [...Bokeh.documents[0].all_models].some(model => model.text == "changed here")
         }"""
     )
-    other["xy_valid"] = True
-    for page in (first, second):
-        until_states(page, a="ok", b="ok")
+    other["xy_valid"] = False
+    for page in pages:
+        until(lambda page=page: page.states.get("b") == "xy not valid", "the state")  # type: ignore[misc]  # as above
     assert not first.shows("changed here")
     watcher.undeclare()
     assert heard == {f"nedbus/{name}/{VLP}" for name in "ab"}
@@ -242,10 +321,10 @@ def test_page_outlives_its_server(web: Web, browser: Browser, fly: Fly, endpoint
 
 
 def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
-    """A recording has a slider that runs, a pause, a speed, and jumps: the page shows the moment that is chosen."""
+    """A recording has a slider that runs, a pause, a speed, jumps, and events: the page shows what was then."""
     port = free_port()
     web(port, str(write_flight(tmp_path, {VLP: lambda time: {"x": time, "xy_valid": time < 60}}, seconds=120)))
-    page = tab(width=1000, height=640)
+    page = tab(width=1280, height=800)
     page.open(f"http://127.0.0.1:{port}")
     page.wait_for_text("flight.mcap")
 
@@ -254,27 +333,39 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
         return float(page.page.evaluate(f"{slider}?.value ?? 0"))
 
     until(lambda: time() > 1, "the time to run")
-    pause = page.page.get_by_text("pause", exact=True)
-    pause.click()
+    page.page.get_by_text("pause", exact=True).click()
     page.page.get_by_text("play", exact=True).wait_for()
     until(lambda: len(page.marks) == 1, "the vehicle")
+    wait_for_none(page.misplaced, "the layout")
 
     def jump(share: float) -> None:
-        # It moves, as what is told above it has more or fewer lines, and is deaf for 0.3 s after each click.
+        # It is deaf for 0.3 s after each click.
         bar = page.page.locator(".noUi-target:not(.noUi-state-tap) .noUi-base")
         box = bar.bounding_box()
         assert box is not None
         bar.click(position={"x": box["width"] * share, "y": box["height"] / 2})
 
     jump(0.75)
-    until(lambda: page.states == {"wing": "invalid"}, "the second minute")
+    until(lambda: page.states == {"wing": "xy not valid"}, "the second minute")
     assert time() == pytest.approx(90, abs=3)
     assert page.marks["wing"]["north"] == pytest.approx(59.9)
-    page.wait_for_text("since 1:")
+    page.wait_for_text("xy not valid since")
     jump(0.25)
     until(lambda: page.states == {"wing": "ok"}, "the first minute")
     assert page.marks["wing"]["north"] == pytest.approx(time(), abs=0.3)
-    assert {round(north) for _, north in points(page.source("valid"))} <= set(range(35))
+    assert {round(north) for _, north in points(page.source("valid0"), "valid0")} <= set(range(35))
+    page.page.locator(".strip [data-do=event]").click()
+    until(lambda: time() == pytest.approx(60, abs=0.1), "the moment of the event")
+    until_states(page, wing="xy not valid")
+    until(lambda: "time" in page.asked, "the address")
+    page.page.get_by_text("flight.mcap").click()  # so that keys are for the page, not for a button
+    for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
+        page.page.keyboard.press(key)
+        until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here
+    other = tab(width=1280, height=800)
+    other.open(page.url)
+    until(lambda: other.states == {"wing": "xy not valid"}, "the same moment, from which on it is played")
+    other.page.close()
     page.page.locator("select").select_option("50")
     page.page.get_by_text("play", exact=True).click()
     until(lambda: time() == pytest.approx(119.9, abs=0.2), "the end")

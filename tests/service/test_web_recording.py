@@ -1,8 +1,9 @@
-"""A recording on the page, without a browser: its time runs, pauses and jumps, and the fleet is as it was then."""
+"""A recording on the page, without a browser: its time runs, pauses and jumps, and all is as it was then."""
 
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleAttitude
 from tests.messages import VLP
 from tests.waits import wait_for
-from tests.web import write_flight
+from tests.web import Shown, write_flight
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def pick(player: Player) -> list[Any]:
     """Return the button, the choice of the speed, and the slider."""
-    return player.controls.children[:3]
+    return list(player.controls)
 
 
 def run(player: Player, clock: SimpleNamespace, seconds: float, step: float = 0.5) -> None:
@@ -55,15 +56,16 @@ def run(player: Player, clock: SimpleNamespace, seconds: float, step: float = 0.
 
 
 def shown(player: Player) -> object:
-    """Return what a page shows of each stream: its condition, where it is, and its last minute."""
+    """Return what a page shows of each vehicle: its state, where it is, and its last minute."""
     picture = player.fleet.picture
     end = picture.time * 1e3
     found = []
-    for line in picture.lines:
-        points = line.stream.points(0, line.stream.written)
-        recent = points[points[:, 0] > end - 50_000]
-        found.append((line.address, line.condition, line.words, line.where, len(line.stream.resets), recent.tolist()))
-    return repr(found)
+    for row in picture.rows:
+        found.append(repr((row.vehicle, row.grade, row.text, row.since, row.where, row.conditions)))
+        for line in row.lines:
+            points = line.stream.minute.points(0, line.stream.minute.written)
+            found.append(repr((line.address, line.words, points[points[:, 0] > end - 50_000].tolist())))
+    return found
 
 
 def test_recording_plays_at_its_speed(recording: Recording, clock: SimpleNamespace) -> None:
@@ -84,7 +86,7 @@ def test_recording_plays_at_its_speed(recording: Recording, clock: SimpleNamespa
     speed.value = "50"
     run(player, clock, 10)
     assert slider.value == pytest.approx(179.9)
-    assert {line.condition for line in player.fleet.picture.lines} == {"ok"}
+    assert [(row.vehicle, row.grade) for row in player.fleet.picture.rows] == [("wing", "watch")], "after a reset"
 
 
 @pytest.mark.parametrize("target", [5.0, 61.0, 100.0, 155.0, 179.9])
@@ -103,8 +105,6 @@ def test_jump_shows_what_playing_there_shows(recording: Recording, clock: Simple
         jumped.tick()
     assert len(jumps) == 3
     assert shown(jumped) == shown(player)
-    for old, new in zip(player.fleet.picture.lines, jumped.fleet.picture.lines, strict=True):
-        assert new.since == pytest.approx(max(old.since, target - 60), abs=1.0)
 
 
 @pytest.mark.parametrize("value", ["inf", "nan", "-5", "1e300", "fast"])
@@ -122,6 +122,101 @@ def test_any_speed_of_a_browser_is_survived(recording: Recording, clock: SimpleN
     assert 0 <= float(slider.value) <= 180
 
 
+class Page(Shown):
+    """What a viewer of a recording sees, as `nedbus web` shows it."""
+
+    def __init__(self, recording: Recording, player: Player, **options: Any) -> None:
+        super().__init__(
+            player.fleet, recording.chronicle, title=recording.name, whole=recording.whole, player=player, **options
+        )  # fmt: skip
+        player.on_jump = self.viewer.restart
+        self.player = player
+        self.update()
+
+    def update(self) -> None:
+        self.player.tick()
+        super().update()
+
+
+def open_page(recording: Recording, asked: str = "") -> Page:
+    """Open a page whose time stands still."""
+    player = Player(recording)
+    pick(player)[0].active = False
+    return Page(recording, player, asked=asked)
+
+
+@pytest.mark.usefixtures("clock")
+def test_event_is_jumped_to(recording: Recording) -> None:
+    """A mark on the slider, an event in the timeline, and the keys n and p set the time to when it happened.
+
+    The state, the sentence and the marker are of that moment, and what came later is not told yet.
+    """
+    page = open_page(recording)
+    assert page.grades == {"wing": "ok"}
+    assert page.moments == (0.0, 60.0)
+    marks = re.findall(r'data-with="(\d+)" title="([^"]*)" class="(\w+)" style="left: ([\d.]+)%"', page.part("marks"))
+    assert [(text, grade) for _, text, grade, _ in marks] == [
+        ("xy not valid", "bad"), ("reset of xy by an unknown amount", "watch"),
+    ]  # fmt: skip
+    assert float(marks[0][3]) == pytest.approx(50, abs=0.2)
+    page.say("event", marks[0][0])
+    assert page.player.time == pytest.approx(90, abs=0.01)
+    assert (page.grades, page.document.title) == ({"wing": "bad"}, "(1 bad) flight.mcap")
+    assert "<b>xy not valid</b> since" in page.part("why")
+    assert "over" not in page.part("why")
+    assert page.marks["wing"]["north"] == pytest.approx(89.9)
+    assert page.moments == pytest.approx((30, 90), abs=0.01)
+    page.say("next")
+    assert page.player.time == pytest.approx(150, abs=0.01)
+    assert page.grades == {"wing": "watch"}
+    page.say("previous")
+    assert page.player.time == pytest.approx(90, abs=0.01)
+    page.say("right")
+    page.say("RIGHT")
+    page.say("left")
+    assert page.player.time == pytest.approx(100, abs=0.01)
+    page.say("now")
+    assert page.player.time == pytest.approx(100, abs=0.01)
+    page.say("play")
+    assert pick(page.player)[0].active
+    page.say("trail")
+    assert page.moments == pytest.approx((0, 179.9), abs=0.01)
+    assert page.plotted["time"][-1] == pytest.approx(179_500, abs=500), "the whole flight, also what is still to come"
+
+
+@pytest.mark.usefixtures("clock")
+def test_address_of_a_recording_names_its_moment(recording: Recording) -> None:
+    """Who opens the address of a page of a recording sees the same vehicle, view and moment."""
+    page = open_page(recording)
+    for do in (("next", ""), ("focus:vehicle", ""), ("right", "")):
+        page.say(*do)
+    other = open_page(recording, asked=page.address)
+    other.update()
+    assert page.player.time == pytest.approx(91, abs=0.01)
+    assert other.player.time == pytest.approx(91, abs=0.06)
+    assert other.address == page.address
+    for part in ("tool", "nums", "why", "list"):
+        assert other.part(part) == page.part(part)
+    for asked in ("time=nan", "time=1e300", "time=-5", "time=99:99", "time=inf", "time=x"):
+        assert 0 <= open_page(recording, asked=asked).player.time <= recording.length
+
+
+@pytest.mark.usefixtures("clock")
+def test_whatever_a_browser_says_of_a_recording_is_survived(recording: Recording) -> None:
+    """No action, index or time of a browser stops the page, nor leaves the recording."""
+    page = open_page(recording)
+    for action in ("left", "left:999", "LEFT:", "Left", "right:x", "play", "play", "now", "next", "previous", "event"):
+        values: list[object] = ["", "-1", "99", "x", "NaN", "9" * 200, None, {}, [1], 1e300]
+        for value in values:
+            page.say(action, value)
+    _, _, slider = pick(page.player)
+    for seconds in (-1e300, 1e300, float("nan"), float("inf"), -float("inf")):
+        slider.trigger("value_throttled", None, seconds)
+        page.update()
+        assert 0 <= page.player.time <= recording.length
+    assert page.vehicles == ["wing"]
+
+
 def test_of_other_messages_only_the_time_is_kept(tmp_path: Path, clock: SimpleNamespace) -> None:
     """A recording with them shows their rate and age, and reads no more of them than PX4's time."""
     file = write_flight(tmp_path, {VLP: lambda _: {}, "vehicle_attitude": lambda _: {}}, seconds=20)
@@ -130,9 +225,10 @@ def test_of_other_messages_only_the_time_is_kept(tmp_path: Path, clock: SimpleNa
     assert {type(payload) for address, payload in opened.entries if address.topic != VLP} == {int}
     player = Player(opened)
     run(player, clock, 10)
-    line = next(line for line in player.fleet.picture.lines if line.address.topic == "vehicle_attitude")
+    (row,) = player.fleet.picture.rows
+    line = next(line for line in row.lines if line.address.topic == "vehicle_attitude")
     assert line.health.rate == pytest.approx(10, rel=0.1)
-    assert (line.condition, line.stream.written, line.health.messages) == ("ok", 0, 100)
+    assert (line.words, line.stream.minute.written, line.health.messages) == ("ok", 0, 100)
 
 
 def test_message_without_a_time_is_rejected(tmp_path: Path) -> None:

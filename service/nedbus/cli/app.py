@@ -13,6 +13,7 @@ from .bridges import foxglove, ros2
 from .check import check
 from .doctor import doctor
 from .echo import echo
+from .events import events, why
 from .files import convert, plot, record
 from .health import health
 from .http import export
@@ -39,6 +40,8 @@ _COMMANDS: Mapping[str, Callable[..., None]] = {
     "hz": hz,
     "get": get,
     "info": info,
+    "events": events,
+    "why": why,
     "health": health,
     "doctor": doctor,
     "check": check,

@@ -16,7 +16,8 @@ import typer
 from nedbus import recording
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
-from nedbus.sources import LiveSource, parse_source, source_text_of_file
+from nedbus.events import Event
+from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 from .follow import write_notice
@@ -122,7 +123,7 @@ def plot(
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
 ) -> None:
-    """Draw a flight: track, altitude, speed, flags, and resets of the estimator."""
+    """Draw a flight: track, altitude, speed, flags, resets of the estimator, and events."""
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
     if topic not in (ANY, *DEFAULT.topics):
@@ -141,10 +142,17 @@ def plot(
         if not streams:
             raise SourceError(str(source), "nothing to draw: no message of what is selected is valid")
         target = output or source.with_suffix(".png")
-        draw(streams, target, title=source.name)
+        draw(streams, target, title=source.name, events=_read_events(source))
         write(str(target))
         if flight.damaged:
             raise SourceError(str(source), "damage cost messages: what could be read is drawn")
+
+
+def _read_events(path: Path) -> list[Event]:
+    """Return what happened in a file, and the begin of what held from the first message to the end."""
+    account = read_account(path).account
+    held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
+    return [*dict.fromkeys(each.begin for each in held), *account.take(0)[0]]
 
 
 @contextmanager

@@ -43,7 +43,9 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
         hint = "end it, or choose another address with --http"
         raise ListenError([f"http://{where}"], "a nedbus runs there already", hint=hint) from exc
     host, _ = split_http(where)
-    _log.info("metrics and health on http://%s/metrics, /healthz, /readyz, /status", where, extra=about("http"))
+    _log.info(
+        "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
+    )
     if not is_loopback(host):
         _log.warning("whoever reaches %s can read them; nothing can be changed there", where, extra=about("http"))
     try:

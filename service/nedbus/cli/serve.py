@@ -60,7 +60,8 @@ def serve(
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
     http: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Serve /metrics, /healthz, /readyz and /status there")
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Serve /metrics, /healthz, /readyz, /vehicles and /status there"),
     ] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,

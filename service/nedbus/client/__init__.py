@@ -2,14 +2,15 @@
 
 from typing import TYPE_CHECKING
 
+from nedbus.events import to_age
 from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
-from .discovery.services import RejectionReport, Rejections
+from .discovery.services import RejectionReport, Rejections, find_accounts
 from .health.histogram import Histogram
 from .health.stream_health import Health, Monitor, StreamHealth
-from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state, to_age
+from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
 from .housekeeping import Housekeeping
 from .publishing.heartbeats import HEARTBEAT
 from .publishing.publisher import Publisher
@@ -51,6 +52,7 @@ __all__ = [
     "connect_async",
     "connect_with",
     "describe_stream",
+    "find_accounts",
     "health_of_last",
     "stream_state",
     "to_age",

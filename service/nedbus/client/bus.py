@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any, Self
 
 from nedbus.errors import ClosedError, NedbusError
+from nedbus.events import AccountReport
 from nedbus.settings import Settings, load_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
-from .discovery.services import Rejections, find_schemas, find_services
+from .discovery.services import Rejections, find_accounts, find_schemas, find_services
 from .discovery.vehicle_directory import VehicleDirectory
 from .housekeeping import Housekeeping
 from .protocol import LIVE
@@ -129,6 +130,11 @@ class Bus:
         """Return the status of every nedbus service on this network, as it reports it."""
         self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
+
+    def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
+        """Return what each nedbus service remembers of the last seconds: events, and the states of its vehicles."""
+        self._require_open()
+        return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
         """Follow the reports of messages that services on this network reject from now on."""

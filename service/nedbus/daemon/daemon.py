@@ -8,12 +8,13 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Final
 
 from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample
 from nedbus.errors import ConnectError
+from nedbus.events import QUESTION, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
@@ -29,6 +30,7 @@ from .write_permission import WritePermission, watch_permission
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s that a source has to end
+_LOOK: Final = 1.0  # s between two looks at what is silent, and at the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
 
 
@@ -51,6 +53,7 @@ class Daemon:
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
+        self.account = Account()
         # In containers every service may be process 1 of the same host name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, when it is open
@@ -103,6 +106,29 @@ class Daemon:
     def sessions(self) -> int:
         """How many sessions are connected: to the embedded router, or of this client to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
+
+    def look(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
+        """Return the account of what happened, as it is now; `measures` of this moment, where they are known."""
+        measured: dict[str, str] = {}
+        for source in self.measures if measures is None else measures:
+            measured |= source.states
+        mains = [vehicle.main for vehicle in list(self.account.vehicles.values()) if vehicle.main is not None]
+        states = {main: measured[str(main)] for main in mains if str(main) in measured}
+        is_cut = self.role == "client" and self._session is not None and not self.sessions
+        link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
+        self.account.look(time.time(), states, link=link)
+        return self.account
+
+    def report(self, *, within: float = 0.0) -> AccountReport:
+        """Return what this service remembers of the last seconds, and the state of each vehicle now."""
+        return report_of(self.look(), self.id, socket.gethostname(), time.time(), within=within)
+
+    def _answer_events(self, within: str) -> dict[str, object]:
+        try:
+            seconds = float(within)
+        except ValueError:
+            seconds = 0.0
+        return asdict(self.report(within=seconds))
 
     def newest(self) -> list[Sample]:
         """Return the last message of each address that was published."""
@@ -160,11 +186,16 @@ class Daemon:
             session, queries, housekeeping, prefix=self._settings.prefix, is_client=self.role == "client"
         )
         try:
-            queries.answer_json(status_key(self.id, prefix=self._settings.prefix), lambda: asdict(self.status))
+            key = status_key(self.id, prefix=self._settings.prefix)
+            queries.answer_json(key, lambda: asdict(self.status), **{QUESTION: self._answer_events})
             router = session if self.role == "router" else None
             with self._planning:
                 self._workers = Workers(
-                    registry, router=router, retry=not settings.until_done, on_end=self._changed.set
+                    registry,
+                    router=router,
+                    account=self.account,
+                    retry=not settings.until_done,
+                    on_end=self._changed.set,
                 )
                 self._workers.apply(self._plan)
             self.ready.set()
@@ -235,8 +266,9 @@ class Daemon:
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
-            self._changed.wait(UPLINK_POLL if watches else None)
+            self._changed.wait(UPLINK_POLL if watches else _LOOK)
             self._changed.clear()
+            self.look()
             if uplinks is not None:
                 uplinks.check()
 

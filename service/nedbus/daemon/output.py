@@ -12,6 +12,7 @@ from typing import Any, Final, cast
 
 from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
 from nedbus.errors import AddressInUseError, InvalidMessageError
+from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
@@ -44,7 +45,7 @@ class _Stream:
 class SourceOutput:
     """Publish what a source delivers; `name` is how the log calls the source, `text` how the user wrote it."""
 
-    def __init__(self, name: str, text: str, registry: PublisherRegistry, clock: Clock) -> None:
+    def __init__(self, name: str, text: str, registry: PublisherRegistry, clock: Clock, account: Account) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
         """How many messages each rule rejected."""
@@ -57,6 +58,7 @@ class SourceOutput:
         self._kind = text.partition(":")[0]
         self._registry = registry
         self._clock = clock
+        self._account = account
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
         self._silent: set[str] = set()  # those that were logged
@@ -137,6 +139,7 @@ class SourceOutput:
         self.durations.add(time.perf_counter() - start)
         self.published += 1
         stream.health.add(fields, received=self._now(), lost=message.lost)
+        self._account.add(message.address, fields, time.time(), lost=message.lost)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source, and claim its address if need be."""
@@ -200,6 +203,7 @@ class SourceOutput:
                 extra=about("rejected", rejection.address, source=self._name, reason=reason),
             )
         if rejection.address is not None:
+            self._account.reject(rejection.address, reason, time.time())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, absence: Absence) -> None:
@@ -254,6 +258,7 @@ class SourceOutput:
                 extra=about("rejected", message.address, source=self._name, reason=reason),
             )
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
+        self._account.reject(message.address, reason, time.time())
         self._registry.reject(message.address, report)
 
 

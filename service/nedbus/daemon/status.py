@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from nedbus.client import Health, Histogram
+from nedbus.client import Health, Histogram, stream_state
 
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
@@ -66,6 +66,14 @@ class SourceMeasures:
     status: SourceStatus
     streams: tuple[StreamStatus, ...]
     durations: Histogram
+
+    @property
+    def states(self) -> dict[str, str]:
+        """The state of each stream by address; silence after the end of the source is no fault."""
+        if self.status.ended:
+            return {stream.address: "ok" for stream in self.streams}
+        published = frozenset(self.status.addresses)
+        return {each.address: stream_state(each.health, alive=each.address in published).name for each in self.streams}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from typing import Final
 
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ClosedError, NedbusError
+from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.sources import LiveSource, ReplayRun, ReplaySource, Source, SourceMessage
 from nedbus.transport import Session
@@ -41,6 +42,7 @@ class Worker:
         *,
         router: Session | None = None,
         clock: Clock,
+        account: Account,
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
@@ -52,7 +54,7 @@ class Worker:
         self._clock = clock
         self._retry = retry or isinstance(source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, clock)
+        self._output = SourceOutput(self._name, self.text, registry, clock, account)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from nedbus.client import PublisherRegistry
+from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.transport import Session
 
@@ -37,10 +38,12 @@ class Workers:
     """
 
     def __init__(
-        self, registry: PublisherRegistry, *, router: Session | None, retry: bool, on_end: Callable[[], object]
-    ) -> None:
+        self, registry: PublisherRegistry, *, router: Session | None, account: Account, retry: bool,
+        on_end: Callable[[], object],
+    ) -> None:  # fmt: skip
         self._registry = registry
         self._router = router
+        self._account = account
         self._retry = retry
         self._on_end = on_end
         self._running: tuple[_Running, ...] = ()
@@ -80,6 +83,7 @@ class Workers:
             self._registry,
             router=self._router,
             clock=SystemClock(stop),
+            account=self._account,
             retry=self._retry,
             on_end=self._on_end,
         )

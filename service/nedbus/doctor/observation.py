@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final
 
+from nedbus.client import find_accounts
+from nedbus.events import AccountReport
 from nedbus.transport import (
     PublisherToken,
     RawSample,
@@ -77,10 +79,12 @@ class Observation:
     `streams`: what arrived, by key; `publishers`: those whose heartbeats came, by key.
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
     `routers`: those that tell this client of their sessions; `listened`: for how long streams were [s].
+    `accounts`: what services remember of vehicles.
     """
 
     prefix: str
     services: list[Service] = field(default_factory=list)
+    accounts: list[AccountReport] = field(default_factory=list)
     alive: list[Address] = field(default_factory=list)
     ages: dict[Address, float | None] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
@@ -108,6 +112,7 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
         for service in _services(session, prefix):
             in_time = time.monotonic() < start + _CLOCKS
             seen.services.append(_with_clock(session, service) if in_time else service)
+        seen.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_TIMEOUT)
         seen.alive = _alive(session, prefix)
         seen.ros2 = _ros2_publishers(session)
         seen.ages = _ages(session, prefix)

@@ -1,16 +1,18 @@
-"""The vehicles: which are alive and silent, published twice, or not to be decoded."""
+"""The vehicles: which are alive and silent, published twice, not to be decoded, or not well as services tell."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Final
 
+from nedbus.events import merge_vehicles
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, format_seconds
 from .observation import Observation
 from .services import reported
 
+_MAX_TEXT: Final = 300  # characters of what a peer says
 _PERIODS: Final = 3.0  # of a topic without a message, from which on it is silent
 
 
@@ -26,6 +28,7 @@ def check_vehicles(seen: Observation, vehicle: str | None, *, writes_only: bool)
     flowing = [address for address in known if address in arrived]
     for address in known:
         yield from _judge(seen, address, flows=address in arrived)
+    yield from _check_states(seen, vehicle)
     hidden = sorted({each for service in seen.services for each in reported(service)} - set(map(str, known)))
     if vehicle is not None:
         hidden = [each for each in hidden if each.partition("/")[0] == vehicle]
@@ -52,6 +55,16 @@ def _absent(seen: Observation, vehicle: str | None, *, blind: bool) -> Finding:
     return Finding("vehicle", vehicle, "wrong", f"it is not seen under {seen.prefix}/", advice)
 
 
+def _check_states(seen: Observation, vehicle: str | None) -> Iterator[Finding]:
+    """Yield what services remember of vehicles that is bad, or to be watched."""
+    for name, (now, told) in sorted(merge_vehicles(seen.accounts).items()):
+        if vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
+            continue
+        state: State = "wrong" if told.severity == "bad" else "warning"
+        advice = f"'nedbus why --vehicle {name}' says what preceded it"
+        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{told.since_text(now)}", advice)
+
+
 def _judge(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
     name, key = str(address), address.key(prefix=seen.prefix)
     stream = seen.streams.get(key)
@@ -65,7 +78,7 @@ def _judge(seen: Observation, address: Address, *, flows: bool) -> Iterator[Find
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
     if stream is not None and stream.error:
         advice = "who publishes this key, and is it nedbus? a newer layout needs a newer nedbus here"
-        yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:300]}", advice)
+        yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:_MAX_TEXT]}", advice)
     beating = len(seen.publishers.get(key, ()))
     sending = max(len(stream.publishers), len(stream.clocks)) if stream is not None else 0
     if max(beating, sending) > 1:

@@ -6,7 +6,9 @@ Needs the extra `metrics`.
 from __future__ import annotations
 
 import json
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
@@ -15,20 +17,27 @@ from typing import Any, Final
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from nedbus.client import Bus, Health, Monitor, Sample
+from nedbus.client import Bus, Monitor, Sample
+from nedbus.events import Account, report_of
 from nedbus_msgs import Address, Selection
 
 from .exposition import build_info, metrics_page
-from .families import MAX_STREAMS, Stream, is_switched_off, stream_families
+from .families import MAX_STREAMS, Stream, is_switched_off, stream_families, vehicle_families
 from .http_server import Page
+from .observer import Observer, Sight
+from .pages import vehicles_page
 from .router_watch import RouterWatch
 
+_LOOK: Final = 0.5  # s between two looks at all vehicles
 _MAX_SOURCES: Final = 4 * MAX_STREAMS  # that are remembered
 _RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
 
 
 class Exporter(Collector):
-    """Read all that a selection matches, and make pages of what was seen; `watch` gets each sample as well."""
+    """Read all that a selection matches, and make pages of what was seen.
+
+    `watch` gets each sample as well, and `on_look` what is seen of all vehicles twice a second.
+    """
 
     def __init__(
         self,
@@ -37,14 +46,16 @@ class Exporter(Collector):
         *,
         version: str,
         watch: Callable[[Sample[Any]], object] = lambda _: None,
+        on_look: Callable[[Sight], object] = lambda _: None,
     ) -> None:
         self._bus = bus
-        self._watch = watch
+        self._watch, self._on_look = watch, on_look
         self._version = version
         self._subscription = bus.subscribe(
             selection.topic, vehicle=selection.vehicle, instance=selection.instance, mode="every"
         )
         self._monitor = Monitor()
+        self._observer = Observer(bus, selection)
         self._routers = RouterWatch(bus)
         self._sources: dict[Address, str] = {}
         self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
@@ -56,17 +67,20 @@ class Exporter(Collector):
             reading.add_done_callback(lambda _: stop.set())
             asking = pool.submit(self._routers.run, stop)
             asking.add_done_callback(lambda _: stop.set())
-            stop.wait()
-            self._routers.close()
-            self._subscription.close()
+            try:
+                while not stop.wait(_LOOK):
+                    self._look()
+            finally:
+                stop.set()
+                self._routers.close()
+                self._subscription.close()
             reading.result()
             asking.result()
 
     @property
-    def healths(self) -> dict[Address, Health]:
-        """The health of each stream."""
-        with self._lock:
-            return self._monitor.snapshot()
+    def account(self) -> Account:
+        """The account of what happened."""
+        return self._observer.account
 
     @property
     def pages(self) -> Mapping[str, Callable[[], Page]]:
@@ -75,6 +89,7 @@ class Exporter(Collector):
             "/metrics": lambda: metrics_page(self),
             "/healthz": lambda: Page.text("ok"),
             "/readyz": self._ready,
+            "/vehicles": self._vehicles,
             "/status": self._status,
         }
 
@@ -91,7 +106,9 @@ class Exporter(Collector):
             "nedbus_queue_messages", "Messages that wait to be read", value=self._subscription.waiting
         )
         yield from self._router_families()
-        yield from stream_families(self._streams(), messages=_RECEIVED)
+        streams = self._streams()
+        yield from stream_families(streams, messages=_RECEIVED)
+        yield from vehicle_families(self.account, streams)
 
     def _router_families(self) -> Iterator[Metric]:
         sessions = GaugeMetricFamily(
@@ -130,7 +147,19 @@ class Exporter(Collector):
                 self._monitor.add(sample)
                 if sample.address in self._sources or len(self._sources) < _MAX_SOURCES:
                     self._sources[sample.address] = sample.source or ""
+            self._observer.add(sample)
             self._watch(sample)
+
+    def _look(self) -> None:
+        with self._lock:
+            healths = self._monitor.snapshot()
+        dropped, waiting = self._subscription.counts.dropped, self._subscription.waiting
+        self._on_look(self._observer.look(healths, dropped=dropped, waiting=waiting))
+
+    def _vehicles(self) -> Page:
+        if not self._bus.connected:
+            return self._ready()
+        return vehicles_page(report_of(self.account, "export", socket.gethostname(), time.time(), within=0.0))
 
     def _ready(self) -> Page:
         if self._bus.connected:

@@ -6,6 +6,7 @@ Labels: `vehicle`, `topic` as `nedbus list` shows it (estimator_local_position/0
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Final
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 
 from nedbus.client import Health, Histogram
+from nedbus.events import SEVERITIES, Account
 
 MAX_STREAMS: Final = 1000
 """Streams with labels of their own, positions first; what the rest counts is added up as vehicle and topic "other"."""
@@ -82,6 +84,30 @@ def stream_families(streams: Sequence[Stream], *, messages: tuple[str, str]) -> 
     yield from _flags(named)
     yield from _latencies(named)
     yield GaugeMetricFamily("nedbus_streams", "Streams that are known", value=len(streams))
+
+
+def vehicle_families(account: Account, streams: Iterable[Stream]) -> Iterator[Metric]:
+    """Yield the metrics of vehicles; one without an active stream has counts, and no state."""
+    active, now = {stream.vehicle for stream in streams if stream.active}, time.time()
+    state = GaugeMetricFamily(
+        "nedbus_vehicle_state", "1 for the state that a vehicle is in", labels=("vehicle", "state")
+    )
+    condition = GaugeMetricFamily(
+        "nedbus_vehicle_condition",
+        "1 for what holds, or happened in the last minute, and is bad or to be watched",
+        labels=("vehicle", "condition"),
+    )
+    events = CounterMetricFamily("nedbus_vehicle_events", "Events of a vehicle", labels=("vehicle", "severity"))
+    for name in list(account.vehicles):
+        if name in active:
+            known = account.state(name, now)
+            for severity in SEVERITIES:
+                state.add_metric([name, "ok" if severity == "info" else severity], severity == known.severity)
+            for kind in sorted({each.kind for each in known.conditions}):
+                condition.add_metric([name, kind], 1)
+        for severity in SEVERITIES:
+            events.add_metric([name, severity], account.counts[name, severity])
+    yield from (state, condition, events)
 
 
 def histogram(family: HistogramMetricFamily, labels: Sequence[str], measured: Histogram) -> None:

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 _CLIENTS: Final = 16  # that are answered at the same time
 _PATIENCE: Final = 5.0  # s that a client may take to ask, and to read the answer
-_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz"}  # a Prometheus or a probe calls a host as it likes
+_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # a Prometheus or a probe calls a host as it likes
 
 
 class Page(NamedTuple):
@@ -42,7 +42,7 @@ class HttpServer:
     A page of somebody else in a browser on this network may make its own name lead here and read what is answered
     under that name. So a page is answered under names that only lead here: addresses, localhost, the names of this
     host and, for others than this host, names without a dot, as in Docker. Others may ask by any name for metrics,
-    health and readiness.
+    health, readiness and the states of vehicles.
 
     Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
     """

@@ -1,4 +1,4 @@
-"""The pages of a service: /metrics, /healthz, /readyz and /status."""
+"""The pages of a service: /metrics, /healthz, /readyz, /vehicles and /status."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
+from nedbus.events import AccountReport, Expectation, faults_of
 from nedbus.extras import needs
 
 from .http_server import Page
@@ -22,8 +23,20 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
         "/metrics": lambda: _metrics(daemon),
         "/healthz": lambda: _health(daemon),
         "/readyz": lambda: _ready(daemon),
+        "/vehicles": lambda: vehicles_page(daemon.report()),
         "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
     }
+
+
+def vehicles_page(report: AccountReport) -> Page:
+    """Return the states of all vehicles; of these only what is wrong, with 503, if anything is."""
+    faults = faults_of([report], Expectation(well=True))
+    if faults:
+        return Page.text("\n".join(map(_one_line, faults)), status=503)
+    lines = [
+        f"{name} {vehicle.text}{vehicle.since_text(report.now)}" for name, vehicle in sorted(report.vehicles.items())
+    ]
+    return Page.text("\n".join(map(_one_line, lines)) or "no vehicle is known")
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
@@ -40,6 +53,10 @@ def why_not_ready(daemon: Daemon) -> list[str]:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
     return reasons
+
+
+def _one_line(text: str) -> str:
+    return "".join(each if each.isprintable() else " " for each in text)  # a reason quotes what a peer sent
 
 
 def _health(daemon: Daemon) -> Page:

@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 from nedbus.daemon import STATES, Daemon, SourceMeasures
 
 from .exposition import build_info
-from .families import Stream, histogram, is_switched_off, stream_families
+from .families import Stream, histogram, is_switched_off, stream_families, vehicle_families
 
 _PUBLISHED = "nedbus_messages_published", "Messages that were validated and published"
 
@@ -29,7 +29,8 @@ class ServiceCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
         daemon = self._daemon
-        sources = _with_names(daemon.measures)
+        measures = daemon.measures
+        sources = _with_names(measures)
         yield build_info(daemon.version)
         yield GaugeMetricFamily("nedbus_start_time_seconds", "When the service started", value=daemon.started)
         sessions = GaugeMetricFamily(
@@ -51,6 +52,7 @@ class ServiceCollector(Collector):
         yield refused
         streams = [stream for name, source in sources for stream in _streams(name, source)]
         yield from stream_families(streams, messages=_PUBLISHED)
+        yield from vehicle_families(daemon.look(measures), streams)
         yield from _source_families(sources)
 
 

@@ -1,35 +1,58 @@
-"""Plot a log or a recording: the track, altitude and speed, the flags over time, and the estimator's resets."""
+"""Plot a log or a recording: the track, altitude and speed, the flags over time, resets, and events."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
+from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
+from nedbus.events import SEVERITIES, Event, Severity, spans_of
 from nedbus.whole_file import whole_file
-from nedbus_msgs import FLAGS, Address
+from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import missing_of
 
+if TYPE_CHECKING:
+    from matplotlib.typing import HashableList
+
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
+_DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
 _HEIGHT: Final = 6.0  # inches of the upper part
 _FLAGS_HEIGHT: Final = 2.0  # inches of the lower part, at least
 _ROW: Final = 0.17  # inches of the lower part that each row needs
+_EVENT_ROW: Final = 0.21  # the same of a row of events, with its text
+_EVENTS_FRAME: Final = 0.5  # inches of the title and the axis of the events
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 _WARNING_COLOR: Final = "#d62728"
+_MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
+    "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
+}  # fmt: skip
+_LEGEND: Final[Mapping[Severity, str]] = {"watch": "an event to watch", "bad": "a bad event"}
+_QUIET: Final = {
+    "mode": "mode", "armed": "armed, landed", "disarmed": "armed, landed", "takeoff": "armed, landed",
+    "landed": "armed, landed",
+}  # fmt: skip
+"""The events of severity info that are shown, each with its row."""
+
+_NEAR: Final = 1.0  # s between an event and the message that tells where it was
+_GAP: Final = 6.0  # points between a mark and its text
+_SHORTEST: Final = 60.0  # points of a text that is worth shortening
 MAX_STREAMS: Final = len(_COLORS)
 """The number of streams that one plot can show."""
 
 _FLAGS: Final = [flag for flag in FLAGS.values() if flag.kind == "estimate"]
+_HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
 _COUNTERS: Final = {
     "xy_reset_counter": "xy", "z_reset_counter": "z", "vxy_reset_counter": "vxy", "vz_reset_counter": "vz",
     "heading_reset_counter": "heading",
@@ -46,74 +69,134 @@ class _Row:
     marks: Sequence[float]
 
 
-def draw(streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str) -> None:
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """What happened to a vehicle, from begin to end [s]; something that happens once ends as it begins."""
+
+    vehicle: str
+    row: str
+    severity: Severity
+    text: str
+    begin: float
+    end: float
+
+
+def draw(
+    streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str, events: Iterable[Event] = ()
+) -> None:
     """Write a plot of up to MAX_STREAMS streams; the file's suffix, .png, .svg or .pdf, is its format.
 
     Each stream has at least one message.
     Times are seconds since the first message of all, positions local NED in metres; altitude is -z.
     Fields that `missing_of` names are not drawn, and the plot says so.
+    `events`: those of the streams' vehicles are marked if they are bad or to be watched, or of mode, arming or landing.
 
     Raises ConfigError for another suffix, OutputError when the file cannot be written; then there is none.
     """
     if Path(path).suffix not in _SUFFIXES:
         raise ConfigError(str(path), f"expected a picture: a file that ends with {' or '.join(_SUFFIXES)}")
+    figure = draw_figure(streams, title=title, events=events)
+    try:
+        with whole_file(Path(path), replace=True) as part:
+            figure.savefig(part)
+    except OSError as exc:
+        raise OutputError(Path(path), exc) from exc
+
+
+def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = ()) -> Figure:
+    """Return the plot that `draw` writes."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     rows = [
         row for stream, color in zip(streams, _COLORS, strict=False) for row in _rows(stream, start, color, streams)
     ]
-    flags_height = max(_FLAGS_HEIGHT, _ROW * len(rows))
-    figure = Figure(figsize=(_WIDTH, _HEIGHT + flags_height), layout="constrained")
+    marks = _marks(streams, start, events)
+    by_row = _by_row(marks)
+    heights = [max(_FLAGS_HEIGHT, _ROW * len(rows)), _EVENTS_FRAME + _EVENT_ROW * len(by_row)][: 2 if by_row else 1]
+    figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
+    mosaic: list[HashableList[str]] = [
+        ["track", "altitude"], ["track", "speed"], ["flags", "flags"], ["events", "events"]
+    ]  # fmt: skip
     axes = figure.subplot_mosaic(
-        [["track", "altitude"], ["track", "speed"], ["flags", "flags"]],
-        height_ratios=[0.6 * _HEIGHT, 0.4 * _HEIGHT, flags_height],
+        mosaic[: 2 + len(heights)],
+        height_ratios=[0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights],
         width_ratios=[1, 1.2],
     )
-    for (address, messages), color in zip(streams, _COLORS, strict=False):
-        seconds = _seconds(messages, start)
-        _draw_track(axes["track"], messages, color=color, label=str(address))
-        _draw_altitude(axes["altitude"], seconds, messages, color=color)
-        speed = np.hypot(messages["vx"], messages["vy"])
-        axes["speed"].plot(seconds, np.where(messages["v_xy_valid"], speed, np.nan), color=color, linewidth=0.9)
+    _draw_track(axes["track"], streams)
+    _draw_altitude(axes["altitude"], streams, start)
+    _draw_speed(axes["speed"], streams, start)
     _draw_rows(axes["flags"], rows)
-    axes["track"].set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
-    axes["track"].set_title("track; circle: start, square: end, dotted: xy invalid")
-    axes["track"].legend(fontsize="small", loc="best")
-    axes["altitude"].set(ylabel="altitude above origin, -z [m]", title="altitude; dotted: z invalid, dashed: a reset")
-    axes["speed"].set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title="speed, while valid")
-    for name, flag in (("track", "xy_valid"), ("altitude", "z_valid"), ("speed", "v_xy_valid")):
+    _mark_events(axes, streams, start, marks)
+    for name in ("track", "altitude", "speed"):
         axes[name].grid(alpha=0.3)
-        if not any(messages[flag].any() for _, messages in streams):
-            axes[name].text(0.5, 0.5, f"{flag} is never set", transform=axes[name].transAxes, ha="center")
+    axes["track"].legend(fontsize="small", loc="best")
+    times = np.concatenate([_seconds(messages, start) for _, messages in streams])
+    low, high = min([times.min(), *(mark.begin for mark in marks)]), max([times.max(), *(mark.end for mark in marks)])
+    margin = 0.02 * (high - low or 1.0)
+    for name in axes.keys() - {"track"}:
+        axes[name].set_xlim(low - margin, high + 3 * margin)  # with room for the text of what happened last
     figure.suptitle(_legible(title), parse_math=False)
     figure.supxlabel(_explain_missing(streams), fontsize="small")
-    try:
-        with whole_file(Path(path), replace=True) as part:
-            figure.savefig(part, dpi=120)
-    except OSError as exc:
-        raise OutputError(Path(path), exc) from exc
+    axes["events" if by_row else "flags"].set_xlabel("time [s]")
+    if by_row:
+        _draw_events(figure, axes["events"], by_row)
+    return figure
 
 
 def _seconds(messages: MessageArray, start: int) -> Any:
     return (messages["timestamp"].astype(np.int64) - start) / 1e6
 
 
-def _draw_track(axes: Any, messages: MessageArray, *, color: str, label: str) -> None:
-    """Draw the track: thin and dotted where xy is invalid; a circle at its start, a square at its end."""
-    axes.plot(messages["y"], messages["x"], color=color, linewidth=0.5, alpha=0.35, linestyle=":")
-    north, east = (np.where(messages["xy_valid"], messages[name], np.nan) for name in ("x", "y"))
-    axes.plot(east, north, color=color, linewidth=1.2, label=label)
-    valid = np.flatnonzero(np.isfinite(north))
-    if len(valid):
-        axes.plot(east[valid[0]], north[valid[0]], "o", color=color, markersize=7, fillstyle="none")
-        axes.plot(east[valid[-1]], north[valid[-1]], "s", color=color, markersize=4)
+def _draw_track(axes: Any, streams: Sequence[tuple[Address, MessageArray]]) -> None:
+    """Draw the tracks, each with a circle at its start and a square at its end."""
+    _draw_lines(axes, [(messages["y"], messages["x"], messages["xy_valid"]) for _, messages in streams], width=1.2)
+    for (address, messages), color, line in zip(streams, _COLORS, axes.lines[-len(streams) :], strict=False):
+        line.set_label(str(address))
+        valid = np.flatnonzero(messages["xy_valid"] & np.isfinite(messages["x"]))
+        east, north = messages["y"][valid], messages["x"][valid]
+        if len(valid):
+            axes.plot(east[0], north[0], "o", color=color, markersize=7, fillstyle="none")
+            axes.plot(east[-1], north[-1], "s", color=color, markersize=4)
+    axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
+    axes.locator_params(axis="x", nbins=6)  # more labels than these may touch each other
+    ends = "circle: start, square: end, " if any(messages["xy_valid"].any() for _, messages in streams) else ""
+    axes.set_title(f"track; {ends}{_thin('xy_valid', streams)}")
 
 
-def _draw_altitude(axes: Any, seconds: Any, messages: MessageArray, *, color: str) -> None:
-    axes.plot(seconds, -messages["z"], color=color, linewidth=0.5, alpha=0.35, linestyle=":")
-    axes.plot(seconds, np.where(messages["z_valid"], -messages["z"], np.nan), color=color, linewidth=1.0)
-    for time in np.unique(np.concatenate([seconds[1:][_is_reset(messages, counter)] for counter in _COUNTERS])):
-        axes.axvline(time, color=color, linewidth=0.5, alpha=0.4, linestyle="--")
+def _draw_altitude(axes: Any, streams: Sequence[tuple[Address, MessageArray]], start: int) -> None:
+    lines = [(_seconds(messages, start), -messages["z"], messages["z_valid"]) for _, messages in streams]
+    _draw_lines(axes, lines, width=1.0)
+    for (_, messages), (seconds, _, _), color in zip(streams, lines, _COLORS, strict=False):
+        for time in np.unique(np.concatenate([seconds[1:][_is_reset(messages, each)] for each in _HEIGHT_COUNTERS])):
+            axes.axvline(time, color=color, linewidth=0.5, alpha=0.4, linestyle="--")
+    axes.set(
+        ylabel="altitude above origin, -z [m]",
+        title=f"altitude; {_thin('z_valid', streams)}, dashed: a reset of z or vz",
+    )
+
+
+def _draw_speed(axes: Any, streams: Sequence[tuple[Address, MessageArray]], start: int) -> None:
+    lines = [
+        (_seconds(messages, start), np.hypot(messages["vx"], messages["vy"]), messages["v_xy_valid"])
+        for _, messages in streams
+    ]
+    _draw_lines(axes, lines, width=0.9)
+    axes.set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title=f"speed; {_thin('v_xy_valid', streams)}")
+
+
+def _thin(flag: str, streams: Sequence[tuple[Address, MessageArray]]) -> str:
+    is_set = any(messages[flag].any() for _, messages in streams)
+    return f"thin: {flag.removesuffix('_valid')} invalid" if is_set else f"thin: {flag} is never set"
+
+
+def _draw_lines(axes: Any, lines: Sequence[tuple[Any, Any, Any]], *, width: float) -> None:
+    """Draw lines, each of x, y and where they are valid: thin elsewhere, and out of the scale if any is valid."""
+    in_scale = not any(np.any(valid & np.isfinite(y)) for _, y, valid in lines)
+    for (x, y, _), color in zip(lines, _COLORS, strict=False):
+        thin = Line2D(x, y, color=color, linewidth=0.5, alpha=0.6)
+        (axes.add_line if in_scale else axes.add_artist)(thin)  # an artist does not take part in the limits
+    for (x, y, valid), color in zip(lines, _COLORS, strict=False):
+        axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=color, linewidth=width)
 
 
 def _rows(
@@ -138,8 +221,129 @@ def _draw_rows(axes: Any, rows: Sequence[_Row]) -> None:
         axes.broken_barh(row.bars, (number - 0.35, 0.7), color=row.color)
         axes.plot(row.marks, np.full(len(row.marks), number), "|", color=row.color, markersize=7)
     axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize="x-small" if len(rows) > 12 else "small")
-    axes.set(xlabel="time [s]", title="set flags, and resets", ylim=(len(rows) - 0.4, -0.6))
+    axes.set(title="set flags, and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
+
+
+def _marks(streams: Sequence[tuple[Address, MessageArray]], start: int, events: Iterable[Event]) -> list[_Mark]:
+    """Return what is marked of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
+    told = [event for event in events if event.boot is not None]
+    marks: list[_Mark] = []
+    for vehicle in sorted({address.vehicle for address, _ in streams}):
+        seconds = np.concatenate([_seconds(each, start) for address, each in streams if address.vehicle == vehicle])
+        first, last = float(seconds.min()), float(seconds.max())
+        found: dict[Event, _Mark] = {}
+        for span in spans_of([event for event in told if event.vehicle == vehicle]):
+            event = span.begin
+            if event is None or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
+                continue
+            offset = event.boot - start / 1e6 - event.time
+            begin = span.since + offset
+            end = last if span.until is None else begin
+            if span.end is not None and span.end.boot is not None:
+                end = span.end.numbers.get("before", span.end.boot) - start / 1e6  # before a reboot that ends it
+            known = found.get(event)
+            if max(first - begin, begin - last) <= last - first + _NEAR:
+                row = _QUIET.get(event.kind, event.kind.replace("_", " "))
+                text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+                end = max(begin, min(end, last), -math.inf if known is None else known.end)
+                found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
+        marks += found.values()
+    return sorted(marks, key=lambda mark: mark.begin)
+
+
+def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
+    """Return the marks of each row, by its label: rows with the worst first."""
+    several = len({mark.vehicle for mark in marks}) > 1
+    rows: dict[str, list[_Mark]] = {}
+    for mark in marks:
+        rows.setdefault(f"{mark.row} {mark.vehicle}" if several else mark.row, []).append(mark)
+
+    def rank(label: str) -> int:
+        return min(SEVERITIES.index(mark.severity) for mark in rows[label])
+
+    return {label: rows[label] for label in sorted(rows, key=rank)}
+
+
+def _mark_events(
+    axes: Mapping[str, Any], streams: Sequence[tuple[Address, MessageArray]], start: int, marks: Iterable[_Mark]
+) -> None:
+    """Mark what is bad or to be watched where it began: on the track, and on the time axes of altitude and speed."""
+    main = {address.vehicle: each for address, each in sorted(streams, key=lambda each: each[0].topic == DEFAULT_TOPIC)}
+    for severity, label in _LEGEND.items():
+        marker, color, size = _MARKERS[severity]
+        own = [mark for mark in marks if mark.severity == severity]
+        if not own:
+            continue
+        style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
+        places = []
+        for mark in own:
+            messages = main[mark.vehicle]
+            away = np.abs(_seconds(messages, start) - mark.begin)
+            if away.min() <= _NEAR:
+                places.append((messages["y"][away.argmin()], messages["x"][away.argmin()]))
+        if places:
+            east, north = zip(*places, strict=True)
+            found = Line2D(east, north, label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3, **style)
+            axes["track"].add_artist(found)
+        for name in ("altitude", "speed"):
+            bottom = axes[name].get_xaxis_transform()
+            times = [mark.begin for mark in own]
+            axes[name].add_artist(Line2D(times, [0.03] * len(own), transform=bottom, markersize=size - 1, **style))
+
+
+def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
+    """Draw a row for each kind, and texts where they have room."""
+    for number, marks in enumerate(rows.values()):
+        for mark in marks:
+            marker, color, size = _MARKERS[mark.severity]
+            axes.broken_barh(
+                [(mark.begin, mark.end - mark.begin)], (number - 0.35, 0.7), color=color, alpha=0.3, linewidth=0
+            )
+            axes.plot(mark.begin, number, marker, color=color, markersize=size)
+    axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
+    axes.set(title="events; x: bad, diamond: watch, bar: until its end", ylim=(len(rows) - 0.4, -0.6))
+    axes.grid(axis="x", alpha=0.3)
+    figure.draw_without_rendering()  # places the axes: the room for texts is known from here on
+    for number, marks in enumerate(rows.values()):
+        _label(axes, number, marks)
+
+
+def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
+    """Write the text of each mark beside it, right or left, shortened or not at all: nothing lies on anything else."""
+    point = _DPI / 72
+    left, right = (float(edge) / point for edge in axes.get_window_extent().intervalx)
+    places = [float(axes.transData.transform((mark.begin, number))[0]) / point for mark in marks]
+    taken = left
+    for index, (mark, place) in enumerate(zip(marks, places, strict=True)):
+        until = places[index + 1] - _GAP if index + 1 < len(marks) else right
+        text = axes.annotate(
+            _legible(mark.text), (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
+            fontsize="x-small", parse_math=False,
+        )  # fmt: skip
+        text.set_in_layout(False)
+        width = _width(text)
+        room = until - place - _GAP
+        if width <= room:
+            taken = place + _GAP + width
+        elif width <= place - _GAP - taken:
+            text.set(x=-_GAP, ha="right")
+            taken = place + _GAP
+        elif room >= _SHORTEST:
+            shown = _legible(mark.text)
+            while _width(text) > room:
+                shown = shown[: min(len(shown) - 1, int(len(shown) * room / width))]
+                text.set_text(shown.rstrip(" ,") + "\N{HORIZONTAL ELLIPSIS}")
+                width = _width(text)
+            taken = until
+        else:
+            text.remove()
+            taken = place + _GAP
+
+
+def _width(text: Any) -> float:
+    """Return the width of a text in points, and a little more: formats differ."""
+    return 1.05 * float(text.get_window_extent().width) * 72 / _DPI
 
 
 def _explain_missing(streams: Sequence[tuple[Address, MessageArray]]) -> str:

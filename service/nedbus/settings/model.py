@@ -91,7 +91,7 @@ class Settings(BaseSettings):
         (), description="What is published: texts, or tables of TOML"
     )
     http: Annotated[str, AfterValidator(_http)] | None = Field(
-        None, description="HOST:PORT of /metrics, /healthz, /readyz and /status"
+        None, description="HOST:PORT of /metrics, /healthz, /readyz, /vehicles and /status"
     )
     until_done: bool = Field(False, description="End when every finite source has ended")
 

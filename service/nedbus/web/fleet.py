@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
@@ -10,15 +11,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from nedbus.client import Health, RejectionReport, Sample, StreamState, describe_stream, health_of_last, stream_state
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address
+from nedbus.events import FIXES, MODES, Condition, State
+from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .stream import Origin, Stream, is_position
+from .stream import LONG, Origin, Place, Stream, is_position
 
-Condition = Literal["disconnected", "gone", "stale", "invalid", "dead reckoning", "slow", "ok"]
-CONDITIONS: Final[tuple[Condition, ...]] = (
-    "disconnected", "gone", "stale", "invalid", "dead reckoning", "slow", "ok",
-)  # fmt: skip
-"""What a stream may be in, the worst first."""
+Grade = Literal["bad", "watch", "ok"]
+GRADES: Final[tuple[Grade, ...]] = ("bad", "watch", "ok")
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
@@ -27,70 +26,122 @@ MAX_STREAMS: Final = 1000
 _OVER: Final = 600.0  # s after which nobody needs to look for what has gone
 _SILENT: Final = 60.0  # s after which a stream makes room for another
 _REPORTS: Final = 100  # rejected messages that are shown
-_VALIDITY: Final = tuple(name for name, flag in FLAGS.items() if flag.label and not flag.inverted)
+_ARMED: Final = 2
+_DIGITS: Final = re.compile(r"(\d+)")
+_DETAIL: Final = re.compile(r":| \(|, | within ")  # behind it a state goes into details
+_SHORT: Final = 32  # characters of a state in a row
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One stream at one moment: its condition, what is wrong in words, and since when [s since the epoch].
-
-    `rank`: its place among the others, 0 for the worst; what was switched off long ago comes last.
-    """
+    """One stream at one moment: its health and its state, both in words."""
 
     address: Address
     stream: Stream
     health: Health
-    condition: Condition
-    words: str
-    since: float
+    state: StreamState
     rejected: int
+
+    @property
+    def words(self) -> str:
+        """Its state and its flags, in words."""
+        return describe_stream(self.health, self.state)
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What other messages say of a vehicle, as text; "" where they say nothing."""
+
+    mode: str = ""
+    armed: str = ""
+    battery: str = ""
+    gps: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One vehicle at one moment: its grade, why and since when, and its streams.
+
+    `main`: the stream that its marker shows; `rank`: its place among the others, 0 for the worst; what was switched
+    off long ago comes last. `number`: for its colour.
+    """
+
+    vehicle: str
+    grade: Grade
+    text: str
+    since: float | None
+    conditions: tuple[Condition, ...]
+    main: Line
+    lines: tuple[Line, ...]
+    facts: Facts
     rank: int
+    number: int
+
+    @property
+    def brief(self) -> str:
+        """Its state in a few words."""
+        text = _DETAIL.split(self.text, maxsplit=1)[0]
+        return text if len(text) <= _SHORT else f"{text[: _SHORT - 1]}…"
+
+    def at(self, state: State) -> Row:
+        """Return this vehicle with the state that it had at another time."""
+        grade: Grade = "ok" if state.severity == "info" else state.severity
+        return replace(self, grade=grade, text=state.text, since=state.since, conditions=state.conditions)
 
     @property
     def where(self) -> str:
         """Where it was last, as far as it was valid."""
-        place, projection = self.stream.valid, self.stream.origin.projection
-        if place is None:
-            return "nowhere: it never had a valid position"
-        text = f"{place.north:.1f} m north, {place.east:.1f} m east"
-        text += f", altitude {place.altitude:.1f} m" if math.isfinite(place.altitude) else ""
-        if not place.common or projection is None:
-            return text
-        latitude, longitude = projection.reproject(place.north, place.east)
-        return f"{text} ({latitude:.6f}, {longitude:.6f})"
+        return describe_place(self.main.stream)
+
+    @property
+    def is_here(self) -> bool:
+        """Whether its position is valid and arrives."""
+        last = self.main.stream.last
+        fresh = self.main.state.name not in ("disconnected", "gone", "stale")
+        return fresh and last is not None and is_position(self.main.address) and bool(last.message.xy_valid)
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """All streams at one moment, by address; `rate` [messages/s]; `link`: "" or what is wrong with the link."""
+    """All vehicles at one moment, the worst first; `link`: "" or what is wrong with it; `own`: with this page."""
 
     time: float
-    lines: Sequence[Line] = ()
+    rows: Sequence[Row] = ()
     reports: Sequence[RejectionReport] = ()
     rejected: int = 0
     left_out: int = 0
     link: str = ""
+    own: str = ""
 
     @property
     def rate(self) -> float:
         """Messages a second, of all streams."""
-        return sum(line.health.rate or 0.0 for line in self.lines)
+        return sum(line.health.rate or 0.0 for row in self.rows for line in row.lines)
 
-    def worst_first(self) -> list[Line]:
-        """Return the lines, those of the worst condition first."""
-        return sorted(self.lines, key=lambda line: (line.rank, line.address))
+    @property
+    def lost(self) -> int:
+        """Messages that were lost, of all streams."""
+        return sum(line.health.lost for row in self.rows for line in row.lines)
+
+    def row(self, vehicle: str | None) -> Row | None:
+        """Return the row of a vehicle."""
+        return next((row for row in self.rows if row.vehicle == vehicle), None)
 
 
 @dataclass(slots=True)
 class Fleet:
-    """Follow all streams; samples may come from another thread than the one that asks for pictures."""
+    """Follow all streams; samples may come from another thread than the one that asks for pictures.
+
+    `long`: size and step of the longer histories.
+    """
 
     origin: Origin = field(default_factory=Origin)
+    long: tuple[int, float] = LONG
     streams: dict[Address, Stream] = field(default_factory=dict)
     picture: Picture = field(default_factory=lambda: Picture(0.0))
+    _numbers: dict[str, int] = field(default_factory=dict)
     _truths: dict[str, Stream] = field(default_factory=dict)
     _left_out: set[Address] = field(default_factory=set)
-    _since: dict[Address, tuple[str, float]] = field(default_factory=dict)
     _rejected: Counter[Address] = field(default_factory=Counter)
     _reports: deque[RejectionReport] = field(default_factory=lambda: deque(maxlen=_REPORTS))
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -104,7 +155,7 @@ class Fleet:
                 if len(self._left_out) < MAX_STREAMS:
                     self._left_out.add(address)
                 return
-            stream = Stream(self.origin)
+            stream = Stream(self.origin, self.long)
             with self._lock:
                 self.streams[address] = stream
                 self._left_out.discard(address)
@@ -122,36 +173,69 @@ class Fleet:
     def clear(self) -> None:
         """Forget all but the common origin: the time has jumped."""
         with self._lock:
-            for part in (self.streams, self._truths, self._left_out, self._since, self._rejected, self._reports):
+            for part in (self.streams, self._truths, self._left_out, self._rejected, self._reports):
                 part.clear()
 
     def look(
         self,
         time: float,
         healths: Mapping[Address, Health],
+        states: Mapping[str, State],
         *,
         alive: Collection[Address] | None = None,
         link: str = "",
+        own: str = "",
     ) -> Picture:
-        """Make and keep the picture at this time [s]; `alive`: what is published now, None if that is not known."""
+        """Make and keep the picture at this time [s].
+
+        `states`: of vehicles, by name. `alive`: what is published now, None if that is not known.
+        """
         with self._lock:
             streams = sorted(self.streams.items())
-        lines = []
+        lines: dict[str, list[Line]] = {}
         for address, stream in streams:
             if stream.last is None:
                 continue
             health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
-            is_alive = None if alive is None else address in alive
-            state = stream_state(health, alive=is_alive, connected=not link)
-            condition = _condition(health, state)
-            words = describe_stream(health, state).removeprefix(state.name).removeprefix(": ")
-            begin = self._begin(address, condition, time, health)
-            is_over = condition == "gone" and time - begin > _OVER
-            rank = len(CONDITIONS) if is_over else CONDITIONS.index(condition)
-            lines.append(Line(address, stream, health, condition, words, begin, self._rejected[address], rank))
+            state = stream_state(health, alive=None if alive is None else address in alive, connected=not link)
+            line = Line(address, stream, health, state, self._rejected[address])
+            lines.setdefault(address.vehicle, []).append(line)
+        rows = [self._row(vehicle, each, states.get(vehicle), time, own) for vehicle, each in lines.items()]
+        rows.sort(key=lambda row: (row.rank, natural(row.vehicle)))
         rejected = self._rejected.total()
-        self.picture = Picture(time, lines, tuple(self._reports), rejected, len(self._left_out), link)
+        self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
+
+    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, time: float, own: str) -> Row:
+        main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
+        state = state or State("info", "ok", None, ())
+        grade: Grade = "ok" if state.severity == "info" else state.severity
+        text, since = state.text, state.since
+        if grade == "ok" and main.state.name == "slow" and not own:  # else it is this page that is slow
+            grade, text = "watch", str(main.state)
+        kinds = [condition.kind for condition in state.conditions]
+        is_over = "gone" in kinds[:1] and since is not None and time - since > _OVER
+        rank = len(GRADES) if is_over else GRADES.index(grade)
+        number = self._numbers.setdefault(vehicle, len(self._numbers)) if len(self._numbers) < MAX_STREAMS else 0
+        return Row(
+            vehicle, grade, text, since, state.conditions, main, tuple(lines), self._facts(vehicle), rank, number
+        )
+
+    def _facts(self, vehicle: str) -> Facts:
+        status = self._last(vehicle, "vehicle_status")
+        battery = self._last(vehicle, "battery_status", 0)
+        gps = self._last(vehicle, "vehicle_gps_position") or self._last(vehicle, "sensor_gps", 0)
+        left = getattr(battery, "remaining", math.nan)
+        return Facts(
+            "" if status is None else MODES.get(status.nav_state, str(status.nav_state)),
+            "" if status is None else "armed" if status.arming_state == _ARMED else "disarmed",
+            f"{100 * left:.0f} %" if 0 <= left <= 1 else "",
+            "" if gps is None else f"{FIXES.get(gps.fix_type, gps.fix_type)} · {gps.satellites_used}",
+        )
+
+    def _last(self, vehicle: str, topic: str, instance: int | None = None) -> Any:
+        stream = self.streams.get(Address(vehicle, topic, instance))
+        return stream.last.message if stream is not None and stream.last is not None else None
 
     def _make_room(self, time: float) -> bool:
         """Forget one that is no position, or was silent for longest, if that was a minute; return whether there was."""
@@ -160,32 +244,47 @@ class Fleet:
             if is_position(address) and time - self.streams[address].time < _SILENT:
                 return False
             del self.streams[address]
-            self._since.pop(address, None)
             if address.topic == TRUTH:
                 del self._truths[address.vehicle]
         return True
 
-    def _begin(self, address: Address, condition: Condition, time: float, health: Health) -> float:
-        known = self._since.get(address)
-        if known is not None and known[0] == condition:
-            return known[1]
-        begin = time - (health.age or 0.0) if condition in {"gone", "stale", "disconnected"} else time
-        if known is not None and {known[0], condition} <= {"gone", "stale", "disconnected"}:
-            begin = known[1]  # the same silence
-        self._since[address] = condition, begin
-        return begin
+
+def natural(name: str) -> list[tuple[bool, int, str]]:
+    """Return a key that sorts uav-2 before uav-10."""
+    return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in _DIGITS.split(name)]
 
 
-def main_line(lines: Sequence[Line]) -> Line:
-    """Return the line of a vehicle that its marker shows: vehicle_local_position, else another position, if any."""
-    return min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
+def places_at(stream: Stream | None, times: Sequence[float]) -> list[Place | None]:
+    """Return where a stream was at these times [s], as its histories have it; None where they do not reach back."""
+    found: list[Place | None] = [None] * len(times)
+    for history in (stream.long, stream.minute) if stream is not None and times else ():
+        points = history.points(0, history.written)
+        points = points[points[:, 1] == points[:, 1]]  # those with a valid position
+        if not len(points):
+            continue
+        first = points[0, 0]
+        for index, at in enumerate(points[:, 0].searchsorted([time * 1e3 for time in times]).tolist()):
+            if first <= times[index] * 1e3:
+                row = points[min(at, len(points) - 1)]
+                found[index] = Place(float(row[1]), float(row[2]), math.nan, True)
+    return found
 
 
-def _condition(health: Health, state: StreamState) -> Condition:
-    """Return the worst that holds: silence, then what the flags of the last second say, then a slow stream."""
-    flags = health.flags or {}
-    if state.name not in {"ok", "slow"}:
-        return state.name
-    if any(flags.get(name, 1.0) < 1.0 for name in _VALIDITY):
-        return "invalid"
-    return "dead reckoning" if flags.get("dead_reckoning") else state.name
+def last_place(stream: Stream, time: float) -> Place | None:
+    """Return where a stream was valid last by a time [s]."""
+    points = stream.long.points(0, stream.long.written)
+    points = points[(points[:, 1] == points[:, 1]) & (points[:, 0] <= time * 1e3)]
+    return Place(float(points[-1, 1]), float(points[-1, 2]), math.nan, True) if len(points) else None
+
+
+def describe_place(stream: Stream) -> str:
+    """Return the last valid position of a stream in words."""
+    place, projection = stream.valid, stream.origin.projection
+    if place is None:
+        return "nowhere: it never had a valid position"
+    text = f"{place.north:z.1f} m north, {place.east:z.1f} m east"
+    text += f", altitude {place.altitude:z.1f} m" if math.isfinite(place.altitude) else ""
+    if not place.common or projection is None:
+        return text
+    latitude, longitude = projection.reproject(place.north, place.east)
+    return f"{text} ({latitude:.6f}, {longitude:.6f})"

@@ -5,30 +5,26 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Final
 
 from nedbus.client import Bus
-from nedbus.monitoring import Exporter, Page
+from nedbus.events import ALL, Event
+from nedbus.monitoring import Exporter, Page, Sight
 from nedbus_msgs import Selection
 
+from .chronicle import PAST, Chronicle
 from .fleet import Fleet
-from .style import to_clock
-
-LOOK: Final = 500
-"""Milliseconds between two pictures of the states."""
 
 
 class LiveFleet:
-    """Read what a selection matches into a fleet, until it is told to stop."""
+    """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop."""
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         self.fleet = Fleet()
-        self._bus, self._selection = bus, selection
         self._exporter = Exporter(
-            bus, selection, version=version, watch=lambda sample: self.fleet.add(sample, time.time())
-        )
-        self._rejections = bus.rejections()
-        self._broken: float | None = None  # since when the link is
+            bus, selection, version=version, on_look=self._look,
+            watch=lambda sample: self.fleet.add(sample, time.time()),
+        )  # fmt: skip
+        self.chronicle = Chronicle(self._exporter.account, before=_remembered(bus, selection))
 
     @property
     def pages(self) -> Mapping[str, Callable[[], Page]]:
@@ -39,12 +35,22 @@ class LiveFleet:
         """Read until `stop` is set."""
         self._exporter.run(stop)
 
-    def look(self) -> None:
+    def _look(self, sight: Sight) -> None:
         """Make the picture of now."""
-        now = time.time()
-        self._broken = None if self._bus.connected else self._broken or now
-        routers = " or ".join(self._bus.routers)
-        link = f"no link to {routers} since {to_clock(self._broken)}: waiting for it" if self._broken else ""
-        self.fleet.reject([report for report in self._rejections.take() if self._selection.matches(report.address)])
-        alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
-        self.fleet.look(now, self._exporter.healths, alive=alive, link=link)
+        account = self._exporter.account
+        self.fleet.reject(sight.rejected)
+        states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
+        own = sight.behind.replace("this reader", "this page")
+        self.fleet.look(sight.time, sight.healths, states, alive=sight.alive, link=sight.link, own=own)
+
+
+def _remembered(bus: Bus, selection: Selection) -> list[Event]:
+    reports = bus.accounts(within=PAST)
+    now = time.time()
+    told = [
+        event
+        for report in reports
+        for event in report.events
+        if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
+    ]
+    return sorted(told, key=lambda event: event.time)

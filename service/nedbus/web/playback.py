@@ -1,4 +1,4 @@
-"""A recording on the page: the messages of a file, and a time that runs, is paused, and can be set."""
+"""A recording on the page: the messages of a file, what happened in it, and a time that runs, is paused, and is set."""
 
 from __future__ import annotations
 
@@ -6,26 +6,29 @@ import logging
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from bokeh.layouts import row
-from bokeh.models import Row
 from bokeh.models.widgets import Select, Slider, Toggle
 
+from nedbus import recording
 from nedbus.client import Monitor, RejectionReport, Sample
-from nedbus.errors import InvalidMessageError, NedbusError
+from nedbus.errors import NedbusError
+from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
-from nedbus.sources import ReplaySource, parse_source, source_text_of_file
-from nedbus_msgs import DEFAULT, Address, codec_of, upgrade_fields
+from nedbus.sources import KEPT_OF_FILE, ReplaySource, SourceMessage, follow, parse_source, source_text_of_file
+from nedbus_msgs import BY_TOPIC, Address, codec_of
 
-from .fleet import Fleet
+from .chronicle import Chronicle, to_elapsed
+from .fleet import Fleet, last_place
 from .stream import is_position
 
 _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s that are shown before the time that is chosen
+_WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two of them
+_KEPT: Final = ("VehicleStatus", "SensorGps", "BatteryStatus")  # messages whose values the page shows
 _SPEEDS: Final[Mapping[str | tuple[Any, str], float]] = {
     "0.5": 0.5, "1": 1.0, "2": 2.0, "5": 5.0, "10": 10.0, "50": 50.0,
 }  # fmt: skip
@@ -34,7 +37,8 @@ _SPEEDS: Final[Mapping[str | tuple[Any, str], float]] = {
 class Recording:
     """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
 
-    Of other messages, which outnumber them, only PX4's time is kept.
+    Of most other messages, which outnumber them, only PX4's time is kept. `whole`: the flight at two points a second;
+    `account`: what happened, whose clock is seconds since the first message; `chronicle`: how the page tells it.
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -42,12 +46,17 @@ class Recording:
     def __init__(self, path: Path) -> None:
         spec = parse_source(source_text_of_file(path))
         self.name = path.name
+        self.whole = Fleet(long=_WHOLE)
+        self.account = Account(KEPT_OF_FILE)
+        self.chronicle = Chronicle(self.account, times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
-        self._path = str(path)
+        self.is_read = False
+        self._path = path
+        self._places: dict[Address, list[int]] = {}  # of each stream in `entries`
         self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
         for warning in self._run.warnings:
-            _log.warning("%s: %s", path, warning, extra=about("damaged", source=self._path, reason=warning))
+            _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property
@@ -55,27 +64,40 @@ class Recording:
         """Seconds that have been read so far."""
         return self.dues[-1] if self.dues else 0.0
 
+    def before(self, index: int) -> list[int]:
+        """Return the last entry of each stream before this one, in order."""
+        found = (places[at - 1] for places in list(self._places.values()) if (at := bisect_left(places, index)))
+        return sorted(found)
+
     def _read(self) -> None:
         try:
-            for message in self._run.messages:
-                keep = _encode if is_position(message.address) else _time_of
-                self.entries.append((message.address, message.error or keep(message.fields)))
-                self.dues.append(message.due)
+            self._find_start()
+            for message, reason, payload in follow(self._run.messages, self.account):
+                self._add(message, reason, payload)
         except NedbusError as exc:
-            _log.error("%s", exc, extra=about("damaged", source=self._path, reason=str(exc)))
+            _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))
+        self.is_read = True
 
+    def _find_start(self) -> None:
+        vehicles = {address.vehicle for address in self._run.addresses}
+        offsets = {name: utc for name in vehicles if (utc := recording.utc_of(self._path, vehicle=name)) is not None}
+        self.chronicle.times = Times(offsets={name: utc.offset_us / 1e6 for name, utc in offsets.items()})
 
-def _encode(fields: Mapping[str, object]) -> bytes | str:
-    """Return a message as bytes, or why it is none."""
-    try:
-        return codec_of(DEFAULT).encode_fields(upgrade_fields(DEFAULT, fields))
-    except InvalidMessageError as exc:
-        return exc.reason
-
-
-def _time_of(fields: Mapping[str, object]) -> int | str:
-    """Return PX4's time of a message, or why it is none."""
-    return cast("int", fields["timestamp"]) if "timestamp" in fields else "timestamp: Field required"
+    def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
+        address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
+        definition = BY_TOPIC.get(address.topic)
+        kept: bytes | str | int = stamp if reason is None else reason
+        if payload is not None and definition is not None and (is_position(address) or definition.name in _KEPT):
+            kept = payload
+            if is_position(address):
+                row = codec_of(definition).decode_row(payload)
+                self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
+        offset = self.chronicle.times.offsets.get(address.vehicle)
+        if self.chronicle.start is None and reason is None and offset is not None:
+            self.chronicle.start = stamp / 1e6 + offset - message.due
+        self._places.setdefault(address, []).append(len(self.entries))
+        self.entries.append((address, kept))
+        self.dues.append(message.due)
 
 
 class _Unread(NamedTuple):
@@ -88,54 +110,91 @@ class Player:
     """One viewer's time in a recording; its fleet is as it was then."""
 
     def __init__(self, recording: Recording) -> None:
-        self.fleet = Fleet()
+        self.fleet = Fleet(origin=recording.whole.origin)
         self.on_jump: Callable[[], object] = lambda: None
+        self.time = 0.0
         self._recording = recording
         self._monitor = Monitor()
-        self._time, self._next = 0.0, 0
+        self._next = 0
         self._ticked = time.monotonic()
-        self._slider = Slider(title="time [s]", start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width")
+        self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
         self._play = Toggle(label="pause", active=True, width=80)
         self._speed = Select(options=list(_SPEEDS), value="1", width=80)
         self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
         self._shown, self._dragged = 0.0, False
         self._slider.on_change("value", lambda _, __, value: self._drag(value))
-        self._slider.on_change("value_throttled", lambda _, __, value: self._jump(value))
-        self.controls: Row = row(self._play, self._speed, self._slider, sizing_mode="stretch_width")
+        self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
+        self.controls: Sequence[Any] = (self._play, self._speed, self._slider)
+
+    @property
+    def length(self) -> float:
+        """Seconds of the recording."""
+        return self._recording.length
 
     def tick(self) -> None:
         """Let the time run on."""
         now = time.monotonic()
         elapsed, self._ticked = now - self._ticked, now
         if self._play.active:
-            self._time = min(self._time + elapsed * _SPEEDS.get(str(self._speed.value), 1.0), self._recording.length)
+            self.time = min(self.time + elapsed * _SPEEDS.get(str(self._speed.value), 1.0), self.length)
         if not self._dragged:
-            self._shown = round(self._time, 1)
-            self._slider.update(end=max(1.0, self._recording.length), value=self._shown)
-        self._feed(self._time)
+            self._shown = round(self.time, 1)
+            self._slider.update(end=max(1.0, self.length), value=self._shown)
+        self._feed(self.time)
+
+    def clock(self, seconds: float) -> str:
+        """Return a time of the recording in words: UTC where the recording tells it, and since its start."""
+        elapsed = to_elapsed(seconds)
+        if self._recording.chronicle.start is None:
+            return elapsed
+        return f"{self._recording.chronicle.moment(seconds)} UTC, {elapsed}"
+
+    def pause(self) -> None:
+        """Stay at this time."""
+        self._play.active = False
+
+    def has(self, seconds: float) -> bool:
+        """Return whether this time was read already, or will not come."""
+        return self._recording.is_read or seconds <= self.length
+
+    def toggle(self) -> None:
+        """Pause, or play on."""
+        self._play.active = not self._play.active
+
+    def jump(self, seconds: float) -> None:
+        """Set the time, as far as the recording has it, with the minute before it."""
+        self._dragged = False
+        self.fleet.clear()
+        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.length)
+        self._next = bisect_left(self._recording.dues, self.time - _MINUTE)
+        for index in self._recording.before(self._next):  # what was known of streams that are silent by then
+            self._show(index)
+        for address, stream in self.fleet.streams.items():
+            whole = self._recording.whole.streams.get(address)
+            if stream.valid is None and whole is not None:
+                stream.valid = last_place(whole, self.time)
+        self._feed(self.time)
+        self.on_jump()
 
     def _drag(self, seconds: float) -> None:
         self._dragged = self._dragged or seconds != self._shown
 
-    def _jump(self, seconds: float) -> None:
-        self._dragged = False
-        self.fleet.clear()
-        self._monitor, self._time = Monitor(), min(max(0.0, seconds), self._recording.length)
-        self._next = bisect_left(self._recording.dues, self._time - _MINUTE)
-        for halves in range(round(2 * _MINUTE)):  # so that it is known since when a condition holds
-            self._feed(max(0.0, self._time - _MINUTE + halves / 2))
-        self.on_jump()
-
     def _feed(self, seconds: float) -> None:
         end = bisect_right(self._recording.dues, seconds)
         for index in range(self._next, end):
-            due, (address, payload) = self._recording.dues[index], self._recording.entries[index]
-            if isinstance(payload, str):
-                self.fleet.reject([RejectionReport(address, payload, round(due * 1e9))])
-                continue
-            message: Any = _Unread(payload) if isinstance(payload, int) else codec_of(DEFAULT).decode_row(payload)
-            sample = Sample(message, address, round(due * 1e9))
-            self._monitor.add(sample, received=sample.received)
-            self.fleet.add(sample, due)
+            self._show(index)
         self._next = max(self._next, end)
-        self.fleet.look(seconds, self._monitor.snapshot(round(seconds * 1e9)))
+        states = {name: state_at(spans, seconds) for name, spans in self._recording.chronicle.spans.items()}
+        self.fleet.look(seconds, self._monitor.snapshot(round(seconds * 1e9)), states)
+
+    def _show(self, index: int) -> None:
+        due, (address, payload) = self._recording.dues[index], self._recording.entries[index]
+        if isinstance(payload, str):
+            self.fleet.reject([RejectionReport(address, payload, round(due * 1e9))])
+            return
+        message: Any = _Unread(payload) if isinstance(payload, int) else None
+        if isinstance(payload, bytes):
+            message = codec_of(BY_TOPIC[address.topic]).decode_row(payload)
+        sample = Sample(message, address, round(due * 1e9))
+        self._monitor.add(sample, received=sample.received)
+        self.fleet.add(sample, due)

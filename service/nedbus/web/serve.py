@@ -15,7 +15,7 @@ from nedbus.client import Bus
 from nedbus.monitoring import Page
 from nedbus_msgs import Selection
 
-from .live import LOOK, LiveFleet
+from .live import LiveFleet
 from .playback import Player, Recording
 from .server import WebServer
 from .viewer import TICK, Viewer
@@ -54,14 +54,14 @@ def serve_live(
     live = LiveFleet(bus, selection, version=version)
 
     def open_page(document: Document, background: Background | None) -> None:
-        viewer = Viewer(document, live.fleet, background=background)
+        viewer = Viewer(document, live.fleet, live.chronicle, background=background)
         document.add_periodic_callback(viewer.update, TICK)
 
     server = where.open(open_page, live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
         reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
         tell(server.url)
-        server.run(stop, live.look, LOOK)
+        server.run(stop)
         reading.result()
 
 
@@ -71,7 +71,10 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
     def open_page(document: Document, background: Background | None) -> None:
         player = Player(recording)
-        viewer = Viewer(document, player.fleet, title=recording.name, background=background, controls=player.controls)
+        viewer = Viewer(
+            document, player.fleet, recording.chronicle, title=recording.name, background=background,
+            whole=recording.whole, player=player,
+        )  # fmt: skip
         player.on_jump = viewer.restart
 
         def tick() -> None:
@@ -82,4 +85,4 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
     server = where.open(open_page, {"/healthz": lambda: Page.text("ok")})
     tell(server.url)
-    server.run(stop, lambda: None, LOOK)
+    server.run(stop)

@@ -80,20 +80,17 @@ class WebServer:
         shown = "127.0.0.1" if host in _ANY else host
         self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
 
-    def run(self, stop: threading.Event, refresh: Callable[[], None], every: int) -> None:
-        """Serve until `stop` is set, and call `refresh` every so many milliseconds, in this thread."""
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set, in this thread."""
         poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _POLL)
-        again = PeriodicCallback(refresh, every)
 
         def begin() -> None:
             poll.start()
-            again.start()
             self._server.start()
 
         self._loop.add_callback(begin)
         self._loop.start()
         poll.stop()  # it would stop the loop once more, amid the end of the server
-        again.stop()
         self._server.stop()
         self._loop.close(all_fds=True)
 

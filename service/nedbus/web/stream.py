@@ -1,4 +1,4 @@
-"""What is kept of one stream for a page: where it was in the last minute, at ten points a second; no I/O.
+"""What is kept of one stream for a page: the last minute at ten points a second, and longer at fewer; no I/O.
 
 Of other messages than positions only the last one is kept.
 """
@@ -6,7 +6,6 @@ Of other messages than positions only the last one is kept.
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
@@ -17,20 +16,23 @@ from nedbus.client import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, MapProjection, ResetTracker, VehicleLocalPosition, to_global
 
 POINTS: Final = 600
-"""Points of a history: a minute."""
+"""Points of the last minute."""
 
-COLUMNS: Final = ("time", "east", "north", "height", "vx", "vy", "climb", "eph", "epv", "error", "doubtful")
+LONG: Final = 900, 1.0
+"""Points of the history beyond it, and seconds between two of them: a quarter of an hour."""
+
+COLUMNS: Final = ("time", "east", "north", "height", "speed", "climb", "eph", "epv", "error", "doubtful")
 """Of a history: ms since the epoch, m, m/s, and 1 while dead reckoning; NaN where the message was not valid.
 
-`height` is above the vehicle's own origin, `error` the distance to the ground truth of the same moment.
+`height` is above the vehicle's own origin, `speed` horizontal, `error` the distance to the ground truth of then.
 """
 
 _ERROR: Final = COLUMNS.index("error")
 _STEP: Final = 0.095  # s between two points
 _SAME: Final = 0.5  # s between an estimate and the ground truth that it is compared with
 _events = attrgetter(
-    "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "ref_timestamp", "xy_global",
-    "xy_valid", "z_valid", "dead_reckoning",
+    "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "xy_global", "xy_valid", "z_valid",
+    "dead_reckoning",
 )  # fmt: skip
 
 
@@ -49,6 +51,24 @@ class Place(NamedTuple):
     north: float
     altitude: float
     common: bool
+
+
+class History:
+    """A ring of the last points: array of shape (size, columns), of which `written` have been written so far."""
+
+    def __init__(self, size: int, step: float) -> None:
+        self.size, self.step = size, step
+        self.written = 0
+        self._points = np.empty((size, len(COLUMNS)))  # no memory until it is written, as it never is for others
+
+    def points(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+        """Return the points with these numbers that are still there, in order, shape (n, columns)."""
+        return self._points[np.arange(max(begin, end - self.size, 0), end) % self.size]
+
+    def write(self, values: list[float]) -> None:
+        """Write the next point."""
+        self._points[self.written % self.size] = values
+        self.written += 1
 
 
 @dataclass(slots=True)
@@ -71,23 +91,20 @@ class Origin:
 
 
 class Stream:
-    """One stream: its last sample, its history, and its resets in that time.
+    """One stream: its last sample, and its histories: of the last minute, and a longer one.
 
-    `history`: array of shape (600, columns), a ring of which `written` points have been written so far.
     `last`: the last sample; `valid`: the last place that was valid, None if none was; `heading` [rad], NaN if unknown.
     """
 
-    def __init__(self, origin: Origin) -> None:
-        self.history = np.empty((POINTS, len(COLUMNS)))  # no memory until it is written, as it never is for others
-        self.written = 0
+    def __init__(self, origin: Origin, long: tuple[int, float] = LONG) -> None:
+        self.minute, self.long = History(POINTS, _STEP), History(*long)
         self.last: Sample[Any] | None = None
         self.time = -math.inf  # of `last` [s since the epoch]
         self.valid: Place | None = None
-        self.resets: deque[tuple[float, float, float]] = deque(maxlen=50)  # time [s], east, north
         self.origin = origin
         self._tracker = ResetTracker()
         self._state: object = None
-        self._sampled = -math.inf
+        self._sampled = self._sampled_long = -math.inf
 
     def add(self, sample: Sample[Any], time: float, truth: Stream | None = None) -> None:
         """Add the next sample of the stream at this time [s], beside the ground truth of its vehicle."""
@@ -106,40 +123,35 @@ class Stream:
     @property
     def error(self) -> float:
         """The distance to the ground truth at the last point [m], NaN without one."""
-        return float(self.history[(self.written - 1) % POINTS, _ERROR]) if self.written else math.nan
-
-    def points(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        """Return the points with these numbers that are still there, in order, shape (n, columns)."""
-        return self.history[np.arange(max(begin, end - POINTS, 0), end) % POINTS]
+        last = self.minute.points(self.minute.written - 1, self.minute.written)
+        return float(last[0, _ERROR]) if len(last) else math.nan
 
     def _add_point(self, message: VehicleLocalPosition, time: float, truth: Stream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
-            self._write([time * 1e3, *[math.nan] * (len(COLUMNS) - 1)])  # the line breaks here
-            if "xy" in track.reset and math.isfinite(place.north):
-                self.resets.append((time, place.east, place.north))
+            gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # the line breaks here
+            self.minute.write(gap)
+            self.long.write(gap)
+            self._sampled_long = -math.inf
         if math.isfinite(place.north):
             self.valid = place
         speed_north, speed_east = (message.vx, message.vy) if message.v_xy_valid else (math.nan, math.nan)
-        self._write(
-            [
-                time * 1e3,
-                place.east,
-                place.north,
-                -message.z if message.z_valid else math.nan,
-                speed_north,
-                speed_east,
-                -message.vz if message.v_z_valid else math.nan,
-                message.eph,
-                message.epv,
-                _distance(place, message, truth),
-                float(message.dead_reckoning),
-            ]
-        )
-
-    def _write(self, values: list[float]) -> None:
-        self.history[self.written % POINTS] = values
-        self.written += 1
+        point = [
+            time * 1e3,
+            place.east,
+            place.north,
+            -message.z if message.z_valid else math.nan,
+            math.hypot(speed_north, speed_east),
+            -message.vz if message.v_z_valid else math.nan,
+            message.eph,
+            message.epv,
+            _distance(place, message, truth),
+            float(message.dead_reckoning),
+        ]
+        self.minute.write(point)
+        if time - self._sampled_long >= self.long.step:
+            self._sampled_long = time
+            self.long.write(point)
 
 
 def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None) -> float:

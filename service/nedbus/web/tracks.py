@@ -12,14 +12,17 @@ from bokeh.models import ColumnDataSource
 from nedbus_msgs import Address
 
 from .fleet import TRUTH
-from .stream import COLUMNS, POINTS, Stream
+from .stream import COLUMNS, History
+from .style import PALETTE
 
 _BUDGET: Final = 6_000  # points of all tracks together: what a browser draws ten times a second
 _FEWEST: Final = 60  # of a track
-_KINDS: Final = ("valid", "doubtful", "truth")
-_NAMES: Final = ("east", *_KINDS)
-_GAP: Final = (math.nan, math.nan, math.nan, math.nan)
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
+_DOUBT, _TRUE = "doubtful", "truth"
+NAMES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBT, _TRUE)
+"""The kinds of lines: valid ones in the colours of vehicles, doubtful ones, and ground truth."""
+
+Track = tuple[History, int]  # with the number of its colour
 
 
 class Tracks:
@@ -30,65 +33,63 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        self.source = ColumnDataSource({name: [] for name in _NAMES})
-        self._addresses: tuple[Address, ...] | None = None
+        self.source = ColumnDataSource({name: [] for name in ("east", *NAMES)})
+        self._tracks: Mapping[Address, Track] | None = None
         self._seen: list[int] = []
         self._step = self._slots = 1
 
-    def update(self, streams: Mapping[Address, Stream]) -> None:
+    def update(self, tracks: Mapping[Address, Track]) -> None:
         """Send what is new of these."""
-        if tuple(streams) != self._addresses:
-            self._begin(streams)
-        patches: dict[str, list[tuple[int, float]]] = {name: [] for name in _NAMES}
-        for index, (address, stream) in enumerate(streams.items()):
-            for slot, values in self._points(index, address, stream):
-                for name, value in zip(patches, values, strict=True):
+        if tracks != self._tracks:
+            self._begin(tracks)
+        patches: dict[str, list[tuple[int, float]]] = {name: [] for name in ("east", *NAMES)}
+        for index, (address, track) in enumerate(tracks.items()):
+            for slot, values in self._points(index, address, track):
+                for name, value in values.items():
                     patches[name].append((slot, value))
         if patches["east"]:
-            self.source.patch(patches)
+            self.source.patch({name: patch for name, patch in patches.items() if patch})
 
     def clear(self) -> None:
         """Forget all, so that the next update sends everything again."""
-        self._addresses = None
+        self._tracks = None
 
-    def _begin(self, streams: Mapping[Address, Stream]) -> None:
-        self._addresses = tuple(streams)
-        self._seen = [0] * len(streams)
-        points = max(_FEWEST, min(POINTS, _BUDGET // max(1, len(streams))))
-        self._step = -(-POINTS // points)
-        self._slots = POINTS // self._step + 2  # with the one that is not complete yet, and the gap
-        filled: dict[str, Any] = {n: np.full((self._slots + 2) * len(streams), math.nan) for n in _NAMES}
-        for index, (address, stream) in enumerate(streams.items()):
-            for slot, values in self._points(index, address, stream):
-                for name, value in zip(filled, values, strict=True):
+    def _begin(self, tracks: Mapping[Address, Track]) -> None:
+        self._tracks = dict(tracks)
+        self._seen = [0] * len(tracks)
+        longest = max((history.size for history, _ in tracks.values()), default=1)
+        points = max(_FEWEST, min(longest, _BUDGET // max(1, len(tracks))))
+        written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
+        self._step = -(-min(longest, max(2 * written, _BUDGET)) // points)
+        self._slots = longest // self._step + 2  # with the one that is not complete yet, and the gap
+        filled: dict[str, Any] = {n: np.full((self._slots + 2) * len(tracks), math.nan) for n in ("east", *NAMES)}
+        for index, (address, track) in enumerate(tracks.items()):
+            for slot, values in self._points(index, address, track):
+                for name, value in values.items():
                     filled[name][slot] = value
         self.source.data = filled
 
-    def _points(
-        self, index: int, address: Address, stream: Stream
-    ) -> Iterator[tuple[int, tuple[float, float, float, float]]]:
+    def _points(self, index: int, address: Address, track: Track) -> Iterator[tuple[int, dict[str, float]]]:
         """Yield the slots that change, with their values."""
+        history, number = track
         step, ring = self._step, self._slots
-        seen, end = self._seen[index], stream.written  # once: another thread adds points
+        seen, end = self._seen[index], history.written  # once: another thread adds points
         if end == seen:
             return
         self._seen[index] = end
-        rows = stream.points(seen // step * step, end)
-        changed: dict[int, tuple[float, float, float, float]] = {}
+        names = (_TRUE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBT)
+        gap = dict.fromkeys(("east", *names), math.nan)
+        rows = history.points(seen // step * step, end)
+        changed: dict[int, dict[str, float]] = {}
         broken = False
-        for number, row in enumerate(rows.tolist(), end - len(rows)):
+        for position, row in enumerate(rows.tolist(), end - len(rows)):
             east, north, doubtful = row[_EAST], row[_NORTH], row[_DOUBTFUL]
-            broken = math.isnan(east) or (broken and number % step > 0)
-            point = round(east, 2), math.nan if broken else round(north, 2)
-            changed[number // step % ring] = _columns(*point, truth=address.topic == TRUTH, doubtful=doubtful > 0)
-        changed[((end - 1) // step + 1) % ring] = _GAP
+            broken = math.isnan(east) or (broken and position % step > 0)
+            values = {**gap, "east": round(east, 2)}
+            values[names[-1 if doubtful > 0 else 0]] = math.nan if broken else round(north, 2)
+            changed[position // step % ring] = values
+        changed[((end - 1) // step + 1) % ring] = gap
         if 0 in changed:
             changed[ring] = changed[0]  # so that the line goes on from the last slot to the first
         for slot, values in changed.items():
             yield index * (ring + 2) + slot, values
-
-
-def _columns(east: float, north: float, *, truth: bool, doubtful: bool) -> tuple[float, float, float, float]:
-    kind = 2 if truth else int(doubtful)
-    norths = [north if kind == each else math.nan for each in range(3)]
-    return east, norths[0], norths[1], norths[2]

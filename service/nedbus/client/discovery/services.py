@@ -6,7 +6,7 @@ import json
 import logging
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,6 +14,7 @@ import zenoh
 
 from nedbus.client.closing import Finalizer
 from nedbus.client.receiving.layout_lookup import Schemas
+from nedbus.events import QUESTION, AccountReport, from_json
 from nedbus.log_event import about
 from nedbus.transport import RawSample, Session, query, while_open
 from nedbus_msgs import ANY, Address, AddressError, address_of_rejected_key, rejected_key_expr, schema_key, status_key
@@ -23,6 +24,7 @@ _log = logging.getLogger(__name__)
 _MAX_FIELDS: Final = 256  # of a layout
 _MAX_TEXT: Final = 300  # characters of a key that are logged, and of a reason that are kept
 _MAX_ANSWER: Final = 2**18  # bytes of an answer that is read
+_MAX_ACCOUNT: Final = 2**20  # the same of the account of a thousand vehicles
 _MAX_CONTENT: Final = 2**28  # bytes that the status of all services may take up, about: JSON is up to 32 times larger
 _MAX_LAYOUTS: Final = 32  # of an answer; there are five
 _TIMEOUT: Final = 2.0  # s for this question: a publisher that is busy is not in time for less
@@ -34,18 +36,31 @@ _MAX_REPORT: Final = 2**16  # bytes of a report that is read
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
     """Return the status of every nedbus service, as it reports it; what would fill the memory is left out."""
     answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
+    return [status for _, status in _parse(_accept(answers)) if isinstance(status, dict)]
+
+
+def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
+    """Return what services remember of the last seconds; what cannot be parsed, or is too large, is left out."""
+    selector = f"{status_key(ANY, prefix=prefix)}?{QUESTION}={within:g}"
+    answers = _accept(query(session, selector, timeout=timeout), limit=_MAX_ACCOUNT)
+    found = (from_json(content) for _, content in _parse(answers, limit=_MAX_ACCOUNT))
+    return [report for report in found if report is not None]
+
+
+def _accept(answers: Sequence[RawSample], *, limit: int = _MAX_ANSWER) -> list[RawSample]:
+    """Return the answers that may be parsed, and log how many would fill the memory."""
     accepted: list[RawSample] = []
     room = _MAX_CONTENT
     for raw in answers:
         text = raw.payload.to_bytes()
         # What it takes up at most when it is parsed, about: measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
-        if len(text) <= _MAX_ANSWER and size <= room:
+        if len(text) <= limit and size <= room:
             accepted.append(raw)
             room -= size
     if left_out := len(answers) - len(accepted):
         _log.warning("%d services are left out: their answers are too large", left_out, extra=about("incomplete"))
-    return [status for _, status in _parse(accepted) if isinstance(status, dict)]
+    return accepted
 
 
 def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
@@ -125,11 +140,11 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
 
 
-def _parse(answers: Iterable[RawSample]) -> Iterator[tuple[RawSample, object]]:
+def _parse(answers: Iterable[RawSample], *, limit: int = _MAX_ANSWER) -> Iterator[tuple[RawSample, object]]:
     """Yield answers with their content; the first that is not JSON is logged, as a peer may send any number."""
     logged = False
     for raw in answers:
-        if len(raw.payload) > _MAX_ANSWER:
+        if len(raw.payload) > limit:
             continue
         try:
             yield raw, json.loads(raw.payload.to_bytes())

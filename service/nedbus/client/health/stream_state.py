@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 from nedbus.client.sample import Sample
+from nedbus.events import to_age
 from nedbus_msgs import Message, describe_flags
 
 from .stream_health import Health, StreamHealth
@@ -69,12 +70,3 @@ def health_of_last(sample: Sample[Message]) -> Health:
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0)
     return stream.snapshot(0 if sample.sent is None else max(0, time.time_ns() - sample.sent))
-
-
-def to_age(seconds: float) -> str:
-    """Return a duration in a suitable unit, as text."""
-    if seconds < 1:
-        return f"{max(0.0, seconds) * 1e3:.0f} ms"
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"

@@ -63,9 +63,22 @@ class QueryServer:
                 self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
                 self._thread.start()
 
-    def answer_json(self, key: str, content: Callable[[], Mapping[str, object]]) -> None:
-        """Answer queries on a key with a JSON document, made anew for each."""
-        self.answer(key, lambda _: [Answer(key, json.dumps(content()).encode(), JSON)])
+    def answer_json(
+        self, key: str, content: Callable[[], Mapping[str, object]],
+        **instead: Callable[[str], Mapping[str, object]],
+    ) -> None:  # fmt: skip
+        """Answer queries on a key with a JSON document, made anew for each.
+
+        `instead`: what is answered to a query with this parameter, given its value.
+        """
+
+        def reply(query: zenoh.Query) -> list[Answer]:
+            given = query.parameters
+            asked = next((name for name in instead if name in given), None)
+            document = content() if asked is None else instead[asked](given.get(asked) or "")
+            return [Answer(key, json.dumps(document).encode(), JSON)]
+
+        self.answer(key, reply)
 
     def close(self) -> None:
         """Stop answering."""

@@ -1,0 +1,47 @@
+"""What happened, and why: events of vehicles from their messages, live or of a file; no I/O."""
+
+from .account import KEPT, Account
+from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State, to_age
+from .faults import VALID, Expectation, faults_of, merge_vehicles
+from .report import FORGOTTEN, QUESTION, AccountReport, VehicleReport, by_vehicle, from_json, report_of
+from .rules import FIXES, MODES
+from .story import Span, Story, about, spans_of, state_at, tell
+from .times import Times, to_clock
+from .vehicle import RECENT, Vehicle
+
+__all__ = [
+    "ALL",
+    "FIXES",
+    "FORGOTTEN",
+    "KEPT",
+    "KINDS",
+    "MODES",
+    "QUESTION",
+    "RECENT",
+    "SEVERITIES",
+    "VALID",
+    "WINDOW",
+    "Account",
+    "AccountReport",
+    "Condition",
+    "Event",
+    "Expectation",
+    "Severity",
+    "Span",
+    "State",
+    "Story",
+    "Times",
+    "Vehicle",
+    "VehicleReport",
+    "about",
+    "by_vehicle",
+    "faults_of",
+    "from_json",
+    "merge_vehicles",
+    "report_of",
+    "spans_of",
+    "state_at",
+    "tell",
+    "to_age",
+    "to_clock",
+]

@@ -1,0 +1,167 @@
+"""The flags whose change is an event, by message, and the words for each; thresholds and the names of modes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from .event import Severity
+
+
+@dataclass(frozen=True, slots=True)
+class FlagRule:
+    """Flags that mean one condition: it holds while a flag is `bad`.
+
+    `flags`: by field, with the word for each; flags that change with one message are one event.
+    `severity`: of the begin, and `on_ground` while the vehicle is known to be disarmed; an end is always info.
+    `begin`, `end`: what is said, with `{}` for the words. `first`: said when it never held before.
+    `minor`: flags of which the begin is info too.
+    `initial`: what holds at the first message already is a condition too.
+    """
+
+    kind: str
+    flags: Mapping[str, str]
+    begin: str
+    end: str
+    first: str = ""
+    bad: bool = True
+    severity: Severity = "watch"
+    on_ground: Severity | None = None
+    minor: frozenset[str] = frozenset()
+    initial: bool = False
+
+
+def _valid(field: str, kind: str, word: str) -> FlagRule:
+    begin, end = f"{word} not valid", f"{word} valid again"
+    return FlagRule(
+        kind, {field: word}, begin, end, f"{word} valid for the first time", bad=False, severity="bad", initial=True
+    )
+
+
+POSITION: Final = (
+    _valid("xy_valid", "xy_invalid", "xy"),
+    _valid("z_valid", "z_invalid", "z"),
+    _valid("v_xy_valid", "v_xy_invalid", "vxy"),
+    _valid("v_z_valid", "v_z_invalid", "vz"),
+    FlagRule(
+        "dead_reckoning", {"dead_reckoning": "dead reckoning"}, "dead reckoning", "dead reckoning ends",
+        initial=True,
+    ),
+    FlagRule(
+        "heading_not_good", {"heading_good_for_control": "heading"}, "heading not good for control",
+        "heading good for control", bad=False, severity="info",
+    ),
+    FlagRule(
+        "xy_not_global", {"xy_global": "xy"}, "xy has no global reference", "xy has a global reference", bad=False,
+        on_ground="info",
+    ),
+    FlagRule(
+        "z_not_global", {"z_global": "z"}, "z has no global reference", "z has a global reference", bad=False,
+        on_ground="info",
+    ),
+    FlagRule(
+        "dist_bottom_invalid", {"dist_bottom_valid": "distance to ground"}, "distance to ground not valid",
+        "distance to ground valid", bad=False, severity="info",
+    ),
+)  # fmt: skip
+
+_AIDING: Final = {
+    "cs_gnss_pos": "GNSS position", "cs_gnss_vel": "GNSS velocity", "cs_ev_pos": "vision position",
+    "cs_ev_vel": "vision velocity", "cs_opt_flow": "optical flow", "cs_aux_gpos": "auxiliary position",
+}  # fmt: skip
+_HEIGHTS: Final = {
+    "cs_gps_hgt": "GNSS height", "cs_gnss_yaw": "GNSS yaw", "cs_ev_yaw": "vision yaw", "cs_ev_hgt": "vision height",
+    "cs_baro_hgt": "baro height", "cs_rng_hgt": "range height",
+}  # fmt: skip
+_FAULTS: Final = {
+    "cs_mag_field_disturbed": "magnetic field disturbed", "cs_mag_fault": "magnetometer",
+    "cs_rng_fault": "range finder",
+    "cs_gnss_yaw_fault": "GNSS yaw", "cs_ev_yaw_fault": "vision yaw", "cs_baro_fault": "barometer",
+    "cs_gnss_fault": "GNSS", "cs_gnss_hgt_fault": "GNSS height", "fs_bad_mag_x": "magnetometer x",
+    "fs_bad_mag_y": "magnetometer y", "fs_bad_mag_z": "magnetometer z", "fs_bad_hdg": "heading",
+    "fs_bad_mag_decl": "declination", "fs_bad_airspeed": "airspeed", "fs_bad_sideslip": "sideslip",
+    "fs_bad_optflow_x": "optical flow x", "fs_bad_optflow_y": "optical flow y",
+    "fs_bad_acc_vertical": "accelerometer, vertical", "fs_bad_acc_clipping": "accelerometer clips",
+    "fs_bad_acc_bias": "accelerometer bias", "fs_bad_vel_n": "velocity north", "fs_bad_vel_e": "velocity east",
+    "fs_bad_vel_d": "velocity down", "fs_bad_pos_n": "position north", "fs_bad_pos_e": "position east",
+    "fs_bad_pos_d": "position down",
+}  # fmt: skip
+_REJECTED: Final = {
+    "reject_hor_vel": "horizontal velocity", "reject_ver_vel": "vertical velocity",
+    "reject_hor_pos": "horizontal position", "reject_ver_pos": "vertical position", "reject_mag_x": "magnetometer x",
+    "reject_mag_y": "magnetometer y", "reject_mag_z": "magnetometer z", "reject_yaw": "yaw",
+    "reject_airspeed": "airspeed", "reject_sideslip": "sideslip", "reject_hagl": "height above ground",
+    "reject_optflow_x": "optical flow x", "reject_optflow_y": "optical flow y",
+}  # fmt: skip
+ESTIMATOR: Final = (
+    FlagRule(
+        "not_fused", {**_AIDING, **_HEIGHTS}, "no longer fused: {}", "fused: {}", bad=False, on_ground="info",
+        minor=frozenset(_HEIGHTS),
+    ),
+    FlagRule("innovation_rejected", _REJECTED, "EKF rejects {}", "EKF accepts {} again"),
+    FlagRule("estimator_fault", _FAULTS, "EKF fault: {}", "EKF fault over: {}", initial=True),
+)  # fmt: skip
+STATUS: Final = (
+    FlagRule(
+        "failsafe", {"failsafe": "failsafe"}, "failsafe", "failsafe ends", severity="bad", initial=True
+    ),
+    FlagRule(
+        "gcs_lost", {"gcs_connection_lost": "ground station"}, "link to the ground station lost",
+        "link to the ground station", on_ground="info",
+    ),
+)  # fmt: skip
+
+_LACKS: Final = (
+    "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
+    "local_position_invalid_relaxed", "local_velocity_invalid", "global_position_invalid",
+    "global_position_invalid_relaxed", "auto_mission_missing", "home_position_invalid", "manual_control_signal_lost",
+    "battery_low_remaining_time", "battery_unhealthy", "fd_critical_failure", "fd_esc_arming_failure",
+    "fd_imbalanced_prop", "fd_motor_failure", "fd_alt_loss", "geofence_breached", "mission_failure",
+    "vtol_fixed_wing_system_failure", "wind_limit_exceeded", "flight_time_limit_exceeded", "position_accuracy_low",
+    "navigator_failure", "parachute_unhealthy", "traffic_avoidance_unhealthy", "remote_id_unhealthy", "gnss_lost",
+)  # fmt: skip
+FAILSAFE: Final = (
+    FlagRule(
+        "failsafe_flag", {name: name.replace("_", " ") for name in _LACKS}, "failsafe flags: {}",
+        "failsafe flags cleared: {}", on_ground="info",
+    ),
+)  # fmt: skip
+
+RULES: Final[Mapping[str, tuple[FlagRule, ...]]] = {
+    "VehicleLocalPosition": POSITION, "EstimatorStatusFlags": ESTIMATOR, "VehicleStatus": STATUS,
+    "FailsafeFlags": FAILSAFE,
+}  # fmt: skip
+
+FIX: Final = 3
+"""The fix_type of SensorGps from which on a position is a fix in three dimensions."""
+
+FEW: Final = 6, 7
+"""Satellites: fewer than the first are few (PX4's EKF2_REQ_NSATS), until there are as many as the second."""
+
+JAMMED: Final = 80, 60
+"""The jamming_indicator from which on PX4's guide to logs calls it too high, and below which it is over."""
+
+JUMP: Final = 1.0, 0.2
+"""A jump is more than so many metres beyond what the velocity explains, and this share of the distance flown."""
+
+SMALL: Final = 0.5
+"""Metres, and metres a second, below which a reset is nothing to watch."""
+
+ARMED: Final = 2
+"""The arming_state of a vehicle that is armed."""
+
+MODES: Final[Mapping[int, str]] = {
+    0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 6: "Position Slow",
+    7: "Guided Course", 8: "Altitude Cruise", 10: "Acro", 12: "Descend", 13: "Termination", 14: "Offboard",
+    15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision Land", 21: "Orbit", 22: "VTOL Takeoff",
+    **{number: f"External {number - 22}" for number in range(23, 31)},
+}  # fmt: skip
+"""The names that QGroundControl shows for nav_state."""
+
+FIXES: Final[Mapping[int, str]] = {
+    0: "none", 1: "none", 2: "2D", 3: "3D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed", 8: "extrapolated",
+}  # fmt: skip
+WARNINGS: Final[Mapping[int, str]] = {
+    1: "low", 2: "critical", 3: "emergency", 4: "failed", 6: "unhealthy", 7: "charging",
+}  # fmt: skip

@@ -1,0 +1,81 @@
+"""The time of an event as a person reads it: UTC where it is known, else seconds since boot."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Final
+
+from .event import Event
+
+_CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:\.\d+)?))?")
+_LATEST: Final = 1e11  # s since the epoch, some thousand years
+_UNIX: Final = 1e9  # s since boot beyond which PX4's time is Unix time, as some simulators have it
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """How times are told: live, or by the offsets of the vehicles of a file.
+
+    `is_live`: the account's clock is this host's, in seconds since the epoch.
+    `offsets`: Unix time minus time since boot [s], by vehicle, where a message tells it.
+    """
+
+    is_live: bool = False
+    offsets: Mapping[str, float] = field(default_factory=dict)
+
+    def utc(self, event: Event) -> float | None:
+        """Return the Unix time of an event [s], None if nothing tells it."""
+        if self.is_live:
+            return event.time
+        offset = self.offsets.get(event.vehicle)
+        if event.boot is None:
+            return None
+        utc = event.boot if event.boot > _UNIX else math.nan if offset is None else event.boot + offset
+        return utc if 0 <= utc < _LATEST else None  # a damaged time is neither
+
+    def clock(self, event: Event) -> str:
+        """Return whose time it is: that of this host, of the vehicle as its messages tell UTC, or since its boot."""
+        return "host" if self.is_live else "boot" if self.utc(event) is None else "vehicle"
+
+    def text(self, event: Event) -> str:
+        """Return the time of an event, without the date."""
+        utc = self.utc(event)
+        if utc is None:
+            return f"{event.time if event.boot is None else event.boot:.3f}"
+        return to_clock(utc)
+
+    def find(self, text: str, near: Event) -> float:
+        """Return a moment by the account's clock, given as 14:05:12 (UTC) or in seconds since boot.
+
+        `near`: an event of the vehicle that is meant, for the date. Raises ValueError for anything else.
+        """
+        utc, found = self.utc(near), _CLOCK.fullmatch(text.strip())
+        if found is None:
+            try:
+                seconds = float(text)
+            except ValueError:
+                raise ValueError("no time") from None
+            if not math.isfinite(seconds):
+                raise ValueError("no time")
+            if near.boot is None and self.is_live:
+                raise ValueError("no message of this vehicle tells when it booted")
+            return near.time + seconds - (near.time if near.boot is None else near.boot)
+        hours, minutes, seconds = int(found[1]), int(found[2]), float(found[3] or 0)
+        if hours > 23 or minutes > 59 or seconds >= 60:
+            raise ValueError("no time of a day")
+        if utc is None:
+            raise ValueError("no message of this vehicle tells UTC")
+        day = datetime.fromtimestamp(utc, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
+        moment = day + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+        step = (moment.timestamp() - utc + 43_200) % 86_400 - 43_200  # the nearest one, also beyond midnight
+        return near.time + step
+
+
+def to_clock(utc: float) -> str:
+    """Return a Unix time as 14:05:12.3, in UTC."""
+    tenths = round(utc * 10)
+    return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"

@@ -1,0 +1,83 @@
+"""What happened in a file: the events of all its vehicles, as the messages of a replay tell them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, cast
+
+from nedbus import recording
+from nedbus.errors import InvalidMessageError
+from nedbus.events import Account, Times
+from nedbus_msgs import BY_TOPIC, codec_of, upgrade_fields
+
+from .source import ReplaySource, SourceMessage
+from .spec import parse_source, source_text_of_file
+
+KEPT_OF_FILE: Final = 100_000
+"""Events that are kept of a file, the last ones."""
+
+_LOOK: Final = 0.5  # s of the flight between two looks for what is silent, or has settled
+_END: Final = 10.0  # s after the last message at which what had not settled is told
+
+
+@dataclass(frozen=True, slots=True)
+class FileAccount:
+    """The account of a file at its end: its clock is seconds since the first message; `end`: of the last one."""
+
+    account: Account
+    times: Times
+    end: float
+    warnings: tuple[str, ...]
+
+
+def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
+    """Return what happened in a .ulg or .mcap file; `vehicle` is that of a log of one vehicle.
+
+    Raises ConfigError and SourceError for a file that cannot be read.
+    """
+    spec = parse_source(source_text_of_file(path, vehicle=vehicle))
+    run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
+    account, due = Account(KEPT_OF_FILE), 0.0
+    for message, _, _ in follow(run.messages, account):
+        due = message.due
+    offsets = {}
+    for name in {address.vehicle for address in run.addresses}:
+        utc = recording.utc_of(path, vehicle=name)
+        if utc is not None:
+            offsets[name] = utc.offset_us / 1e6
+    return FileAccount(account, Times(offsets=offsets), due, run.warnings)
+
+
+def follow(
+    messages: Iterable[SourceMessage], account: Account
+) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
+    """Add the messages of a replay to an account, and yield each with why it is rejected, or with its payload."""
+    looked = due = 0.0
+    for message in messages:
+        due = message.due
+        while due - looked >= _LOOK:
+            looked += _LOOK
+            account.look(looked)
+        yield message, *_add(account, message)
+    account.look(due)
+    account.settle(due + _END)
+
+
+def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | None]:
+    definition = message.definition or BY_TOPIC.get(message.address.topic)
+    reason = message.error
+    if reason is None and definition is None:
+        return None, None
+    if reason is None and definition is not None:
+        try:
+            fields = upgrade_fields(definition, message.fields)
+            payload = codec_of(definition).encode_fields(fields)
+        except InvalidMessageError as exc:
+            reason = exc.reason
+        else:
+            account.add(message.address, fields, message.due)
+            return None, payload
+    account.reject(message.address, reason or "", message.due)
+    return reason, None

@@ -1,0 +1,83 @@
+"""A vehicle that sends hand-made messages, and the account of what happens to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from nedbus.events import Account, Event
+from nedbus_msgs import Address, get_topic
+from tests.messages import VALID, VLP, message
+
+POSITION: Final = Address("1", VLP)
+GOOD_GPS: Final[dict[str, Any]] = {
+    "fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0,
+}  # fmt: skip
+DISARMED, ARMED = 1, 2
+
+
+class Flight:
+    """A vehicle and its account; each message comes when the vehicle sends it, so many seconds after its boot."""
+
+    def __init__(self) -> None:
+        self.account = Account()
+        self.now = 100.0
+        self.booted = 90.0
+        self.link = ""
+        self._seen = 0
+
+    def wait(self, seconds: float) -> Flight:
+        self.now += seconds
+        return self
+
+    def send(
+        self, topic: str = VLP, *, vehicle: str = "1", instance: int | None = None, missing: Iterable[str] = (),
+        lost: int = 0, **fields: Any,
+    ) -> list[Event]:  # fmt: skip
+        """Send a message, valid unless told otherwise, and return what is told."""
+        stamp = round((self.now - self.booted) * 1e6)
+        values: object = {"timestamp": stamp, **fields}
+        if topic == VLP:
+            values = message(stamp, **(VALID | fields))
+        instance = 0 if instance is None and get_topic(topic).instances else instance
+        address = Address(vehicle, topic, instance)
+        self.account.add(address, values, self.now, missing=frozenset(missing), lost=lost)
+        return self.take()
+
+    def fly(self, seconds: float, rate: float = 10.0) -> list[Event]:
+        """Send positions for a while, and return what is told."""
+        told = []
+        for _ in range(round(seconds * rate)):
+            self.wait(1 / rate)
+            told += self.send()
+        return told
+
+    def gps(self, **fields: Any) -> list[Event]:
+        return self.send("vehicle_gps_position", **GOOD_GPS | fields)
+
+    def status(self, state: int, **fields: Any) -> list[Event]:
+        return self.send("vehicle_status", **{"arming_state": state, "nav_state": 4, "failsafe": False} | fields)
+
+    def battery(self, warning: int) -> list[Event]:
+        return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
+
+    def look(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
+        """Look at the vehicle's position, in this state by its stream, or None if that is not known."""
+        self.account.look(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
+        return self.take()
+
+    def reject(self, reason: str = "x is NaN") -> list[Event]:
+        self.account.reject(POSITION, reason, self.now)
+        return self.take()
+
+    def take(self) -> list[Event]:
+        new, self._seen = self.account.take(self._seen)
+        return new
+
+    @property
+    def severity(self) -> str:
+        return self.account.state("1", self.now).severity
+
+    @property
+    def kinds(self) -> list[str]:
+        return [each.kind for each in self.account.state("1", self.now).conditions]

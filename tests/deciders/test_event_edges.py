@@ -1,0 +1,143 @@
+"""Events where streams, clocks and data are not as they should be: each of these went wrong once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from nedbus.events import Account, Event, Times, spans_of, state_at, tell
+from nedbus_msgs import Address
+from tests.messages import VALID, VLP
+
+MAIN = Address("1", VLP)
+GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}
+
+
+class Sent:
+    """An account of vehicle 1 that gets fields by name, as a service has them."""
+
+    def __init__(self) -> None:
+        self.account = Account()
+
+    def __call__(self, time: float, topic: str = VLP, instance: int | None = None, **fields: Any) -> None:
+        given = {**(VALID if topic.endswith("local_position") else {}), "timestamp": round((10 + time) * 1e6), **fields}
+        given = {name: value for name, value in given.items() if value is not None}
+        self.account.add(Address("1", topic, instance), given, time)
+
+    @property
+    def told(self) -> list[tuple[str, str]]:
+        return [(event.kind, event.change) for event in self.account.events]
+
+    def state(self, time: float) -> str:
+        return self.account.state("1", time).severity
+
+    def stories(self, **options: Any) -> list[tuple[str, float | None]]:
+        vehicle = self.account.vehicles["1"]
+        conditions = [*vehicle.initial, *vehicle.conditions.values()]
+        return [(story.what, story.until) for story in tell(list(self.account.events), conditions, **options)]
+
+
+@pytest.fixture
+def sent() -> Sent:
+    return Sent()
+
+
+def test_flags_that_a_source_does_not_have_are_no_state(sent: Sent) -> None:
+    """MAVLink without ESTIMATOR_STATUS has no flags: the position is neither valid nor invalid."""
+    none: dict[str, Any] = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"))
+    sent(0.0, **none)
+    assert sent.state(0.0) == "info"
+    sent(1.0, xy_valid=False)
+    assert sent.state(1.0) == "bad"
+    sent(2.0, **none)
+    assert sent.state(2.0) == "info"
+    assert sent.told == []
+
+
+def test_silence_ends_with_the_vehicle_that_was_gone(sent: Sent) -> None:
+    """What was silent, then gone, and is back, is no story without an end."""
+    sent(0.0)
+    sent.account.look(4.0, {MAIN: "stale"})
+    sent.account.look(8.0, {MAIN: "gone"})
+    sent(20.0)
+    assert sent.told == [("silent", "begin"), ("gone", "begin"), ("gone", "end")]
+    assert state_at(spans_of(list(sent.account.events)), 24.0).severity == "info"
+    assert all(until is not None for _, until in sent.stories())
+
+
+def test_stream_that_speaks_for_the_vehicle_no_more_ends_what_it_told(sent: Sent) -> None:
+    """A better position, and a better receiver: what the other told is over."""
+    sent(0.0, "estimator_local_position", 0)
+    sent(1.0, "estimator_local_position", 0, xy_valid=False)
+    sent(1.0, "sensor_gps", 0, **GPS)
+    sent(2.0, "sensor_gps", 0, **{**GPS, "fix_type": 0, "satellites_used": 0})
+    assert sent.state(2.0) == "bad"
+    sent(3.0)
+    sent(3.0, "vehicle_gps_position", **GPS)
+    assert sent.state(3.0) == "info"
+    assert all(until is not None for _, until in sent.stories())
+
+
+def test_battery_that_is_taken_out_warns_no_more(sent: Sent) -> None:
+    """The one that is put in next is not low before it says so."""
+    sent(0.0, "battery_status", 0, warning=0, connected=True)
+    sent(1.0, "battery_status", 0, warning=2, connected=True)
+    assert sent.state(1.0) == "bad"
+    sent(2.0, "battery_status", 0, warning=2, connected=False)
+    assert sent.told[-1] == ("battery", "end")
+    sent(3.0, "battery_status", 0, warning=0, connected=True)
+    assert sent.state(3.0) == "info"
+
+
+def test_damaged_time_is_no_reboot(sent: Sent) -> None:
+    """One message far ahead of the others, as a damaged log has it, and the one behind it."""
+    for second in range(5):
+        sent(float(second), xy_valid=second < 3)
+    sent(5.0, timestamp=9 * 10**18, xy_valid=False)
+    sent(6.0, xy_valid=False)
+    assert ("reboot", "once") not in sent.told
+    assert sent.state(6.0) == "bad"
+    event = Event("1", "jump", "once", "watch", "", 5.0, boot=9e12)
+    assert Times(offsets={"1": 1e9}).utc(event) is None
+    assert Times(offsets={"1": 1e9}).text(event) == "9000000000000.000"
+
+
+def test_clock_that_is_set_back_hides_no_silence(sent: Sent) -> None:
+    """After a step of the host's clock what is silent is told, and what happened before it is not recent for ever."""
+    sent(10_000.0)
+    sent.account.look(10_000.0, {MAIN: "ok"}, dropped=5)
+    sent.account.reject(MAIN, "a rule", 10_000.0)
+    sent.account.look(4_000.0, {MAIN: "stale"}, dropped=5)
+    for second in range(4_001, 4_020):
+        sent.account.look(float(second), {MAIN: "stale"}, dropped=5)
+    assert {("silent", "begin"), ("rejected", "end"), ("overload", "end")} <= set(sent.told)
+
+
+def test_what_held_at_first_is_over_at_a_reboot(sent: Sent) -> None:
+    """A vehicle that was not valid, reboots and is valid, has nothing that goes on."""
+    for second in range(3):
+        sent(float(second), xy_valid=False)
+    sent(10.0, timestamp=1_000_000)
+    assert ("reboot", "once") in sent.told
+    assert all(until is not None for what, until in sent.stories() if "xy" in what)
+
+
+def test_what_began_on_the_ground_counts_when_armed(sent: Sent) -> None:
+    """A link that was lost while disarmed is nothing to watch until the vehicle is armed."""
+    status = {"arming_state": 1, "nav_state": 4, "failsafe": False}
+    sent(0.0, "vehicle_status", **status, gcs_connection_lost=False)
+    sent(1.0, "vehicle_status", **status, gcs_connection_lost=True)
+    assert sent.state(1.0) == "info"
+    sent(2.0, "vehicle_status", **{**status, "arming_state": 2}, gcs_connection_lost=True)
+    assert sent.state(2.0) == "watch"
+
+
+def test_jamming_at_first_is_a_state(sent: Sent) -> None:
+    """A service that starts while a receiver is jammed says so; a vehicle without GNSS is not to be watched for it."""
+    sent(0.0, "vehicle_gps_position", **{**GPS, "jamming_state": 3})
+    assert sent.state(0.0) == "watch"
+    assert sent.told == []
+    other = Sent()
+    other(0.0, "vehicle_gps_position", **{**GPS, "fix_type": 0, "satellites_used": 0})
+    assert other.state(0.0) == "info"

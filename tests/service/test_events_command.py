@@ -1,0 +1,378 @@
+"""`nedbus events` and `nedbus why`: of files, and live; the peers are a service and scripts in other processes.
+
+The logs are small ones in PX4's format, and where it is said so a real one of PX4 1.17.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import nedbus
+from nedbus import Address
+from nedbus.events import KINDS
+from nedbus.transport import Session
+from tests.command_line import Ended, run_command
+from tests.messages import VALID, VLP, message
+from tests.ports import free_endpoint
+from tests.processes import Start
+from tests.ulogs import LOGS, UlogWriter
+from tests.waits import repeating, wait_for, wait_for_reader
+
+REAL = LOGS.parent / "px4" / "twelve_messages.ulg"
+TOLD = [
+    ("5.000", "WATCH", "dead reckoning"),
+    ("8.000", "BAD", "xy not valid  <- dead reckoning (3.0 s before)"),
+    ("8.000", "BAD", "vxy not valid  <- dead reckoning (3.0 s before)"),
+    ("12.000", "", "xy valid again after 4.0 s"),
+    ("12.000", "", "vxy valid again after 4.0 s"),
+    ("12.000", "", "dead reckoning ends after 7.0 s"),
+]
+WHY = """\
+1: xy and vxy not valid from 8.000, for 4.0 s
+  before it
+    5.000  dead reckoning (3.0 s before)
+  it ended at 12.000 with
+    12.000  dead reckoning ends after 7.0 s
+  not in the data: vehicle_gps_position, estimator_status_flags, vehicle_status, failsafe_flags, which may tell why: \
+PX4 from 1.14 on logs them by default (SDLOG_PROFILE, bit 0)
+"""
+
+
+def write_flight(path: Path, *, fault: bool = True) -> Path:
+    """Write a log of 20 s at 10 Hz, of which four seconds are not valid, after three of dead reckoning."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for tenth in range(10, 210):
+        fields: dict[str, object] = dict(VALID)
+        if fault and 50 <= tenth < 120:
+            fields |= {"dead_reckoning": True, "xy_valid": tenth < 80, "v_xy_valid": tenth < 80}
+        writer.add(VLP, message(tenth * 100_000, **fields))
+    return writer.write(path)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Write a log with a fault."""
+    return write_flight(tmp_path / "flight.ulg")
+
+
+def lines_of(shown: Ended) -> list[tuple[str, str, str]]:
+    """Return time, severity and text of each line."""
+    found = [re.fullmatch(r" *(\S+)  1 {8}(BAD|WATCH)? +(.*)", line) for line in shown.out.splitlines()]
+    return [(match[1], match[2] or "", match[3]) for match in found if match]
+
+
+def test_events_of_a_file(log: Path) -> None:
+    """A line each, with the evidence; stderr says what the times are."""
+    shown = run_command("events", str(log))
+    assert (shown.exit_code, shown.err) == (0, "times: seconds since boot, as no message tells UTC\n")
+    assert lines_of(shown) == TOLD
+    assert len(shown.out.splitlines()) == len(TOLD)
+
+
+@pytest.mark.parametrize(("severity", "count"), [("bad", 2), ("watch", 3), ("info", 6)])
+def test_events_by_severity(log: Path, severity: str, count: int) -> None:
+    """These, and worse ones."""
+    assert len(run_command("events", str(log), "--severity", severity).out.splitlines()) == count
+
+
+def test_events_as_json_and_csv(log: Path) -> None:
+    """Both have every field; JSON is valid without NaN, CSV has evidence and numbers in a cell each."""
+
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} is no JSON")
+
+    events = [
+        json.loads(line, parse_constant=refuse) for line in run_command("events", str(log), "--json").out.splitlines()
+    ]
+    assert [(each["boot"], each["text"]) for each in events] == [
+        (float(at), text.partition("  <- ")[0]) for at, _, text in TOLD
+    ]
+    assert events[1] == {
+        "time": None, "clock": "boot", "vehicle": "1", "kind": "xy_invalid", "change": "begin", "severity": "bad",
+        "text": "xy not valid", "boot": 8.0, "topic": VLP, "numbers": {}, "names": ["xy_valid"], "lasted": None,
+        "evidence": [
+            {"kind": "dead_reckoning", "change": "begin", "text": "dead reckoning", "topic": VLP, "before": 3.0}
+        ],
+    }  # fmt: skip
+    rows = list(csv.DictReader(io.StringIO(run_command("events", str(log), "--csv").out)))
+    assert [(row["boot"], row["kind"]) for row in rows] == [(str(each["boot"]), each["kind"]) for each in events]
+    assert rows[1]["evidence"] == "dead_reckoning 3.0 s"
+
+
+def test_events_of_a_recording_are_those_of_its_log(log: Path, tmp_path: Path) -> None:
+    """Converted to MCAP the flight tells the same."""
+    assert run_command("convert", str(log), "flight.mcap").exit_code == 0
+    assert lines_of(run_command("events", "flight.mcap")) == TOLD
+    assert "'nedbus record' without --topic" in run_command("why", "flight.mcap").out
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+def test_events_of_a_real_flight() -> None:
+    """A log of PX4 1.17 with twelve messages, and the MCAP that was converted from it."""
+    assert run_command("convert", str(REAL), "flight.mcap", "--topics", "*").exit_code == 0
+
+    def events_of(file: str) -> list[tuple[str, str, str]]:
+        told = [json.loads(line) for line in run_command("events", file, "--json").out.splitlines()]
+        return sorted((each["time"], each["text"], each["topic"]) for each in told)
+
+    told = events_of(str(REAL))
+    assert len(told) == 63
+    assert events_of("flight.mcap") == told
+    assert "23:09:04.9  1        BAD    xy not valid  <- GPS fix 3D to none, 10 satellites to 0 (5.1 s before)" in (
+        run_command("events", str(REAL)).out
+    )
+    story = run_command("why", str(REAL)).out
+    assert story.startswith("1: xy and vxy not valid from 23:09:04.9, for 15.9 s\n  before it\n    23:08:59.8  GPS fix")
+    assert "not in the data" not in story
+
+
+def test_why_of_a_file(log: Path) -> None:
+    """What was wrong, since when, for how long, and what precedes it; and what the log does not have."""
+    shown = run_command("why", str(log))
+    assert (shown.exit_code, shown.out) == (0, WHY)
+    assert shown.err == "times: seconds since boot, as no message tells UTC\n"
+    story = json.loads(run_command("why", str(log), "--json").out)
+    assert (story["what"], story["lasted"]) == ("xy and vxy not valid", pytest.approx(4.0))
+    assert [each["kind"] for each in story["before"]] == ["dead_reckoning"]
+    assert story["lacking"][0] == "vehicle_gps_position"
+
+
+def test_why_of_a_moment(log: Path) -> None:
+    """--at names a moment: seconds since boot here, where nothing tells UTC."""
+    assert run_command("why", str(log), "--at", "10").out == WHY
+    assert run_command("why", str(log), "--at", "6.5").out.startswith("1: dead reckoning from 5.000, for 7.0 s\n")
+
+
+@pytest.mark.logs
+@pytest.mark.skipif(not REAL.exists(), reason=f"no real logs: {REAL} is not there")
+def test_why_of_a_moment_in_both_clocks() -> None:
+    """UTC, as the real log's messages tell it, and seconds since boot are the same moment."""
+    by_utc = run_command("why", str(REAL), "--at", "23:09:00").out
+    assert by_utc.startswith("1: GPS fix 3D to none, 10 satellites to 0 from 23:08:59.8, for 19.8 s\n")
+    assert run_command("why", str(REAL), "--at", "27.557").out == by_utc
+
+
+def test_nothing_was_wrong(tmp_path: Path) -> None:
+    """A flight without a fault: neither command is silent, and both say how long it was."""
+    log = str(write_flight(tmp_path / "good.ulg", fault=False))
+    shown = run_command("events", log)
+    assert (shown.exit_code, shown.out) == (0, "")
+    assert shown.err == f"{log}: nothing happened: no event in 20 s\n"
+    shown = run_command("why", log)
+    assert (shown.exit_code, shown.out, shown.err) == (0, "1: nothing was wrong in 20 s\n", "")
+
+
+def test_what_never_was_valid_is_said(tmp_path: Path) -> None:
+    """It is no event, as nothing changed."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for tenth in range(1, 50):
+        writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
+    log = str(writer.write(tmp_path / "never.ulg"))
+    assert run_command("events", log).err == "from the first message to the end: 1: xy not valid\n"
+    assert run_command("why", log).out.startswith("1: xy not valid from the first message on, until the end\n")
+
+
+def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more than an account keeps the last are told, and that there were more."""
+    monkeypatch.setattr("nedbus.sources.account.KEPT_OF_FILE", 2000)
+    writer = UlogWriter()
+    writer.define([VLP])
+    for second in range(2200):
+        writer.add(VLP, message((second + 1) * 1_000_000, **VALID | {"xy_reset_counter": second % 256}))
+    log = str(writer.write(tmp_path / "long.ulg"))
+    shown = run_command("events", log)
+    assert len(shown.out.splitlines()) == 2000
+    assert f"{log}: of 2199 events only the last 2000\n" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (("events", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: name one of LOG: 1\n"),
+        (("why", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: name one of LOG: 1\n"),
+        (("why", "LOG", "--at", "noon"), 2, "nedbus: --at: 'noon': no time: EXPECTED\n"),
+        (("why", "LOG", "--at", "nan"), 2, "nedbus: --at: 'nan': no time: EXPECTED\n"),
+        (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': no time of a day: EXPECTED\n"),
+        (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle tells UTC: EXPECTED\n"),
+        (("events", "LOG", "--severity", "dire"), 2, "nedbus: --severity: 'dire': expected bad or watch or info\n"),
+        (("events", "LOG", "--within", "60"), 2, "nedbus: --within: is for live vehicles, not for a file\n"),
+        (("events", "LOG", "--duration", "60"), 2, "nedbus: --duration: is for live vehicles, not for a file\n"),
+        (("events", "LOG", "--json", "--csv"), 2, "nedbus: --csv: cannot be combined with --json: remove"),
+        (("events", "note.txt"), 2, "nedbus: note.txt: expected a flight log: a file that ends with .ulg or .mcap\n"),
+        (("why", "gone.ulg"), 1, "nedbus: gone.ulg: no such file or directory\n"),
+        (("why", "a/b", "--vehicle", "a b"), 2, "nedbus: "),
+        (("why", "not.ulg"), 1, "nedbus: "),
+    ],
+)  # fmt: skip
+def test_mistake_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str) -> None:
+    """What a stranger types wrong is said in one line, with what to do; 2 is a wrong call, 1 what cannot be done."""
+    (tmp_path / "note.txt").write_text("no log")
+    (tmp_path / "not.ulg").write_text("no log")
+    shown = run_command(*(str(log) if each == "LOG" else each for each in arguments))
+    text = text.replace("LOG", str(log)).replace("EXPECTED", "expected 14:05:12 (UTC), or seconds since boot")
+    assert shown.err.startswith(text)
+    assert (shown.exit_code, shown.out) == (code, "")
+    assert len(shown.err.splitlines()) == 1
+
+
+def test_no_router_and_no_service(endpoint: str) -> None:
+    """Without a router, and without a service that remembers anything, why says what is missing."""
+    closed = free_endpoint()
+    shown = run_command("why", "-c", closed)
+    assert shown.exit_code == 1
+    assert len(shown.err.splitlines()) == 1
+    shown = run_command("why", "-c", endpoint)
+    assert (shown.exit_code, shown.err) == (
+        1, f"nedbus: no nedbus service at {endpoint} knows a vehicle: 'nedbus serve' remembers what happens\n"
+    )  # fmt: skip
+
+
+def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: str) -> None:
+    """Start a service in another process, and wait until all vehicles have flown."""
+    options = [part for source in sources for part in ("-s", source)]
+    run_nedbus("serve", "-c", endpoint, *options)
+    wait_for(lambda: sum(len(each.vehicles) for each in bus.accounts()) == len(sources), what="the vehicles")
+
+    def has_ended() -> bool:
+        states = [source["state"] for service in bus.services() for source in service["sources"]]  # type: ignore[attr-defined]  # it is one of ours
+        return states == ["done"] * len(sources)
+
+    wait_for(has_ended, what="the end of the flights")
+
+
+def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path) -> None:
+    """A service in another process tells what it saw since it began, of a vehicle that is named where there are two."""
+    good = write_flight(tmp_path / "good.ulg", fault=False)
+    start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
+    shown = run_command("why", "-c", endpoint)
+    assert (shown.exit_code, shown.err) == (2, "nedbus: --vehicle: name one of the network: 1, 2\n")
+    assert run_command("why", "-c", endpoint, "-v", "2").out == "2: nothing was wrong, as far as services remember\n"
+    shown = run_command("why", "-c", endpoint, "-v", "1")
+    assert (shown.exit_code, shown.err) == (0, "times: UTC, by the clocks of these hosts\n")
+    assert re.match(r"1: xy and vxy not valid from \d\d:\d\d:\d\d\.\d, for \d+ ms\n  before it\n", shown.out)
+    assert "publish them too: PX4's dds_topics.yaml" in shown.out
+    since_boot = run_command("why", "-c", endpoint, "-v", "1", "--at", "12")  # when it ended
+    assert shown.out in since_boot.out
+    at = re.search(r"\d\d:\d\d:\d\d\.\d", shown.out)
+    assert at
+    assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
+    shown = run_command("why", "-c", endpoint, "-v", "7")
+    assert (shown.exit_code, shown.err) == (2, "nedbus: --vehicle: name one of the network: 1, 2\n")
+
+
+def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:
+    """A vehicle that was never valid since the service began is not told to be well."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for tenth in range(1, 50):
+        writer.add(VLP, message(tenth * 100_000, **VALID | {"xy_valid": False}))
+    log = writer.write(tmp_path / "never.ulg")
+    start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
+    assert run_command("why", "-c", endpoint).out.startswith("1: xy not valid from the first message on, until now\n")
+
+
+def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+    """--within shows them first, from a service in another process, and then what happens."""
+    start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20")
+    follower = run_nedbus("events", "-c", endpoint, "--within", "600", "--json", "-v", "1")
+    wait_for(lambda: len(follower.out.splitlines()) == len(TOLD), what="what happened")
+    told: list[dict[str, Any]] = [json.loads(line) for line in follower.out.splitlines()]
+    assert [each["text"].partition(" after")[0] for each in told] == [
+        text.partition("  <- ")[0].partition(" after")[0] for _, _, text in TOLD
+    ]
+    assert {each["clock"] for each in told} == {"host"}
+    assert [each["kind"] for each in told[1]["evidence"]] == ["dead_reckoning"]
+
+
+def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+    """What happens to a vehicle of a script is told as it happens, and what held before this began is said."""
+    fields: dict[str, object] = VALID | {"z_valid": False}
+    with bus.publisher(VLP, vehicle="7") as publisher:
+
+        def publish() -> None:
+            publisher.publish(message(time.monotonic_ns() // 1000, **fields))
+
+        publish()
+        follower = run_nedbus("events", "-c", endpoint)
+        wait_for_reader(raw, "nedbus/7/vehicle_local_position")
+        with repeating(publish):
+            wait_for(lambda: "7: z not valid, since before this began\n" in follower.err, what="what held before")
+            assert follower.out == ""
+            fields["xy_valid"] = False
+            wait_for(lambda: "xy not valid" in follower.out, what="the event")
+            fields["xy_valid"] = True
+            wait_for(lambda: "xy valid again after" in follower.out, what="its end")
+        wait_for(lambda: "silent: no vehicle_local_position for" in follower.out, what="silence")
+    wait_for(lambda: "gone: nobody publishes vehicle_local_position" in follower.out, what="the end of the publisher")
+    lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
+    assert [line[0] for line in lines] == ["7"] * len(lines)
+    assert lines[0][1].startswith("BAD    xy not valid")
+
+
+def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
+    """--vehicle leaves out the others, --severity what is not as bad."""
+    fields: dict[str, object] = dict(VALID)
+    with bus.publisher(VLP, vehicle="7") as seven, bus.publisher(VLP, vehicle="8") as eight:
+
+        def publish() -> None:
+            for publisher in (seven, eight):
+                publisher.publish(message(time.monotonic_ns() // 1000, **fields))
+
+        follower = run_nedbus("events", "-c", endpoint, "--vehicle", "8", "--severity", "bad")
+        wait_for_reader(raw, "nedbus/8/vehicle_local_position")
+        with repeating(publish):
+            heard = bus.subscribe(VLP, vehicle="8")
+            heard.receive(30)
+            wait_for(lambda: Address("8", VLP) in {each for all_ in bus.vehicles().values() for each in all_}, what="8")
+            for _ in range(2):
+                fields["xy_valid"] = False
+                wait_for(lambda: follower.out.count("xy not valid") > 0, what="the event")
+                fields["xy_valid"] = True
+            heard.close()
+        assert "valid again" not in follower.out
+        assert {line.split()[1] for line in follower.out.splitlines()} == {"8"}
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "events.md"
+BASH = "".join(re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL))
+SHOWN = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", SHOWN)
+def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path) -> None:
+    """Each command of the page does what is said there, of a flight of that name, or of that vehicle, live."""
+    assert log.name == "flight.ulg"
+    arguments = [str(log) if part == log.name else part for part in command.split()]
+    if "flight.ulg" in command:
+        shown = run_command(*arguments)
+        assert shown.exit_code == 0
+        assert "xy" in shown.out or "--at" in command
+        return
+    run_nedbus("serve", "-c", endpoint, "-s", "sim:?vehicle=7")
+    wait_for(lambda: [each for each in bus.accounts() if "7" in each.vehicles], what="the vehicle")
+    if "health" in command:
+        shown = run_command(*arguments, "-c", endpoint)
+        assert (shown.exit_code, shown.err) == (
+            1, "nedbus: vehicle 1 is missing: nobody publishes it\nnedbus: vehicle 2 is missing: nobody publishes it\n"
+        )  # fmt: skip
+    else:
+        shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))
+        assert (shown.exit_code, shown.err) == (0, "")
+
+
+def test_every_kind_is_on_the_page() -> None:
+    """The table of docs/events.md has all kinds, and no other."""
+    rows = re.findall(r"^\| (`.*?) \| .*(?:bad|watch|info)", PAGE.read_text(), re.MULTILINE)
+    kinds = [kind for row in rows for kind in re.findall(r"`(\w+)`", row)]
+    assert sorted(kinds) == sorted(KINDS)

@@ -1,0 +1,235 @@
+"""Events of real flight logs, beside a table of what happened in them that was made without nedbus.
+
+The peers are eight logs of PX4 1.12 to 1.17 (six flights and two simulations), and `tests/events_table.py`, which reads
+them with pyulog and tells first differences of single topics.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from nedbus.events import Event, Story, tell
+from nedbus.sources import read_account
+from nedbus.sources.account import FileAccount
+from tests import events_table
+from tests.events_table import Row
+from tests.ulogs import LOGS
+
+TABLE: Final = json.loads(events_table.TABLE.read_text())
+NAMES: Final = [name for name in TABLE if name != "from"]
+MILLISECOND: Final = 1.0005e-3  # the table has rounded times
+FLAPPING: Final = 4, 10.0, 5.0  # changes within so many seconds that are told; then the last, after so many without one
+RENAMED: Final = {"cs_gps": "cs_gnss_pos"}  # as the layout of today calls what PX4 1.15 logs
+
+pytestmark = [pytest.mark.logs, pytest.mark.skipif(not LOGS.exists(), reason=f"no real logs: {LOGS} is not there")]
+
+
+def path_of(name: str) -> Path:
+    return next(LOGS.parent.glob(f"*/{name}.ulg"))
+
+
+@cache
+def account_of(name: str) -> FileAccount:
+    return read_account(path_of(name))
+
+
+def told_in(name: str) -> list[Event]:
+    return account_of(name).account.take(0)[0]
+
+
+def time_of(event: Event) -> float:
+    """Return the time since boot; of a jump, which is told when it has ended, that of the last message before it."""
+    time = event.numbers["begin"] if event.kind == "jump" else event.boot
+    assert time is not None
+    return time
+
+
+def without_flapping(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:
+    """Yield the rows that are told, each with the number of changes that it stands for."""
+    times: dict[tuple[str, ...], list[float]] = {}
+    untold: dict[tuple[str, ...], list[Row]] = {}
+    limit, window, pause = FLAPPING
+    for row in rows:
+        key = (row["kind"], *row["numbers"].get("flags", ()))
+        if key in untold and row["t"] - untold[key][-1]["t"] > pause:
+            yield untold[key][-1], len(untold.pop(key))
+        before = times.setdefault(key, [])
+        is_fast = row["change"] != "once" and len(before) >= limit and row["t"] - before[-limit] < window
+        before.append(row["t"])
+        if is_fast:
+            untold.setdefault(key, []).append(row)
+        else:
+            yield row, 1
+    for left in untold.values():
+        yield left[-1], len(left)
+
+
+def is_same(row: Row, event: Event) -> bool:
+    """Return whether an event is this row: kind, change, time, flags and quantities."""
+    # The table has the first message that the velocity does not explain; a jump begins with the one before it.
+    tolerance = 0.05 if row["kind"] == "jump" else MILLISECOND
+    names = row["numbers"].get("flags", row["numbers"].get("quantities"))
+    return (
+        (row["kind"], row["change"]) == (event.kind, event.change)
+        and abs(row["t"] - time_of(event)) <= tolerance
+        and (names is None or sorted(RENAMED.get(name, name) for name in names) == sorted(event.names))
+    )
+
+
+def sizes_of(event: Event) -> Mapping[str, float]:
+    """Return the numbers as the table has them: down for up."""
+    down = {f"{name.removesuffix('up')}down": -value for name, value in event.numbers.items() if name[-2:] == "up"}
+    return {**event.numbers, **(down if event.kind == "reset" else {})}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_event_of_the_table_is_told(name: str) -> None:
+    """Nothing more, nothing less: kind, change, time within a millisecond, flags and sizes.
+
+    Meant to differ: what holds at the first message is no event, in both; a flag that changes more than four times in
+    ten seconds is told once more, when it has come to rest; PX4's older names are those of the newest layout.
+    """
+    left = list(told_in(name))
+    for row, count in without_flapping(TABLE[name]):
+        event = next((each for each in left if is_same(row, each)), None)
+        assert event is not None, f"not told: {row}"
+        left.remove(event)
+        assert ("changes that are not told" in event.text) == (count > 1), event.text
+        assert count == 1 or f"the last of {count} changes" in event.text
+        sizes = sizes_of(event)
+        for number, value in row["numbers"].items():
+            if number == "distance" and row["kind"] == "jump":
+                assert sizes[number] == pytest.approx(value, rel=0.01)
+            elif number not in ("flags", "quantities", "origin"):  # with a new origin the table gives no sizes
+                assert sizes[number] == pytest.approx(value, abs=2e-4), (number, row)
+    assert [(time_of(event), event.kind, event.text) for event in left] == []
+
+
+def test_table_is_what_its_script_makes() -> None:
+    """The file is not edited, and has every log."""
+    logs = {path.stem: path for path in LOGS.parent.glob("*/*.ulg")}
+    made = {name: events_table.rows_of(logs[name]) for name in NAMES}
+    assert set(logs) == set(NAMES)
+    assert events_table.to_json(made) == events_table.TABLE.read_text()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_numbers_are_finite(name: str) -> None:
+    """What an event tells can be written as JSON, which has no NaN."""
+    for event in told_in(name):
+        assert all(math.isfinite(number) for number in event.numbers.values()), event
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_evidence_precedes(name: str) -> None:
+    """Evidence was told before, or held at the first message; it is at most ten seconds old, or goes on."""
+    told = told_in(name)
+    for index, event in enumerate(told):
+        for each in event.evidence:
+            assert each.time <= event.time
+            earlier = [other for other in told[:index] if (other.kind, other.text) == (each.kind, each.text)]
+            since = [other for other in told[:index] if other.kind == each.kind and each.time < other.time < event.time]
+            ended = {name for other in since if other.change == "end" for name in other.names}
+            is_on = not ended.issuperset(each.names)
+            assert event.time - each.time <= 10.0 or is_on
+            begun = [other for other in told[:index] if other.kind == each.kind and other.change == "begin"]
+            assert earlier or (each.change == "begin" and not begun), f"{each.text} was never told"
+
+
+def why(name: str, *, at: float | None = None) -> list[Story]:
+    """Return the stories of a log; `at` is seconds since boot."""
+    read, told = account_of(name), told_in(name)
+    followed = read.account.vehicles["1"]
+    if at is not None:
+        at = read.times.find(str(at), told[-1])
+    return tell(told, followed.conditions.values(), topics=list(followed.messages.values()), at=at)
+
+
+def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:
+    return [(event.kind, None if event.boot is None else round(event.boot, 3)) for event in events]
+
+
+@pytest.mark.parametrize("name", ["cuav_1.16_gps_interference", "sitl_1.15_events"])
+def test_flight_without_a_fault_has_no_story(name: str) -> None:
+    """The estimate of both is good from begin to end; the start of the estimator is no fault."""
+    assert why(name) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "lacking"),
+    [
+        ("cubeorange_1.12_small", ("estimator_status_flags", "failsafe_flags")),
+        ("sitl_1.13_three_topics", ("failsafe_flags",)),
+    ],
+)
+def test_estimate_that_was_never_valid(name: str, lacking: tuple[str, ...]) -> None:
+    """Where xy was not valid in any message that is told, and the topics that would say why and are not there."""
+    only = why(name)
+    assert [(each.what, each.begin, each.until) for each in only] == [("xy and vxy not valid", None, None)]
+    assert only[0].since < 1.0
+    assert (only[0].before, only[0].lacking) == ((), lacking)
+
+
+def test_gps_loss_without_gps_messages() -> None:
+    """The log has the position and the state alone: dead reckoning precedes it, and what is missing is named."""
+    only = why("gps_loss")
+    assert [each.what for each in only] == ["xy and vxy not valid"]
+    story = only[0]
+    assert story.begin is not None
+    assert story.begin.boot == pytest.approx(27.908, abs=1e-3)
+    assert story.until is not None
+    assert story.until - story.since == pytest.approx(30.036 - 27.908, abs=1e-3)
+    assert short(story.before) == [("dead_reckoning", 23.908)]
+    assert short(story.meanwhile) == [("failsafe", 27.932), ("mode", 27.932)]
+    assert short(story.after) == [("dead_reckoning", 30.036)]
+    assert story.lacking == ("vehicle_gps_position", "estimator_status_flags", "failsafe_flags")
+
+
+def test_gps_loss_with_all_messages() -> None:
+    """With everything logged the receiver is the cause, and the position jumps when it is back."""
+    only = why("twelve_messages")
+    assert [each.what for each in only] == ["xy and vxy not valid"]
+    story = only[0]
+    assert story.until is not None
+    assert story.until - story.since == pytest.approx(48.324 - 32.444, abs=1e-3)
+    assert short(story.before) == [("gps_fix_lost", 27.392), ("few_satellites", 27.392), ("dead_reckoning", 28.444)]
+    assert short(story.meanwhile) == [
+        ("failsafe_flag", 32.468), ("failsafe", 32.48), ("mode", 32.48), ("not_fused", 34.564),
+    ]  # fmt: skip
+    assert {kind for kind, _ in short(story.after)} == {
+        "gps_fix_lost", "few_satellites", "not_fused", "dead_reckoning", "jump",
+    }  # fmt: skip
+    assert story.lacking == ()
+    assert story.topics == (
+        "estimator_status_flags", "failsafe_flags", "vehicle_gps_position", "vehicle_local_position", "vehicle_status",
+    )  # fmt: skip
+
+
+def test_what_held_at_a_moment() -> None:
+    """Asked about a moment, what held then is told, bad or not, or else what was before."""
+    assert [each.what for each in why("gps_loss", at=29.0)] == ["xy and vxy not valid", "failsafe"]
+    assert [each.what for each in why("gps_loss", at=24.0)] == ["dead reckoning"]
+    assert [each.what for each in why("gps_loss", at=36.0)] == ["failsafe"]
+
+
+def test_vehicle_that_fell() -> None:
+    """A flight whose estimate stays valid has what is to be watched: each with what precedes it."""
+    told = {(each.begin.kind, round(each.begin.boot or 0, 3)): each for each in why("nxp_v0_ekf_failure") if each.begin}
+    assert list(told) == [
+        ("estimator_fault", 74.269), ("jamming", 87.074), ("estimator_fault", 93.579), ("reset", 94.249),
+        ("failsafe_flag", 114.981), ("dead_reckoning", 116.238), ("estimator_fault", 116.609), ("reset", 118.838),
+        ("failsafe_flag", 125.482),
+    ]  # fmt: skip
+    assert short(told["reset", 118.838].before) == [("estimator_fault", 116.609), ("dead_reckoning", 118.838)]
+    assert told["reset", 118.838].what == "reset of height by 19.2 m, vz by 3.8 m/s"
+    lasted = told["dead_reckoning", 116.238]
+    assert lasted.until is not None
+    assert lasted.until - lasted.since == pytest.approx(2.6, abs=1e-3)
+    assert all(each.lacking == () for each in told.values())

@@ -1,0 +1,157 @@
+"""A night of six vehicles, scripted: each event is told once, in order, by `nedbus events`, the page, and `health`."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+from typing import Final
+
+import pytest
+from playwright.sync_api import Browser
+
+import nedbus
+from nedbus.recording import RecordingWriter
+from nedbus_msgs import BY_TOPIC, Address, Provenance
+from nedbus_msgs.codecs.arrays import arrays_of
+from tests.browser import PATIENCE, browser, open_tabs
+from tests.command_line import run_command
+from tests.messages import VALID, VLP
+from tests.ports import free_port
+from tests.processes import Process, Start
+from tests.waits import wait_for
+
+__all__ = ["browser"]  # a fixture
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
+GPS: Final = "vehicle_gps_position"
+VEHICLES: Final = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot")
+SECONDS: Final = 150
+RATE: Final = 10  # Hz
+
+# What the recording has: seconds after its begin, and what is told of whom.
+TOLD: Final = [
+    ("alpha", "gps_fix_lost", "begin"), ("alpha", "few_satellites", "begin"), ("alpha", "dead_reckoning", "begin"),
+    ("alpha", "xy_invalid", "begin"), ("alpha", "v_xy_invalid", "begin"), ("alpha", "gps_fix_lost", "end"),
+    ("alpha", "few_satellites", "end"), ("alpha", "xy_invalid", "end"), ("alpha", "v_xy_invalid", "end"),
+    ("alpha", "dead_reckoning", "end"), ("bravo", "reset", "once"), ("charlie", "silent", "begin"),
+    ("charlie", "silent", "end"), ("delta", "reboot", "once"), ("echo", "rejected", "begin"),
+    ("echo", "rejected", "end"),
+]  # fmt: skip
+CUT: Final = [("*", "link_down", "begin"), ("*", "link_down", "end")]
+HELD_UP: Final = [("*", "overload", "begin"), ("*", "overload", "end")]
+
+
+def fields_of(vehicle: str, second: float) -> dict[str, object] | None:
+    """Return a position of the script, None while the vehicle is silent."""
+    fields: dict[str, object] = {**VALID, "x": 0.0, "y": 0.0}
+    if vehicle == "alpha" and 4.0 <= second < 9.0:
+        fields["dead_reckoning"] = True
+        fields["xy_valid"] = fields["v_xy_valid"] = second < 5.0
+    if vehicle == "bravo" and second >= 10.0:
+        fields |= {"x": 3.1, "y": 0.4, "xy_reset_counter": 1, "delta_xy": (3.1, 0.4)}
+    if vehicle == "charlie" and 11.0 <= second < 16.0:
+        return None
+    return fields
+
+
+def write_night(path: Path) -> None:
+    """Record the script: positions of all, and the GNSS receiver of one."""
+    position, gps = BY_TOPIC[VLP], BY_TOPIC[GPS]
+    start = 1_700_000_000_000_000_000
+    with RecordingWriter(path) as writer:
+        for number in range(SECONDS * RATE):
+            second = number / RATE
+            logged = [start + round(second * 1e9)]
+            for vehicle in VEHICLES:
+                booted = 17.0 if vehicle == "delta" and second >= 17.0 else -100.0  # s of the script
+                stamp = round((second - booted) * 1e6) + 1_000_000
+                if vehicle == "alpha":
+                    has_fix = not 3.0 <= second < 8.0
+                    message = gps.model(timestamp=stamp, fix_type=3 * has_fix, satellites_used=12 * has_fix)
+                    address = Address(vehicle, GPS)
+                    writer.write(
+                        arrays_of(gps).of([message]),
+                        gps,
+                        [(address, Provenance("sim"))],
+                        logged=logged,
+                        published=logged,
+                    )
+                fields = fields_of(vehicle, second)
+                if fields is None:
+                    continue
+                array = arrays_of(position).of([position.model(timestamp=stamp, **fields)])
+                if vehicle == "echo" and 19.0 <= second < 19.3:
+                    array["x"] = float("nan")  # while xy is valid: no service publishes that
+                writer.write(
+                    array, position, [(Address(vehicle, VLP), Provenance("sim"))], logged=logged, published=logged
+                )
+
+
+def told_by(process: Process) -> list[tuple[str, str, str]]:
+    events = [json.loads(line) for line in process.out.splitlines()]
+    return [(event["vehicle"], event["kind"], event["change"]) for event in events]
+
+
+def wait_for_event(process: Process, vehicle: str, kind: str, change: str) -> None:
+    wait_for(lambda: (vehicle, kind, change) in told_by(process), what=f"{vehicle} {kind} {change}", seconds=PATIENCE)
+
+
+def freeze(process: Process, subscription: nedbus.Subscription, messages: int) -> None:
+    """Stop a process for as long as a vehicle sends this many messages."""
+    process.signal(signal.SIGSTOP)
+    try:
+        for _ in range(messages):
+            subscription.receive(timeout=PATIENCE)
+    finally:
+        process.signal(signal.SIGCONT)
+
+
+def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browser, tmp_path: Path) -> None:
+    """Six vehicles of a recording that a service replays to readers of other processes: a command, a page, a test.
+
+    A service, two readers and a router, each a process. GPS is lost, an estimate is reset, a vehicle is silent, one
+    reboots, one sends what is rejected; then the router is stopped and started again, and both readers are held up.
+    """
+    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    write_night(tmp_path / "night.mcap")
+    router = run_nedbus("router", "--listen", endpoint)
+    wait_for(lambda: "router on" in router.err, what="the router")
+    events = run_nedbus("events", "--connect", endpoint, "--json")
+    web = run_nedbus("web", "--connect", endpoint, "--listen", f"127.0.0.1:{port}")
+    wait_for(lambda: "open http" in web.err, what="the page")
+    with open_tabs(browser, may_complain=True) as make:
+        page = make(width=1280, height=800)
+        page.open(f"http://127.0.0.1:{port}")
+        run_nedbus("serve", "--connect", endpoint, "-s", f"mcap:{tmp_path / 'night.mcap'}")
+        wait_for_event(events, *TOLD[-1])
+        assert told_by(events) == TOLD
+        told = json.loads(run_command("why", "-c", endpoint, "--vehicle", "alpha", "--json").out)
+        assert told["what"] == "xy and vxy not valid"
+        assert [each["kind"] for each in told["before"]] == ["gps_fix_lost", "few_satellites", "dead_reckoning"]
+        router.signal(signal.SIGTERM)
+        router.wait()
+        wait_for_event(events, *CUT[0])
+        router = run_nedbus("router", "--listen", endpoint)
+        wait_for_event(events, *CUT[1])
+        with (
+            nedbus.connect(endpoint, timeout=PATIENCE) as bus,
+            bus.subscribe(vehicle="foxtrot", mode="every") as follow,
+        ):
+            follow.receive(timeout=PATIENCE)
+            freeze(events, follow, 4 * RATE)
+            freeze(web, follow, 4 * RATE)
+            wait_for_event(events, *HELD_UP[1])
+        assert told_by(events) == [*TOLD, *CUT, *HELD_UP]
+        shown = [each for each in (*TOLD, *CUT, *HELD_UP) if each[2] != "end"]
+        wait_for(lambda: len(page.rows("who")) >= len(shown), what="all events on the page", seconds=PATIENCE)
+        marks = sorted(page.rows("who"), key=lambda mark: mark["time"])
+        assert [mark["who"] for mark in marks] == [vehicle for vehicle, *_ in shown]
+    shown_health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))
+    assert shown_health.exit_code == 1
+    faults = [line.partition(": ")[2] for line in shown_health.err.splitlines()]
+    assert [fault.partition(":")[0].removeprefix("vehicle ") for fault in faults[:-1]] == [
+        vehicle for vehicle, _, change in TOLD if change != "end"
+    ]
+    assert "no link to" in faults[-1]
