@@ -722,7 +722,7 @@ def test_page_outlives_the_router() -> None:
         assert page.marks["wing"]["fill"] == DARK.ground
         router = open_router(listen=(where,))
         until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
-        assert "no link to" not in page.part("head")
+        until(lambda: "no link to" not in page.part("head"), "the header to say so")
         told = [event.text.partition(" after")[0] for event in page.viewer._world.events if event.kind == "link_down"]
         assert told == [f"no link to {where}", "link is back"]
     router.close()
