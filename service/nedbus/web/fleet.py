@@ -262,10 +262,10 @@ def places_at(stream: Stream | None, times: Sequence[float]) -> list[Place | Non
         points = points[points[:, 1] == points[:, 1]]  # those with a valid position
         if not len(points):
             continue
-        first = points[0, 0]
-        for index, at in enumerate(points[:, 0].searchsorted([time * 1e3 for time in times]).tolist()):
-            if first <= times[index] * 1e3:
-                row = points[min(at, len(points) - 1)]
+        after = points[:, 0].searchsorted([time * 1e3 for time in times], side="right").tolist()
+        for index, at in enumerate(after):
+            if at > 0:  # where it was valid last
+                row = points[at - 1]
                 found[index] = Place(float(row[1]), float(row[2]), math.nan, True)
     return found
 

@@ -109,7 +109,7 @@ button { font: inherit; background: var(--panel); border: 1px solid var(--line);
 button[aria-pressed=true] { background: var(--chosen); }
 button:focus-visible, .row:focus-visible { outline: 2px solid var(--text); outline-offset: -2px; }
 .row { display: grid; grid-template-columns: 12px minmax(80px, 1fr) minmax(0, 1.9fr)
-  58px minmax(0, 0.9fr) 42px 82px;
+  62px minmax(0, 0.9fr) 44px 82px;
   gap: 0 6px; padding: 3px 5px; border-radius: 5px; cursor: pointer; align-items: center; }
 .row > * { overflow: hidden; text-overflow: ellipsis; white-space: nowrap; }
 .row.titles { cursor: default; color: var(--quiet); font-size: 11px; position: sticky; top: 0;
@@ -131,11 +131,11 @@ input, .bk-input { background: var(--panel); color: var(--text); border-color: v
 .bk-input-group > label, .noUi-handle, .bk-slider-title { color: var(--text); }
 .bk-btn { background: var(--panel) !important; color: var(--text) !important; border-color: var(--line) !important; }
 @media (max-width: 800px) {
-  .row { grid-template-columns: 12px minmax(84px, 1fr) minmax(0, 1.6fr) 60px 44px; }
+  .row { grid-template-columns: 12px minmax(84px, 1fr) minmax(0, 1.6fr) 62px 44px; }
   .row .mode, .row .gps { display: none; } button { padding: 5px 11px; }
 }
-@media (max-width: 1500px) and (min-width: 801px) {
-  .row { grid-template-columns: 12px minmax(84px, 1fr) minmax(0, 1.4fr) 60px 44px; }
+@media (max-width: 1850px) and (min-width: 801px) {
+  .row { grid-template-columns: 12px minmax(84px, 1fr) minmax(0, 1.4fr) 62px 44px; }
   .row .mode, .row .gps { display: none; }
 }
 """

@@ -42,6 +42,7 @@ class Timeline:
         """Show what happened from `begin` to `end` [s]; `vehicles`: the most important first."""
         shown = [event for event in told if begin <= event.time <= end and is_notable(event)]
         affected = {event.vehicle for event in shown if event.severity != "info"}
+        affected |= {name for name in vehicles if any(_is_shown(span, begin) for span in spans.get(name, ()))}
         names = [name for name in vehicles[:1] if name]
         names += [name for name in vehicles if name in affected and name not in names]
         names = [*([ALL] if ALL in affected else []), *names][:_ROWS]
@@ -58,12 +59,7 @@ class Timeline:
                 for event in self.shown
             ],
         )  # fmt: skip
-        held = [
-            (span, rows[name])
-            for name in names
-            for span in spans.get(name, ())
-            if span.severity != "info" and span.since != span.until and (span.until is None or span.until > begin)
-        ]
+        held = [(span, rows[name]) for name in names for span in spans.get(name, ()) if _is_shown(span, begin)]
         held.sort(key=lambda each: each[0].severity == "bad")
         ends = [min(end, now if span.until is None else span.until) for span, _ in held]
         bars = zip(held, ends, strict=True)
@@ -104,3 +100,7 @@ class Timeline:
 def is_notable(event: Event) -> bool:
     """Return whether an event is shown: what is bad or to be watched, and what a flight consists of."""
     return event.severity != "info" or event.kind in NOTABLE
+
+
+def _is_shown(span: Span, begin: float) -> bool:
+    return span.severity != "info" and span.since != span.until and (span.until is None or span.until > begin)
