@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Account, Event, Times, spans_of, state_at, tell
+from nedbus.events import Account, Event, Times, about, report_of, spans_of, state_at, tell
 from nedbus_msgs import Address
 from tests.messages import VALID, VLP
 
@@ -141,3 +141,43 @@ def test_jamming_at_first_is_a_state(sent: Sent) -> None:
     other = Sent()
     other(0.0, "vehicle_gps_position", **{**GPS, "fix_type": 0, "satellites_used": 0})
     assert other.state(0.0) == "info"
+
+
+def test_what_holds_from_first_to_last_is_the_state_at_any_time(sent: Sent) -> None:
+    """A recording of a vehicle that never was valid shows it as bad all along, as live it would be."""
+    for second in range(5):
+        sent(float(second), xy_valid=False)
+    state = state_at(spans_of(list(sent.account.events), sent.account.vehicles["1"].initial), 3.0)
+    assert (state.severity, state.text) == ("bad", "xy not valid")
+    assert [each.initial for each in state.conditions] == [True]
+
+
+def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
+    """Of two things within a minute each has its own story, and an end has that of its begin."""
+    sent(0.0)
+    sent(1.0, timestamp=1_000_000)
+    sent(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
+    sent(2.0, timestamp=2_000_000, xy_reset_counter=1, x=3.0, y=4.0, xy_valid=False)
+    sent(3.0, timestamp=3_000_000, xy_reset_counter=1, x=3.0, y=4.0)
+    events = list(sent.account.events)
+    stories = {(event.kind, event.change): about(event, events) for event in events}
+    told = {key: story.what for key, story in stories.items() if story is not None}
+    assert told["reset", "once"].startswith("reset of xy by 5.0 m")
+    assert told["reboot", "once"].startswith("rebooted")
+    assert told["xy_invalid", "end"] == told["xy_invalid", "begin"] == "xy not valid"
+    assert about(Event("1", "jump", "once", "watch", "", 9.0), events) is None
+
+
+def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
+    """What a service remembers of one is answered though another has had hundreds of events since."""
+    account = Account()
+    quiet, noisy = Address("quiet", VLP), Address("noisy", VLP)
+    for second, valid in enumerate((True, False, True)):
+        account.add(quiet, {**VALID, "timestamp": (second + 1) * 10**6, "xy_valid": valid}, float(second))
+    for number in range(900):
+        fields = {**VALID, "timestamp": (number + 1) * 10**6, "xy_reset_counter": number % 256}
+        account.add(noisy, fields, 10.0 + number)
+    answered = report_of(account, "s", "h", 1000.0, within=2000.0).events
+    assert [event.kind for event in answered if event.vehicle == "quiet"] == ["xy_invalid", "xy_invalid"]
+    assert 100 < len(answered) <= 300
+    assert [event.time for event in answered] == sorted(event.time for event in answered)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,11 +18,13 @@ import pytest
 import nedbus
 from nedbus.daemon import Daemon
 from nedbus.settings import load_settings
+from nedbus.transport import Session
 from nedbus_msgs import Address
 from tests.command_line import Ended, run_command
 from tests.messages import VALID, VLP, message
 from tests.ports import free_port
 from tests.processes import Start
+from tests.service.answering import answering, reply_with
 from tests.ulogs import UlogWriter
 from tests.waits import DEADLINE, wait_for
 
@@ -180,6 +183,8 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
     ("arguments", "text"),
     [
         (("--expect", "1,a b"), "nedbus: vehicle 'a b' is not valid"),
+        (("--expect", ""), "nedbus: --expect: names nothing"),
+        (("--valid", " , "), "nedbus: --valid: names nothing"),
         (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected some of xy, z, vxy, vz\n"),
     ],
 )
@@ -189,3 +194,25 @@ def test_wrong_expectation_is_explained(health: Judge, arguments: tuple[str, ...
     assert shown.exit_code == 2
     assert shown.err.startswith(text)
     assert len(shown.err.splitlines()) == 1
+
+
+def test_old_replay_is_no_silence_of_now(endpoint: str, bus: nedbus.Bus) -> None:
+    """Who begins to follow a service whose replay ended long ago hears its last message, and tells nothing of it."""
+    with serving(endpoint, "sim:?duration=0.1"):
+
+        def is_old() -> bool:
+            return any(sample.latency is not None and sample.latency > 3.5 for sample in bus.latest("*"))
+
+        wait_for(is_old, what="the last message to be old")
+        shown = run_command("events", "-c", endpoint, "--duration", "4")
+        assert shown.out == ""
+
+
+def test_service_that_keeps_no_account_is_a_fault(endpoint: str, raw: Session, health: Judge) -> None:
+    """An older service answers its status whatever is asked: what is expected of its vehicles is not known to hold."""
+    key, status = "nedbus/@service/old/status", {"service": "old", "host": socket.gethostname(), "sources": []}
+    with answering(raw, key, reply_with({key: json.dumps(status).encode()}, encoding="application/json")):
+        for option in ("--valid", "xy"), ("--within", "60"):
+            shown = health("--services", "1", *option)
+            assert shown.exit_code == 1
+            assert "service old does not say what happens to its vehicles: update nedbus there" in shown.err

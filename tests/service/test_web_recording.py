@@ -14,10 +14,10 @@ from nedbus.errors import NedbusError
 from nedbus.recording import RecordingWriter
 from nedbus.web.fleet import TRUTH
 from nedbus.web.playback import Player, Recording
-from nedbus_msgs import Address, Provenance
+from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleAttitude
-from tests.messages import VLP
+from tests.messages import VALID, VLP, message
 from tests.waits import wait_for
 from tests.web import Shown, write_flight
 
@@ -249,3 +249,26 @@ def test_damaged_recording_is_an_error(tmp_path: Path) -> None:
     file.write_bytes(b"nothing")
     with pytest.raises(NedbusError, match=r"flight\.ulg"):
         Recording(file)
+
+
+def test_jump_keeps_vehicles_that_are_silent_by_then(tmp_path: Path, clock: SimpleNamespace) -> None:
+    """One that fell silent long before has its row, its state and its last valid place, as without a jump."""
+    file = tmp_path / "silent.mcap"
+    with RecordingWriter(file) as writer:
+        for second in range(120):
+            for vehicle in ("here", "silent"):
+                if vehicle == "here" or second < 20:
+                    sent = message(1_000_000 * (second + 1), **VALID | {"x": 7.0, "xy_valid": second < 15})
+                    stamps = [1_700_000_000_000_000_000 + second * 10**9]
+                    stream = [(Address(vehicle, VLP), Provenance("sim"))]
+                    writer.write(to_array([sent]), DEFAULT, stream, logged=stamps, published=stamps)
+    recording = Recording(file)
+    wait_for(lambda: recording.is_read, what="the recording")
+    player = Player(recording)
+    player.jump(119.0)
+    rows = {row.vehicle: row for row in player.fleet.picture.rows}
+    assert {name: row.grade for name, row in rows.items()} == {"here": "bad", "silent": "bad"}
+    assert rows["silent"].text.startswith("silent")
+    assert {row.where.partition(",")[0] for row in rows.values()} == {"7.0 m north"}
+    silent = next(event for event in recording.chronicle.events if event.kind == "silent")
+    assert 22.0 <= silent.time <= 24.0

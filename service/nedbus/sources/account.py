@@ -10,7 +10,7 @@ from typing import Final, cast
 from nedbus import recording
 from nedbus.errors import InvalidMessageError
 from nedbus.events import Account, Times
-from nedbus_msgs import BY_TOPIC, codec_of, upgrade_fields
+from nedbus_msgs import BY_TOPIC, Address, codec_of, upgrade_fields
 
 from .source import ReplaySource, SourceMessage
 from .spec import parse_source, source_text_of_file
@@ -42,12 +42,14 @@ def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
     account, due = Account(KEPT_OF_FILE), 0.0
     for message, _, _ in follow(run.messages, account):
         due = message.due
-    offsets = {}
-    for name in {address.vehicle for address in run.addresses}:
-        utc = recording.utc_of(path, vehicle=name)
-        if utc is not None:
-            offsets[name] = utc.offset_us / 1e6
-    return FileAccount(account, Times(offsets=offsets), due, run.warnings)
+    return FileAccount(account, times_of(path, run.addresses), due, run.warnings)
+
+
+def times_of(path: Path, addresses: Iterable[Address]) -> Times:
+    """Return how the times of a file are told: in UTC for each vehicle whose messages tell it."""
+    vehicles = {address.vehicle for address in addresses}
+    told = {name: recording.utc_of(path, vehicle=name) for name in vehicles}
+    return Times(offsets={name: utc.offset_us / 1e6 for name, utc in told.items() if utc is not None})
 
 
 def follow(

@@ -12,12 +12,19 @@ from typing import Any, Final, NamedTuple, cast
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
-from nedbus import recording
 from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import Account, Times, state_at
 from nedbus.log_event import about
-from nedbus.sources import KEPT_OF_FILE, ReplaySource, SourceMessage, follow, parse_source, source_text_of_file
+from nedbus.sources import (
+    KEPT_OF_FILE,
+    ReplaySource,
+    SourceMessage,
+    follow,
+    parse_source,
+    source_text_of_file,
+    times_of,
+)
 from nedbus_msgs import BY_TOPIC, Address, codec_of
 
 from .chronicle import Chronicle, to_elapsed
@@ -71,17 +78,13 @@ class Recording:
 
     def _read(self) -> None:
         try:
-            self._find_start()
+            self.chronicle.times = times_of(self._path, self._run.addresses)
             for message, reason, payload in follow(self._run.messages, self.account):
                 self._add(message, reason, payload)
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))
-        self.is_read = True
-
-    def _find_start(self) -> None:
-        vehicles = {address.vehicle for address in self._run.addresses}
-        offsets = {name: utc for name in vehicles if (utc := recording.utc_of(self._path, vehicle=name)) is not None}
-        self.chronicle.times = Times(offsets={name: utc.offset_us / 1e6 for name, utc in offsets.items()})
+        finally:
+            self.is_read = True
 
     def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
         address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
