@@ -53,7 +53,7 @@ wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and 
 bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck readers, pacing of a replay, an idle service
 	$(BIN)/pip install -q --group bench
 	$(BIN)/python -m benchmarks.compare
-	$(BIN)/python -m benchmarks.picture
+	$(BIN)/python -m benchmarks.compare.picture
 	$(BIN)/python -m benchmarks.scale
 	$(BIN)/python -m benchmarks.load
 	$(BIN)/python -m benchmarks.record --seconds 60

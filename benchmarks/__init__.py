@@ -1,1 +1,1 @@
-"""What is measured: run them with `make bench`."""
+"""Measurements: run them with `make bench`."""

@@ -41,7 +41,7 @@ def measure(form: str, script: str, seconds: int) -> str:
     with router() as (_, endpoint):
         reader = start("-m", "benchmarks.busy_reader", form, script, endpoint)
         sender = "raw" if form.startswith("raw") else "rows"
-        publisher = start("-m", "benchmarks.role", sender, "publish", endpoint, str(sent), str(RATE))
+        publisher = start("-m", "benchmarks.compare.role", sender, "publish", endpoint, str(sent), str(RATE))
         try:
             expect(reader)
             expect(publisher)

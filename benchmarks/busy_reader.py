@@ -18,8 +18,8 @@ import zenoh
 
 import nedbus
 
-from .forms.nedbus_ends import TOPIC
-from .forms.zenoh_session import KEY, open_session
+from .compare.nedbus_ends import TOPIC
+from .compare.zenoh_session import KEY, open_session
 
 QUIET = 1.0  # s without a message after which nothing more comes
 PATIENCE = 5.0  # s after the last was sent, whatever is still to come
@@ -30,7 +30,7 @@ Counts = Callable[[], dict[str, int]]
 
 @dataclass
 class Ages:
-    """How old messages were, in ns, and how much the script has computed meanwhile."""
+    """Age of messages in ns, and the work that the script did meanwhile."""
 
     ages: list[int] = field(default_factory=list)
     steps: int = 0

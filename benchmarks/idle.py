@@ -1,4 +1,4 @@
-"""What a service with one simulated vehicle costs while nobody reads, and with one reader of everything.
+"""CPU time of a service with one simulated vehicle while nobody reads, and with one reader of everything.
 
 The bars: below 10 % of a core and below 120 MB.
 """

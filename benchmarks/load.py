@@ -16,7 +16,7 @@ VEHICLES = 10
 
 PLAN = """
 import sys, time
-from benchmarks.forms.fields import PROVIDED
+from benchmarks.compare.fields import PROVIDED
 vehicles, seconds, endpoint = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 STREAMS = {"vehicle_local_position": 1, "vehicle_local_position_groundtruth": 2, "external_ins_local_position": 2,
            "estimator_local_position/0": 50, "estimator_local_position/1": 50}  # every how many ticks of 10 ms
@@ -36,7 +36,7 @@ def play(send):
     sys.stdin.readline()
 """
 RAW_PUBLISHER = """
-from benchmarks.forms.zenoh_session import open_session
+from benchmarks.compare.zenoh_session import open_session
 session = open_session(endpoint)
 publishers = {(v, s): session.declare_publisher(f"raw/{v}/{s}") for v in range(vehicles) for s in STREAMS}
 payload = bytes(244)
@@ -45,7 +45,7 @@ session.close()
 """
 RAW_READER = """
 import sys, zenoh
-from benchmarks.forms.zenoh_session import open_session
+from benchmarks.compare.zenoh_session import open_session
 session = open_session(sys.argv[1])
 subscriber = session.declare_subscriber("raw/**", zenoh.handlers.FifoChannel(1024))
 print("ready", flush=True)

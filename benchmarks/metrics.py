@@ -1,4 +1,4 @@
-"""What metrics cost: the time of a page with 200 streams, and what a scrape every second takes from publishing.
+"""Costs of metrics: the time of a page with 200 streams, and what a scrape every second takes from publishing.
 
 The bars: /metrics with 200 streams in under 50 ms (the median of 20 requests), and less than 2 % of effect on what is
 published: on its rate, and on the CPU time of the threads that publish, for each message.
@@ -28,7 +28,7 @@ _PUBLISHED: Final = "nedbus_messages_published_total{"
 
 
 class Turn(NamedTuple):
-    """What was measured in some seconds: messages a second, and CPU time of the threads that publish [us/message]."""
+    """Measurement of some seconds: messages a second, and CPU time of the threads that publish [us/message]."""
 
     rate: float
     cpu: float

@@ -17,7 +17,7 @@ from tests.ulogs import write_log
 
 import nedbus
 
-from .forms.fields import FIELDS
+from .compare.fields import FIELDS
 
 ENDPOINT = "tcp/127.0.0.1:17461"
 PERIOD = 10_000  # us

@@ -18,7 +18,7 @@ from typing import Final
 import psutil
 from mcap.reader import make_reader
 
-from .fleet_at_once import RATE
+from .fleet import RATE
 from .processes import Process, end, expect, router, start, tell
 
 SAMPLES: Final = 20  # of the memory
@@ -37,7 +37,7 @@ def main() -> None:
             command = [sys.executable, "-m", "nedbus", "record", "-c", endpoint, "-o", str(path)]
             recorder = subprocess.Popen(command, stderr=errors)
         publisher = start(
-            "-m", "benchmarks.fleet_at_once", str(arguments.vehicles), str(arguments.seconds), endpoint, "noise"
+            "-m", "benchmarks.fleet", str(arguments.vehicles), str(arguments.seconds), endpoint, "noise"
         )  # fmt: skip
         try:
             record(recorder, publisher, path, sent=arguments.vehicles * arguments.seconds * RATE)

@@ -13,7 +13,7 @@ import time
 
 import psutil
 
-from .fleet_at_once import RATE
+from .fleet import RATE
 from .processes import end, expect, router, start, tell
 
 READER = """
@@ -64,7 +64,7 @@ def measure(vehicles: int, readers: int, seconds: int, way: str) -> str:
         taking = [start("-c", READER, way, endpoint) for _ in range(readers)]
         for reader in taking:
             expect(reader)
-        publisher = start("-m", "benchmarks.fleet_at_once", str(vehicles), str(seconds), endpoint)
+        publisher = start("-m", "benchmarks.fleet", str(vehicles), str(seconds), endpoint)
         expect(publisher)
         time.sleep(1.0)
         processes = [psutil.Process(process.pid) for process in (publisher, routing, taking[0])]

@@ -86,7 +86,7 @@ def measure(case: str, habit: str, seconds: int, *, rate: int, messages: int) ->
 
 
 def _publisher(endpoint: str, count: int, rate: int, vehicle: str) -> Process:
-    return start("-m", "benchmarks.role", "rows", "publish", endpoint, str(count), str(rate), vehicle)
+    return start("-m", "benchmarks.compare.role", "rows", "publish", endpoint, str(count), str(rate), vehicle)
 
 
 def _describe(stuck: dict[str, Any], healthy: dict[str, Any], sent: dict[str, int], stuck_reads: str) -> list[str]:

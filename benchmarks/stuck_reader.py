@@ -18,7 +18,7 @@ from typing import Final
 
 import nedbus
 
-from .forms.nedbus_ends import TOPIC
+from .compare.nedbus_ends import TOPIC
 
 QUIET: Final = 3.0  # s without a message after which nothing more comes
 PATIENCE: Final = 60.0  # s for it
@@ -27,7 +27,7 @@ PAUSE: Final = 1.0  # s between two messages of a reader that is slow
 
 @dataclass
 class Got:
-    """What came of one vehicle: `gap` is the longest time without a message, in s."""
+    """Messages of one vehicle: `gap` is the longest time without a message, in s."""
 
     received: int = 0
     last: float = 0.0

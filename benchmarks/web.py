@@ -30,7 +30,7 @@ FLEET: Final = """
 import math, sys, time
 import numpy as np
 import nedbus
-from benchmarks.forms.fields import FIELDS
+from benchmarks.compare.fields import FIELDS
 from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE
 from tests.first_message import encode_array
 vehicles, rate, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
@@ -148,7 +148,7 @@ def _serve(endpoint: str) -> tuple[Process, str]:
 
 
 def _open(browser: Browser, url: str, vehicles: int) -> Page:
-    """Open a page of its own, and wait until so many vehicles are on it."""
+    """Open a page of its own, and wait until it lists `vehicles` vehicles."""
     page = browser.new_page(viewport={"width": 1600, "height": 950})
     page.set_default_timeout(PATIENCE * 1e3)
     page.add_init_script(COUNT)

@@ -1,4 +1,4 @@
-"""How far is each EKF instance from the truth? Every message counts here, so the mode is "every"."""
+"""Distance of each EKF instance from the ground truth. Every message counts here, so the mode is "every"."""
 
 import math
 from contextlib import suppress

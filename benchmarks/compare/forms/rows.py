@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import nedbus
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS, PROVIDED
+from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 
 from . import fields_in
-from .case import Case
-from .fields import FIELDS, PROVIDED
-from .nedbus_ends import open_publishers, open_subscription
 
 Send = Callable[[int], None]
 

@@ -1,4 +1,4 @@
-"""What nedbus must reach, each as a ratio of two forms in one run, and what was measured."""
+"""Bars of nedbus, each as a ratio of two forms in one run, and what was measured."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from .forms.fields import COMPLETE
+from .fields import COMPLETE
 from .results import FULL, KHZ, TEN, Load, Results
 
 

@@ -1,4 +1,4 @@
-"""What the forms of nedbus share: the publishers of all vehicles, and a subscription to every sample."""
+"""Ends that all forms of nedbus share: the publishers of all vehicles, and a subscription to every sample."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 import msgpack
 import zmq
 
-from .case import Case
-from .fields import FIELDS
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
 
 PACKAGES = ["pyzmq==27.3.0", "msgpack==1.2.4"]
 

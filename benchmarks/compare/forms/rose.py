@@ -8,9 +8,9 @@ import msgspec
 from rose import Message
 from rose.node import Publisher, Subscriber
 
-from .case import Case
-from .fields import FIELDS
-from .zenoh_session import KEY, open_session
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.zenoh_session import KEY, open_session
 
 PACKAGES = ["rose-py==0.1.6"]
 

@@ -9,10 +9,11 @@ import platform
 import re
 from typing import Final
 
+from benchmarks.processes import ROOT
+
 from .bars import judge
-from .forms.fields import DEFAULT_FLIGHT, FLIGHTS
+from .fields import DEFAULT_FLIGHT, FLIGHTS
 from .peers import CORE, title
-from .processes import ROOT
 from .results import FULL, KHZ, LOADS, SLOW, TEN, Measured, Results
 
 RESULTS: Final = ROOT / "docs" / "performance.json"

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 
 import zenoh
 
-from .case import Case
-from .zenoh_session import declare_publishers, key, open_session
+from benchmarks.compare.case import Case
+from benchmarks.compare.zenoh_session import declare_publishers, key, open_session
 
 SIZE = 244
 

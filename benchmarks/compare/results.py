@@ -1,4 +1,4 @@
-"""What was measured in all rounds, with medians and ratios; and the loads that are measured."""
+"""Results of all rounds, with medians and ratios; and the loads that are measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Measured = dict[str, float]
 
 @dataclass(frozen=True)
 class Load:
-    """How messages are sent: `rate` of each vehicle in Hz, 0 for as fast as possible; `messages` of all together."""
+    """Load of a run: `rate` of each vehicle in Hz, 0 for as fast as possible; `messages` of all together."""
 
     name: str
     rate: int

@@ -11,8 +11,8 @@ from typing import Any
 
 import lcm
 
-from .case import Case
-from .fields import FIELDS
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
 
 PACKAGES = ["lcm==1.5.3"]
 

@@ -1,5 +1,6 @@
-"""One end of a measurement: python -m benchmarks.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...].
+"""One end of a measurement.
 
+Run it as `python -m benchmarks.compare.role FORM publish|receive ENDPOINT COUNT RATE [VEHICLE,VEHICLE...]`.
 COUNT messages of all vehicles together, RATE of each in Hz, 0 for as fast as possible; all vehicles send at once.
 It prints "ready", waits for a line, works, and prints what it measured as JSON.
 """
@@ -17,7 +18,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, cast
 
-from .forms.case import Case
+from .case import Case
 
 QUIET = 3.0  # s without a message after which a receiver gives up
 
@@ -25,7 +26,7 @@ Send = Callable[[Any], None]
 
 
 class Form(Protocol):
-    """A module of benchmarks.forms."""
+    """A module of benchmarks.compare.forms."""
 
     def publish(self, case: Case) -> AbstractContextManager[list[Send]]: ...
     def receive(self, case: Case, ready: Callable[[], None], seen: Callable[[Any], bool]) -> None: ...
@@ -34,7 +35,7 @@ class Form(Protocol):
 def main() -> None:
     """Play the role that the arguments name."""
     form_name, role, endpoint, count, rate, *vehicles = sys.argv[1:7]
-    form = cast("Form", importlib.import_module(f"benchmarks.forms.{form_name}"))
+    form = cast("Form", importlib.import_module(f"benchmarks.compare.forms.{form_name}"))
     chosen = tuple(vehicles[0].split(",")) if vehicles else ("1",)
     play = publish if role == "publish" else receive
     play(form, Case(endpoint, chosen, paced=float(rate) > 0), int(count), float(rate))

@@ -1,4 +1,4 @@
-"""What a form is told about one run."""
+"""Parameters of one run of a form."""
 
 from dataclasses import dataclass
 
@@ -18,10 +18,10 @@ class Case:
 
     @property
     def lossless(self) -> bool:
-        """Whether a publisher waits for its readers: a live one never does."""
+        """True if publishers wait for their readers: live ones never do."""
         return not self.paced
 
     @property
     def vehicle(self) -> str:
-        """What a reader subscribes to: the only vehicle, or all of them."""
+        """Vehicle that a reader subscribes to: the only one, or all of them."""
         return self.vehicles[0] if len(self.vehicles) == 1 else "*"

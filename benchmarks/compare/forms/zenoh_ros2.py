@@ -10,8 +10,8 @@ import numpy as np
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosHistoryKind, QosProfile
 
-from .case import Case
-from .fields import FIELDS
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
 
 PACKAGES = ["zenoh-ros2-sdk==0.1.8"]
 

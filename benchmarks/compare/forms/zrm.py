@@ -10,9 +10,9 @@ import zrm
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
-from .case import Case
-from .fields import FIELDS
-from .zenoh_session import KEY
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.zenoh_session import KEY
 
 PACKAGES = ["zrm==3.1.2"]
 

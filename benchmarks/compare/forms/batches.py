@@ -6,12 +6,12 @@ from contextlib import contextmanager
 import numpy as np
 
 import nedbus
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 from nedbus_msgs.arrays import to_array
 
 from . import rows
-from .case import Case
-from .fields import FIELDS
-from .nedbus_ends import open_publishers, open_subscription
 
 BATCH = 1000  # messages that are sent at once, where they are not paced
 

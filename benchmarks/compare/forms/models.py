@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import nedbus
-
-from .case import Case
-from .fields import PROVIDED
-from .nedbus_ends import open_publishers, open_subscription
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import PROVIDED
+from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 
 Send = Callable[[int], None]
 

@@ -1,6 +1,6 @@
 """nedbus beside its peers, in one run: python -m benchmarks.compare [--rounds N].
 
-Each form of benchmarks/forms sends the same 53 fields from one process to another, through one router where it uses
+Each form of `forms` sends the same 53 fields from one process to another, through one router where it uses
 Zenoh: as fast as it can without losing any, then at 1 kHz and at 100 Hz; some with ten vehicles in one process, and
 with the messages of other flights.
 Rounds are interleaved, and medians taken, as machines are shared and noisy; only the ratios of one run mean something.
@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from benchmarks.processes import router
+
 from .bars import print_bars
-from .forms.fields import DEFAULT_FLIGHT, FLIGHTS
+from .fields import DEFAULT_FLIGHT, FLIGHTS
 from .measure import run
 from .peers import CORE, find_forms, prepare
-from .processes import router
 from .report import as_markdown, write
 from .results import FULL, KHZ, LOADS, TEN, Load, Results
 
@@ -33,7 +34,7 @@ MANY: Final = {"raw": 2_000_000, "batches": 2_000_000}  # messages of these in a
 
 @dataclass(frozen=True)
 class Part:
-    """What is measured: all of it, unless the arguments name less."""
+    """The part that is measured: all of it, unless the arguments name less."""
 
     forms: Sequence[str]
     loads: Sequence[str]

@@ -6,8 +6,9 @@ import json
 import subprocess
 import time
 
-from .forms.fields import VARIABLE
-from .processes import Process, end, expect, start, tell
+from benchmarks.processes import Process, end, expect, start, tell
+
+from .fields import VARIABLE
 from .results import Load, Measured
 
 TRIES = 2  # a shared machine may stand still for seconds
@@ -31,7 +32,7 @@ def _run(name: str, python: str, load: Load, *, flight: str, endpoint: str, quie
     try:
         for role in ("receive", "publish"):
             process = start(
-                "-m", "benchmarks.role", name, role, endpoint, str(load.messages), str(load.rate), vehicles,
+                "-m", "benchmarks.compare.role", name, role, endpoint, str(load.messages), str(load.rate), vehicles,
                 python=python,
                 environment={VARIABLE: flight},
                 quiet=quiet,

@@ -10,9 +10,9 @@ import venv
 from pathlib import Path
 from typing import Final
 
-from .processes import ROOT
+from benchmarks.processes import ROOT
 
-FORMS: Final = ROOT / "benchmarks" / "forms"
+FORMS: Final = ROOT / "benchmarks" / "compare" / "forms"
 CORE: Final = ("raw", "straightforward", "models", "fields_in", "rows", "batches")
 """The forms that are measured in all cases: what others are compared with, and nedbus."""
 

@@ -7,9 +7,9 @@ import msgpack
 import zenoh
 from pydantic import BaseModel, ConfigDict, create_model
 
-from .case import Case
-from .fields import FIELDS
-from .zenoh_session import declare_publishers, key, open_session
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.zenoh_session import declare_publishers, key, open_session
 
 Position = create_model(
     "Position",

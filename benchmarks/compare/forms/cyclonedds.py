@@ -12,8 +12,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from .case import Case
-from .fields import FIELDS
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
 
 PACKAGES = ["cyclonedds==11.0.1"]
 

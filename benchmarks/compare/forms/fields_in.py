@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import nedbus
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import PROVIDED
+from benchmarks.compare.nedbus_ends import open_publishers
 
 from . import models
-from .case import Case
-from .fields import PROVIDED
-from .nedbus_ends import open_publishers
 
 Send = Callable[[int], None]
 

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import msgspec
 import zenoh
 
-from .case import Case
-from .fields import FIELDS
-from .zenoh_session import KEY, open_session
+from benchmarks.compare.case import Case
+from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.zenoh_session import KEY, open_session
 
 PACKAGES = ["msgspec==0.22.0", "eclipse-zenoh==1.10.2"]
 

@@ -1,0 +1,1 @@
+"""nedbus beside its peers, in one run: `python -m benchmarks.compare`."""
