@@ -174,7 +174,7 @@ class Tab:
 
     @property
     def asked(self) -> dict[str, str]:
-        """What stands behind "?" in the address."""
+        """Return the query string of the page's address."""
         return dict(parse_qsl(urlsplit(self.url).query))
 
     @property

@@ -1,4 +1,4 @@
-"""What nedbus serves over HTTP, as a client reads it."""
+"""A client of the pages that nedbus serves over HTTP."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def read_families(text: str) -> dict[str, Metric]:
 
 
 class Pages:
-    """What answers on a port of loopback."""
+    """A server on a port of loopback."""
 
     def __init__(self, port: int) -> None:
         self.port = port

@@ -48,7 +48,7 @@ class Listener:
             self.turn()
 
     def receive(self, count: int = 1) -> list[SourceMessage]:
-        """Wait for so many messages, and return them."""
+        """Wait for `count` messages, and return them."""
         self.turn_until(lambda: len(self.messages) >= count, what=f"{count} messages")
         received, self.messages = self.messages[:count], self.messages[count:]
         return received

@@ -50,7 +50,7 @@ class Fault:
 
     @property
     def name(self) -> str:
-        """What it is called in the table of results."""
+        """The name of the fault in the table of results."""
         return f"{self.path}: {self.kind}: {self.what}"
 
     def arguments(self, checkout: Path) -> list[str]:

@@ -35,7 +35,7 @@ VEHICLES: Final = 8
 
 
 def main() -> None:
-    """Run for so many seconds, print what happened, and exit with 1 when it stood still."""
+    """Run for `--seconds`, print what happened, and exit with 1 when it stood still."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--restart", type=float, default=20.0, help="seconds between two deaths of the router")

@@ -24,7 +24,7 @@ COMMANDS = sorted(re.findall(r"^nedbus ((?:pki )?\w+)([^#\n]*)", BASH, re.MULTIL
 
 
 def test_first_script_is_the_example() -> None:
-    """What is shown is what the tests run."""
+    """Each listing in the README is run by the tests."""
     example = (ROOT / "examples" / "position.py").read_text()
     assert example in blocks("python")
     assert len(example.splitlines()) == 10

@@ -133,7 +133,7 @@ def models_of(document: Document, kind: type[Model]) -> list[Any]:
 
 
 class Shown:
-    """What a viewer's document shows, as a person reads it; `asked`: what stands behind "?" in its address."""
+    """The document of a viewer as a person reads it; `asked`: the query string of its address."""
 
     def __init__(self, fleet: Fleet, world: Chronicle, *, asked: str = "", **options: Any) -> None:
         self.document = Document()
@@ -176,7 +176,7 @@ class Shown:
 
     @property
     def address(self) -> str:
-        """What stands behind "?" in the address that the browser shows."""
+        """The query string of the address that the browser shows."""
         return str(self.viewer._address.value)
 
     @property

@@ -30,7 +30,7 @@ class Recorder:
             self.samples.append(sample)
 
     def wait_for_more(self, count: int, *, seconds: float = DEADLINE) -> float:
-        """Wait for so many samples from now on, and return how long that took."""
+        """Wait for `count` samples from now on, and return how long that took."""
         start, before = time.monotonic(), len(self.samples)
         wait_for(lambda: len(self.samples) >= before + count, what=f"{count} more samples", seconds=seconds)
         return time.monotonic() - start

@@ -1,4 +1,4 @@
-"""What `nedbus pki enroll` makes, started with Docker beside the secure stack; and what `renew` and `rules` change."""
+"""Folders made by `nedbus pki enroll`, started with Docker beside the secure stack; `renew` and `rules` on them."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ class Fleet:
         return modes.count("client") - 2  # this session, and the reader
 
     def wait_for_clients(self, router: str, count: int) -> None:
-        """Wait until a router has so many vehicles."""
+        """Wait until a router has `count` vehicles."""
         wait_for(lambda: self.clients(router) == count, what=f"{count} vehicles at {router}")
 
     def wait_for_news(self, *routers: str) -> None:

@@ -1,4 +1,4 @@
-"""Who reads what, where: on the host, in containers, behind a second router."""
+"""Readers on the host, in containers, and behind a second router."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_compose_up_shows_data(make_stack: StartStack) -> None:
 
 
 def test_flags_are_those_of_zenohd(make_stack: StartStack) -> None:
-    """What compose files ask of a router image is what zenohd takes."""
+    """The flags that compose files give a router image are flags of zenohd."""
     for file in ("docker-compose.yml", "docker-compose.hosts.yml"):
         config = json.loads(make_stack("flags", file).compose("config", "--format", "json"))
         for name, service in config["services"].items():

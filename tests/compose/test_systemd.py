@@ -204,7 +204,7 @@ def test_several_services(machine: Machine) -> None:
 
 
 def test_mavlink_over_udp(machine: Machine) -> None:
-    """What it is allowed suffices for MAVLink over UDP; before anything arrives the service is started all the same."""
+    """The unit's permissions suffice for MAVLink over UDP; the service is started before anything arrives."""
     configure(machine, 'source = ["mavlink:udpin:127.0.0.1:14540"]\n')
     machine.run("systemctl start nedbus")
     wait_for(lambda: "nothing arrives" in machine.property("StatusText"), what="the status")
@@ -224,7 +224,7 @@ def test_mavlink_over_serial_port(machine: Machine) -> None:
 
 
 def test_bundle(machine: Machine, tmp_path: Path) -> None:
-    """What `nedbus pki enroll` makes, installed as its README.txt says, beside a router that asks for certificates.
+    """The folder of `nedbus pki enroll`, installed as its README.txt says, beside a router that asks for certificates.
 
     The service can read its keys, and nobody else can.
     """

@@ -47,7 +47,7 @@ def test_doubts_are_the_flags_with_a_label() -> None:
     ],
 )  # fmt: skip
 def test_shares_are_described(shares: dict[str, float], text: str) -> None:
-    """What is bad in all messages is grouped; what is bad in some has its percentage, which is never 0 or 100."""
+    """Flags that are bad in all messages are grouped; others have a percentage, which is never 0 or 100."""
     assert describe_flags(shares) == text
 
 

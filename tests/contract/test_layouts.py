@@ -76,7 +76,7 @@ def test_downgrade_then_upgrade_keeps_what_the_layout_has(message: VehicleLocalP
 
 
 def test_not_provided_fields_of_an_old_layout() -> None:
-    """What 1.13 lacks is NaN, false or 0 and not in model_fields_set."""
+    """Fields that 1.13 lacks are NaN, false or 0 and not in model_fields_set."""
     older = downgrade(VehicleLocalPosition(timestamp=7, dead_reckoning=True, tilt_var=1.0, hagl_max_z=5.0), "1.13")
     message = upgrade(older, "1.13")
     assert (message.dead_reckoning, message.dist_bottom_reset_counter) == (False, 0)

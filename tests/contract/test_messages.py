@@ -95,7 +95,7 @@ def test_vectors_of_rosbags_are_decoded_and_encoded_to_the_bit() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fields_of_older_layouts_survive_the_model(name: str) -> None:
-    """What an older vehicle says is in the model, under its present name, and is the same when it is downgraded."""
+    """Values of an older layout are in the model, under their present names, and are the same when downgraded."""
     dropped = {"q_offset", "pose_covariance", "velocity_covariance", "local_frame"}  # of odometry in 1.13
     for vector in (each for each in vectors() if each["message"] == name):
         known = message_of_type_hash(vector["type_hash"])
@@ -291,7 +291,7 @@ print("used", len(messages), nedbus.WheelEncoders.__name__)
 
 
 def write_wheels(path: Path, count: int) -> Path:
-    """Write a log of a rover: its wheels turn as many times as there were messages before."""
+    """Write a log of a rover: each message has one more turn of the wheels."""
     log = UlogWriter()
     log.put("F", b"wheel_encoders:uint64_t timestamp;float[2] wheel_speed;float[2] wheel_angle;")
     log.put("A", struct.pack("<BH", 0, 0) + b"wheel_encoders")

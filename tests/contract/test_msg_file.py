@@ -111,7 +111,7 @@ def test_text_that_is_no_message_says_where(text: str, reason: str) -> None:
 
 
 def test_unknown_value_is_one_as_it_is_sent_too() -> None:
-    """What `@invalid` names passes before and after it is rounded to float32; its bounds may be infinite."""
+    """The value that `@invalid` names passes before and after it is rounded to float32; bounds may be infinite."""
     text = "uint64 timestamp\nfloat32 a # @range 1, 5 @invalid 0.1\nfloat32 b # @range 1, 5 @invalid inf\n"
     definition = define_msg("Gauge", text)
     message = definition.model.model_validate({"timestamp": 1, "a": 0.1, "b": math.inf})

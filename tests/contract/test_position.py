@@ -78,7 +78,7 @@ def test_int_is_a_float_where_a_float_is_meant() -> None:
 
 @pytest.mark.parametrize("changes", BREAKING)
 def test_broken_rule_is_named(changes: dict[str, object]) -> None:
-    """What a flag promises, signs, bounds and the order of the times: just beyond each, the field is rejected."""
+    """Flags, signs, bounds and the order of the times: just beyond each, the field is rejected."""
     assert list(changes)[-1] in rejection(**changes)
 
 
@@ -164,7 +164,7 @@ def test_only_what_json_writes_is_read_back(fields: dict[str, object]) -> None:
 
 
 def test_numpy_scalars_make_a_message() -> None:
-    """What arrays hold can be given to the model, also beside Python's values; what does not fit is rejected."""
+    """Elements of arrays can be given to the model, also beside Python's values; those that do not fit are rejected."""
     array = np.array([1.5, np.nan], "f4")
     scalars = {
         "timestamp": np.uint64(2**63),

@@ -69,7 +69,7 @@ def test_other_spellings_are_accepted(name: str, parts: tuple[str, str, int | No
 
 @pytest.mark.parametrize("name", ["", "/", "fmu/out/Attitude", "fmu/out/vehicle_local_position_x", "a_/", "fmu/out/_0"])
 def test_other_topics_are_rejected(name: str) -> None:
-    """What cannot be a topic of PX4, and what is nearly the name of one, is an AddressError."""
+    """A name that no topic of PX4 can have, or that is nearly a topic's, is an AddressError."""
     with pytest.raises(AddressError, match="topic"):
         split_ros2_topic(name)
 

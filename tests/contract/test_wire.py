@@ -107,7 +107,7 @@ def test_reason_of_a_bad_payload(payload: bytes, reason: str) -> None:
 
 
 def test_violation_in_a_payload_is_rejected() -> None:
-    """What is received is validated as what is sent, on both paths of the decoder."""
+    """A received message is validated like a sent one, on both paths of the decoder."""
     values = [1, *VehicleLocalPosition(timestamp=1).model_dump().values()]
     values[3] = True  # xy_valid, while x is NaN
     with pytest.raises(DecodeError, match="x: must be finite while xy_valid"):

@@ -1,1 +1,1 @@
-"""What decides, alone: no Zenoh session, no process, time given by the test."""
+"""Decisions alone: no Zenoh session, no process, time given by the test."""

@@ -22,7 +22,7 @@ UNLIMITED: Final = 100_000
 
 
 class Setting(NamedTuple):
-    """What a world begins with.
+    """The first state of a world.
 
     `keeps`: the cache of each publisher, in messages. `capacity`: of the queue. `begins`: of a publisher that is
     heard by a heartbeat first, that message is asked for.

@@ -33,7 +33,7 @@ class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
 
 @dataclass(eq=False)
 class Reader:
-    """A reader that takes so many messages a second; its connection breaks `lease` seconds after it was stopped."""
+    """A reader of `rate` messages a second; its connection breaks `lease` seconds after it was stopped."""
 
     name: str
     rate: float = math.inf
@@ -92,7 +92,7 @@ class World:
         return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
 
     def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
-        """Publish so many messages, so many a second where nothing holds it up."""
+        """Publish `count` messages, `rate` a second where nothing holds it up."""
         for _ in range(count):
             self.advance(1 / rate)
             self.published += 1
@@ -100,7 +100,7 @@ class World:
             control.pace(self.published)
 
     def plan(self, seconds: float, action: Callable[[], object]) -> None:
-        """Let something happen in so many seconds."""
+        """Let something happen after a number of seconds."""
         self.plans.append((self.now + seconds, action))
         self.plans.sort(key=itemgetter(0))
 
@@ -134,7 +134,7 @@ class World:
             self._answer(query)
 
     def is_linked(self, reader: Reader) -> bool:
-        """Whether a query reaches this reader."""
+        """Return true if a query reaches this reader."""
         return bool(self.routers) and reader.is_linked(self.now)
 
     def longest_pause(self, since: float = 0.0) -> float:

@@ -17,7 +17,7 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its account; each message comes when the vehicle sends it, so many seconds after its boot."""
+    """A vehicle and its account; each message comes when the vehicle sends it, in seconds after its boot."""
 
     def __init__(self) -> None:
         self.account = Account()

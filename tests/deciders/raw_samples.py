@@ -35,7 +35,7 @@ INVALID = Payload(bytes(len(VALID)))  # of the right size, so that only its read
 
 
 class Raw(SimpleNamespace):
-    """What is read of a sample of Zenoh; unlike its base, weak references to it are possible."""
+    """The attributes of a Zenoh sample that are read; unlike its base, weak references to it are possible."""
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:

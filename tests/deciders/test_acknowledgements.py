@@ -1,4 +1,4 @@
-"""What a reader of mode `every` answers publishers, and when: without Zenoh, and without a publisher."""
+"""Acknowledgements of a reader of mode `every`, and their times: without Zenoh, and without a publisher."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_unknown_publisher_is_not_answered_while_its_messages_may_still_come(ask
 
 
 def test_request_waits_for_a_gap(asked: Asked) -> None:
-    """What is held back has not arrived for its reader; what is given up is not waited for."""
+    """A sample that is held back has not arrived for its reader; one that is given up is not waited for."""
     asked.put(raw(0), raw(2))
     assert asked.ask(2) == []
     asked.queue.give_up()

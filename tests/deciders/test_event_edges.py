@@ -56,7 +56,7 @@ def test_flags_that_a_source_does_not_have_are_no_state(sent: Sent) -> None:
 
 
 def test_silence_ends_with_the_vehicle_that_was_gone(sent: Sent) -> None:
-    """What was silent, then gone, and is back, is no story without an end."""
+    """A vehicle that was silent, then gone, and is back, has no story without an end."""
     sent(0.0)
     sent.account.look(4.0, {MAIN: "stale"})
     sent.account.look(8.0, {MAIN: "gone"})
@@ -169,7 +169,7 @@ def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
 
 
 def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
-    """What a service remembers of one is answered though another has had hundreds of events since."""
+    """A service answers about one vehicle though another has had hundreds of events since."""
     account = Account()
     quiet, noisy = Address("quiet", VLP), Address("noisy", VLP)
     for second, valid in enumerate((True, False, True)):

@@ -102,7 +102,7 @@ def test_report_of_many_vehicles_is_read() -> None:
     ],
 )  # fmt: skip
 def test_hostile_answer_is_none(content: object) -> None:
-    """What is no report is left out, whatever it is."""
+    """Anything that is no report is left out."""
     assert from_json(content) is None
 
 

@@ -64,7 +64,7 @@ def test_story_that_ended() -> None:
 
 
 def test_reboot_ends_a_story() -> None:
-    """What held before it is over, though no message says so; the reboot itself is a story too."""
+    """Conditions from before it are over, though no message says so; the reboot itself is a story too."""
     flight = Flight()
     flight.send()
     flight.wait(1.0).send(xy_valid=False)
@@ -154,7 +154,7 @@ def test_moment_is_found(text: str, step: float) -> None:
     "text", ["", "noon", "24:00", "12:60", "12:30:60", "12:30:61.5", "1:2", "12.30.00", "nan", "inf", "1:00:00:00"]
 )
 def test_garbage_is_no_moment(text: str) -> None:
-    """What is no time is a ValueError, which does not repeat what Python thinks of it."""
+    """A text that is no time is a ValueError, which does not repeat Python's own reason."""
     with pytest.raises(ValueError, match="no time"):
         Times(is_live=True).find(text, event_at(EVENING, boot=100.0))
 

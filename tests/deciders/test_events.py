@@ -30,7 +30,7 @@ def brief(events: Iterable[Event]) -> list[tuple[str, str, str]]:
 
 
 def test_first_message_is_no_event() -> None:
-    """What it says holds since before: it is the state, without an event, until it ends."""
+    """Conditions of its first message hold since before: they are its state, without an event, until they end."""
     flight = Flight()
     assert flight.send(xy_valid=False, dead_reckoning=True) == []
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
@@ -133,7 +133,7 @@ def test_silence_of_unknown_streams(flight: Flight) -> None:
 
 
 def test_loss_is_told_once(flight: Flight) -> None:
-    """What is lost in a row is one event, with its count, at the time of the first one."""
+    """Losses in a row are one event, with their count, at the time of the first one."""
     flight.wait(1.0).send(lost=2)
     first = flight.now
     flight.wait(1.0).gps()
@@ -226,7 +226,7 @@ def test_overload(flight: Flight) -> None:
 
 
 def test_overload_is_evidence_of_loss(flight: Flight) -> None:
-    """What goes on for all vehicles explains what happens to one, however long ago it began."""
+    """A condition of all vehicles explains the events of one, however long ago it began."""
     for dropped in range(1, 31):
         flight.fly(1)
         flight.look(dropped=dropped)
@@ -307,7 +307,7 @@ def test_estimator_flags(flight: Flight) -> None:
 
 
 def test_on_the_ground(flight: Flight) -> None:
-    """What belongs to a vehicle that is switched on is no reason to watch it while it is disarmed."""
+    """Evidence about a vehicle that is switched on is no reason to watch it while it is disarmed."""
     flight.status(DISARMED, gcs_connection_lost=False)
     assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "info")]
     assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("armed", "once", "info")]
@@ -319,7 +319,7 @@ def test_on_the_ground(flight: Flight) -> None:
 
 
 def test_missing_flag_is_no_event() -> None:
-    """What a source does not provide is neither valid nor invalid, whatever value stands for it."""
+    """A field that the source does not provide is neither valid nor invalid, whatever value stands for it."""
     flight = Flight()
     missing = ("z_valid", "v_z_valid", "heading_good_for_control", "dist_bottom_valid", "dead_reckoning")
     flight.send(missing=missing, z_valid=False, v_z_valid=False, dead_reckoning=True)
@@ -406,7 +406,7 @@ def test_jump_is_what_velocity_does_not_explain(flight: Flight) -> None:
 
 
 def test_jump_that_is_a_reset(flight: Flight) -> None:
-    """What the estimator says it reset is a reset, with its size, and no jump."""
+    """A reset that the estimator reports is a reset, with its size, and no jump."""
     told = flight.wait(0.1).send(
         x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0), delta_z=-4.0
     )
@@ -441,7 +441,7 @@ def test_flapping_of_one_is_not_of_another(flight: Flight) -> None:
 
 
 def test_evidence_is_from_the_window(flight: Flight) -> None:
-    """What happened within ten seconds before counts; what happened later, or of other kinds, does not."""
+    """Events within ten seconds before count; later ones, or ones of other kinds, do not."""
     flight.gps()
     flight.gps(jamming_indicator=100)
     flight.gps()
@@ -461,7 +461,7 @@ def test_evidence_is_from_the_window(flight: Flight) -> None:
 
 
 def test_evidence_that_goes_on(flight: Flight) -> None:
-    """What began long ago, and holds, counts at any time."""
+    """A condition that began long ago, and holds, counts at any time."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.fly(10 * WINDOW)
@@ -532,7 +532,7 @@ def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
 
 
 def test_every_kind_is_known() -> None:
-    """What may explain is itself a kind of event."""
+    """Each explaining kind is itself a kind of event."""
     for kind, evidence in KINDS.items():
         assert set(evidence) <= set(KINDS), kind
 

@@ -1,4 +1,4 @@
-"""How a lossless publisher waits for its readers: the window, the trickle beyond it, and readers that have gone."""
+"""Flow control of a lossless publisher: its credit, the trickle beyond it, and readers that have gone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def control(world: World, monkeypatch: pytest.MonkeyPatch) -> FlowControl:
 
 
 def test_limits_fit_into_each_other() -> None:
-    """What is sent without an acknowledgement is still kept for recovery, and fits into the queue of each reader."""
+    """Messages sent without an acknowledgement are still kept for recovery, and fit into the queue of each reader."""
     assert WINDOW < LIMIT < KEPT < RING < CAPACITY
     assert LIMIT + WINDOW == KEPT
 
@@ -138,7 +138,7 @@ def test_reader_that_is_closed_is_not_waited_for(world: World, control: FlowCont
 
 
 def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> float:
-    """Publish, and return how many messages a reader lacked in so many seconds; it has read nearly all in the end."""
+    """Publish, and return how many messages a reader lacked `at` seconds later; it has read nearly all in the end."""
     lead: list[float] = []
     world.plan(at, lambda: lead.append(world.published - reader.read))
     count = world.published + 20_000

@@ -16,7 +16,7 @@ from nedbus.transport import Session
 
 @dataclass(eq=False)
 class FakeWriter:
-    """What heartbeats need of a writer."""
+    """The part of a writer that heartbeats need."""
 
     published: int = 0
     key: str = "key"
@@ -99,7 +99,7 @@ def test_heartbeat_has_the_number_of_the_last_message() -> None:
 
 
 def test_many_heartbeats_are_sent_in_turns() -> None:
-    """What falls silent at once does not hold up the other jobs of a session."""
+    """Publishers that fall silent at once do not hold up the other jobs of a session."""
     stream = Stream()
     writers = [FakeWriter(published=1) for _ in range(1000)]
     for writer in writers:

@@ -1,4 +1,4 @@
-"""Which samples are current, decided at times that the test gives, by clocks that agree in nothing."""
+"""The filter of late samples, at times that the test gives, by clocks that agree in nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a live source publishes of a vehicle's topics that have no rate, with a clock of the test's."""
+"""Publishing a live source's topics that have no rate, with a clock of the test's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What waits to be read: what a reader gets, in which order, and what is counted; with samples made by hand."""
+"""The queue of samples that wait to be read: order and counts; with samples made by hand."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_invalid_samples_are_counted_and_logged_once_for_each_key(caplog: pytest
 
 
 def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is known of a key is kept for 10,000 of them, here 10; messages on others come all the same."""
+    """The state of 10,000 keys is kept, here of 10; messages on others come all the same."""
     monkeypatch.setattr("nedbus.client.receiving.decoder.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
@@ -269,7 +269,7 @@ def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: boo
 
 
 def test_ring_that_was_full_dropped_what_is_absent(caplog: pytest.LogCaptureFixture) -> None:
-    """What Zenoh's ring pushed out, unread, was dropped here, and not lost in transit; the log says so once.
+    """Samples that Zenoh's ring pushed out, unread, were dropped here, and not lost in transit; the log says so once.
 
     Only what comes out of a full ring is in doubt: a gap after that is a loss again.
     """
@@ -301,7 +301,7 @@ def undescribed(payload: bytes = VALID) -> RawSample:
 
 
 def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who receives and who acknowledges hear of a key at the same moment: what one knows of its publishers both do."""
+    """Receiving and acknowledging learn of a key at the same moment: both know the same publishers."""
     decoder, met = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), list[object]()
 
     def meet_meanwhile(*arguments: Any) -> Any:
@@ -326,7 +326,7 @@ def test_what_a_batch_left_is_read_next() -> None:
 
 
 def test_batch_goes_past_what_is_invalid() -> None:
-    """What nobody describes is no reason to wait for more, and no message of another kind, whatever its bytes."""
+    """A payload without a description is no reason to wait, and no message of another kind, whatever its bytes."""
     for payload in (VALID, VALID[:-1]):
         pending_queue = make_queue("every")
         put(pending_queue, [undescribed(payload), raw(0)])
@@ -367,7 +367,7 @@ def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
 
 
 def test_losses_come_with_the_batch_in_which_the_gap_is() -> None:
-    """What is too much for one batch takes its losses into the next."""
+    """A batch that is full leaves the rest, with its losses, to the next."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
     first, second = take_batch(pending_queue), take_batch(pending_queue)

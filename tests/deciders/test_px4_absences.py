@@ -1,4 +1,4 @@
-"""What is announced and does not arrive, or is not carried, at times that the test gives."""
+"""Topics that are announced and do not arrive, or are not carried, at times that the test gives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which publishers of rmw_zenoh are alive, alike or replaced, by the tokens of a real PX4 and of ROS 2 nodes."""
+"""Publishers of rmw_zenoh, alive, alike or replaced, by the tokens of a real PX4 and of ROS 2 nodes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_token_of_a_real_px4_is_parsed() -> None:
     "text", ["", "a", REAL.replace("MP", "MS"), REAL + "/x", REAL.replace("/0/7", "/x/7"), 99 * REAL]
 )
 def test_other_tokens_are_refused(text: str) -> None:
-    """What rmw_zenoh would not declare for a publisher raises DecodeError."""
+    """A token that rmw_zenoh would not declare for a publisher raises DecodeError."""
     with pytest.raises(DecodeError):
         PublisherToken.parse(text)
 

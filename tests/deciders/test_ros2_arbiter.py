@@ -1,4 +1,4 @@
-"""What the bridge publishes to ROS 2, decided without a network and at times that the test gives."""
+"""The choice of streams that the bridge publishes to ROS 2, without a network and at times that the test gives."""
 
 from __future__ import annotations
 

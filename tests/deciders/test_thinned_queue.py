@@ -38,7 +38,7 @@ def at(
 
 
 def test_thinned_stream_passes_whole() -> None:
-    """What the publisher has thinned is not thinned again, whatever the jitter of its timestamps."""
+    """A stream that its publisher downsamples is not downsampled again, whatever the jitter of its timestamps."""
     queue = make_queue()
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
@@ -209,7 +209,7 @@ def test_step_is_the_greatest_that_is_not_above() -> None:
 
 @pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, "5", True, None])
 def test_invalid_rate_is_refused(value: object) -> None:
-    """What is no finite number above 0 is a ConfigError, and a ValueError, that names the option."""
+    """A rate that is no finite number above 0 is a ConfigError, and a ValueError, that names the option."""
     with pytest.raises(ConfigError, match="max_rate") as error:
         check_max_rate(value)
     assert isinstance(error.value, ValueError)

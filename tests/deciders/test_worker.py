@@ -231,7 +231,7 @@ def test_failure_is_retried_with_growing_pauses() -> None:
 
 
 class PanicException(BaseException):
-    """What pyo3 raises when Rust panics, as Zenoh does under a clock before 1970."""
+    """The exception that pyo3 raises when Rust panics, as Zenoh does under a clock before 1970."""
 
 
 @pytest.mark.parametrize("retry", [True, False])
@@ -341,7 +341,7 @@ def test_live_states_follow_the_vehicles() -> None:
 
 
 def test_live_losses_and_reboots_are_summed() -> None:
-    """What a source says was lost before it is counted, and so is each restart of a vehicle."""
+    """Messages that a source reports as lost are counted, and so is each restart of a vehicle."""
     clock = StandingClock(stop_at=100.0)
     reboot = SourceMessage(0.0, ONE, {"timestamp": 0}, 0, True)
     status = run(FakeLive(clock, [SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4), reboot]), clock).status

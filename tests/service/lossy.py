@@ -26,7 +26,7 @@ class LossyQueue(PendingQueue):
 
 
 class Lossy:
-    """A subscription with a lossy queue, and its questions: so many `unanswered`, as those that a router drops."""
+    """A subscription with a lossy queue, and its requests, the first `unanswered` of which get no answer."""
 
     def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session

@@ -1,4 +1,4 @@
-"""What tests publish in numbers, once somebody reads it."""
+"""Publishers of many numbered messages, which begin once a reader is there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.waits import DEADLINE, wait_for
 
 
 def numbered(count: int, *, first: int = 1) -> MessageArray:
-    """Return so many messages, with the timestamps `first`, `first + 1`, ..."""
+    """Return `count` messages, with the timestamps `first`, `first + 1`, ..."""
     messages: MessageArray = np.repeat(to_array([message()]), count)
     messages["timestamp"] = np.arange(first, first + count)
     return messages
@@ -41,5 +41,5 @@ def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
 
 
 def take(subscription: nedbus.Subscription, count: int) -> list[int]:
-    """Wait for so many messages, and return their timestamps."""
+    """Wait for `count` messages, and return their timestamps."""
     return [subscription.receive(DEADLINE).message.timestamp for _ in range(count)]

@@ -38,7 +38,7 @@ def talk(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any
 
 
 def listen(topic: str, definition: str, rows: list[dict[str, Any]], **options: Any) -> None:
-    """Print as many messages as there are rows, then the topics that ROS 2 lists."""
+    """Print one message for each row, then the topics that ROS 2 lists."""
     done = threading.Event()
     left = len(rows)
 

@@ -194,7 +194,7 @@ def test_file_is_read_by_streams(tmp_path: Path) -> None:
 
 
 def test_tables_are_frames_with_nulls(tmp_path: Path) -> None:
-    """What is not there yet, or not at all, is null; arrays have a column for each element; times are UTC."""
+    """A value that is not there yet, or not at all, is null; arrays have a column per element; times are UTC."""
     pytest.importorskip("pandas")
     pl = pytest.importorskip("polars")
     gps = array_of("sensor_gps", {"timestamp": 1_100_000, "time_utc_usec": BOOT + 1_100_000, "satellites_used": 9})
@@ -242,7 +242,7 @@ def test_utc_is_told_or_absent() -> None:
 
 
 def test_samples_tell_utc(bus: nedbus.Bus) -> None:
-    """What a live vehicle last said is enough: the UTC of any of its samples, and by whom; None without."""
+    """The last sample of a live vehicle is enough: the UTC of any of its samples, and its source; None without."""
     for vehicle, utc in (("7", 1_700_000_000_000_000), ("8", 0)):
         gps = bus.publisher("sensor_gps", vehicle=vehicle, instance=1)
         gps.publish({"timestamp": 5_000_000, "time_utc_usec": utc})

@@ -37,7 +37,7 @@ SCHEMA = "nedbus/@schema/VehicleLocalPosition"
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
-    """What is published arrives typed, equal to the bit, with its address and times."""
+    """A published message arrives typed, equal to the bit, with its address and times."""
     publisher = bus.publisher("estimator_local_position", vehicle=7, instance=1)
     sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
     subscription = client.subscribe("*", mode=mode)
@@ -195,7 +195,7 @@ def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus,
 
 
 def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
-    """What `subscribe` can read, `latest` reads as well: a layout that its publisher explains."""
+    """A layout that its publisher explains is read by `latest` as by `subscribe`."""
     types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
     layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
     explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})

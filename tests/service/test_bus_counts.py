@@ -1,4 +1,4 @@
-"""What a reader counts, over a real router: floods, junk, unknown layouts, rejected messages; and that it goes on."""
+"""Counts of a reader over a real router, which goes on: floods, junk, unknown layouts, rejected messages."""
 
 from __future__ import annotations
 
@@ -268,7 +268,7 @@ def test_unexpected_error_in_the_pump_is_counted(
 
 
 def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None:
-    """What a service reports is read with its address; what is no report is left out, whoever sends it."""
+    """A report of a service is read with its address; anything else is left out, whatever its sender."""
     rejections = bus.rejections()
     wait_for_reader(raw, ADDRESS.rejected_key())
     for key, payload in (

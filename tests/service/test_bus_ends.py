@@ -1,4 +1,4 @@
-"""How a bus begins and ends: routers that are not there, closing, cancelling, forks and garbage, of either client."""
+"""Beginning and end of a bus: absent routers, closing, cancelling, forks and garbage, of either client."""
 
 from __future__ import annotations
 

@@ -231,7 +231,7 @@ def test_certificates_that_expire_are_named(tmp_path: Path) -> None:
 
 
 def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path: Path) -> None:
-    """What is not installed is no mistake in the settings: a warning says what is not checked, and why."""
+    """A package that is not installed is no mistake in the settings: a warning says what is not checked, and why."""
     make_authority(tmp_path / "pki")
     settings = tmp_path / "nedbus.toml"
     settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')

@@ -181,7 +181,7 @@ def test_ended_replay_starts_again_or_keeps_its_last_value(tmp_path: Path, serve
 def test_invalid_message_is_rejected_counted_and_reported(
     tmp_path: Path, run_nedbus: Start, endpoint: str, raw: Session, bus: nedbus.Bus
 ) -> None:
-    """What fails validation is never published: it is on the rejected key with its reason, and counted in status."""
+    """An invalid message is never published: it is on the rejected key with its reason, and counted in status."""
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(10):

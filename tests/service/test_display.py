@@ -1,4 +1,4 @@
-"""What `nedbus serve` shows on a terminal."""
+"""The terminal display of `nedbus serve`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["on_terminal"]  # a fixture
 
 
 def test_hint_needs_no_flag_that_it_lacks() -> None:
-    """What can be pasted needs no certificate; where one is needed, that is said in one line."""
+    """Commands to paste need no certificate; where one is needed, that is said in one line."""
     assert " list  what" in what_to_type([DEFAULT_ENDPOINT])
     assert " hz -c tcp/b:1 " in what_to_type(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):

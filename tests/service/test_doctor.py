@@ -137,7 +137,7 @@ def test_all_is_well(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
 
 
 def test_silent_vehicle(bus: nedbus.Bus, endpoint: str) -> None:
-    """Who has a token and sends nothing is found, with the age of the last message; who is asked for must be there."""
+    """A vehicle with a token that sends nothing is found, with the age of its last; one asked for must exist."""
     bus.publisher(VLP, vehicle="mute")
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
     findings = look(endpoint)
@@ -230,7 +230,7 @@ def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -
 
 
 def test_what_services_remember_of_vehicles(raw: Session, endpoint: str) -> None:
-    """What is bad is wrong, what is to be watched a warning; who is well, or was switched off, is no finding.
+    """A bad vehicle is an error, one to be watched a warning; one that is well, or was switched off, is no finding.
 
     Of two services that remember a vehicle the one counts that hears it. The peers answer as services do.
     """
@@ -282,7 +282,7 @@ def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[
 
 
 def test_vehicle_of_a_real_service_that_is_not_well(run_nedbus: Start, tmp_path: Path) -> None:
-    """What a service of another process remembers of a vehicle, whose log this test writes, is found."""
+    """Events of a vehicle that a service of another process remembers, from a log of this test's, are found."""
     endpoint = free_endpoint()
     log = write_log(tmp_path / "a.ulg", range(100_000, 300_000_000, 100_000), **{**VALID, "xy_valid": False})
     run_nedbus("serve", "--listen", endpoint, "-s", f"ulog:{log}?vehicle=sick")
@@ -319,7 +319,7 @@ def test_keys_that_readers_do_not_look_at(raw: Session, endpoint: str) -> None:
 
 
 def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
-    """What the service of another process reports: in words for people, in JSON for programs, exit code 1."""
+    """The report of a service of another process: in words for people, in JSON for programs, exit code 1."""
     endpoint = free_endpoint()
     service = run_nedbus("serve", "--listen", endpoint, "-s", "sim:", "-s", "ulog:nowhere.ulg")
     wait_for(lambda: "no such file" in service.err, what="the source that fails")
@@ -540,7 +540,7 @@ def test_what_comes_on_a_mavlink_link() -> None:
 
 
 def test_settings_that_are_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What sets the router, what else is set and by what, and what the sources lack."""
+    """The origin of the router's setting, the other settings and their origins, and what the sources lack."""
     Path("nedbus.toml").write_text('prefix = "fleet"\nsource = ["ulog:gone.ulg", "sim:?nonsense=1"]\n')
     monkeypatch.setenv("NEDBUS_VEHICLE", "7")
     findings = examine(load_settings(), version="0")

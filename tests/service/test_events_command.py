@@ -137,7 +137,7 @@ def test_events_of_a_real_flight() -> None:
 
 
 def test_why_of_a_file(log: Path) -> None:
-    """What was wrong, since when, for how long, and what precedes it; and what the log does not have."""
+    """Each fault with its begin, its duration, and what precedes it; and the topics that the log does not have."""
     shown = run_command("why", str(log))
     assert (shown.exit_code, shown.out) == (0, WHY)
     assert shown.err == "times: seconds since boot, as no message tells UTC\n"
@@ -216,7 +216,7 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     ],
 )  # fmt: skip
 def test_mistake_is_one_line(log: Path, tmp_path: Path, arguments: tuple[str, ...], code: int, text: str) -> None:
-    """What a stranger types wrong is said in one line, with what to do; 2 is a wrong call, 1 what cannot be done."""
+    """A mistyped command is answered in one line, with what to do; 2 is a wrong call, 1 a failure."""
     (tmp_path / "note.txt").write_text("no log")
     (tmp_path / "not.ulg").write_text("no log")
     shown = run_command(*(str(log) if each == "LOG" else each for each in arguments))
@@ -296,7 +296,7 @@ def test_events_that_a_service_remembers(run_nedbus: Start, bus: nedbus.Bus, end
 
 
 def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint: str) -> None:
-    """What happens to a vehicle of a script is told as it happens, and what held before this began is said."""
+    """Events of a script's vehicle are told as they happen, and conditions from before are said."""
     fields: dict[str, object] = VALID | {"z_valid": False}
     with bus.publisher(VLP, vehicle="7") as publisher:
 

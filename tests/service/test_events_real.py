@@ -122,7 +122,7 @@ def test_table_is_what_its_script_makes() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_numbers_are_finite(name: str) -> None:
-    """What an event tells can be written as JSON, which has no NaN."""
+    """Each event can be written as JSON, which has no NaN."""
     for event in told_in(name):
         assert all(math.isfinite(number) for number in event.numbers.values()), event
 

@@ -66,7 +66,7 @@ def test_with_certificates(tmp_path: Path, pki: Path, monkeypatch: pytest.Monkey
     "answer", [b"", b"\x00", b"HTTP/1.0 400 Bad Request\r\n\r\n", b"\2\0\3\2", b"\4\0\1\t\xf2\xff", b"\xff" * 5000]
 )
 def test_other_answers_are_not_full(answer: bytes) -> None:
-    """What is no router, or says something else, is not called full, whatever it sends."""
+    """A server that is no router, or says something else, is not called full, whatever it sends."""
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:

@@ -218,7 +218,7 @@ def test_states_have_reasons() -> None:
 
 
 def test_description_has_state_flags_and_events() -> None:
-    """What is shown in a table: state, flags, then gaps, disorder and reboots; "ok" when there is nothing to say."""
+    """Notes of the table: state, flags, then gaps, disorder and reboots; "ok" when there is nothing to say."""
     health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
     doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)

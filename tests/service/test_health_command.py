@@ -197,7 +197,7 @@ def test_wrong_expectation_is_explained(health: Judge, arguments: tuple[str, ...
 
 
 def test_old_replay_is_no_silence_of_now(endpoint: str, bus: nedbus.Bus) -> None:
-    """Who begins to follow a service whose replay ended long ago hears its last message, and tells nothing of it."""
+    """A follower of a service whose replay ended long ago hears its last message, and tells nothing."""
     with serving(endpoint, "sim:?duration=0.1"):
 
         def is_old() -> bool:

@@ -168,7 +168,7 @@ def test_service_logs_json(start: Start) -> None:
 
 @pytest.mark.parametrize("level", ["info", "debug"])
 def test_error_of_a_command_is_an_object(run_nedbus: Start, level: str) -> None:
-    """What ends a command is one object too, with the traceback where the level is debug."""
+    """The error that ends a command is one object too, with the traceback where the level is debug."""
     ended = run_nedbus("--log-format", "json", "--log-level", level, "get", "-c", "tcp/127.0.0.1:1")
     assert ended.wait() == 1
     (fields,) = [json.loads(line) for line in ended.err.splitlines()]
@@ -227,7 +227,7 @@ class Limited:
 
 
 def test_flood_of_any_length_is_bounded() -> None:
-    """A burst passes, then so many a minute, each after a line that says how many were left out before it."""
+    """A burst passes, then a limited number a minute, each after a line with the number left out before it."""
     limited = Limited()
     assert limited.flood(1000) == BURST
     limited.now += 60 / PER_MINUTE

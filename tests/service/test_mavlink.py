@@ -162,7 +162,7 @@ def test_fields_are_those_of_mavlink(listener: Listener, port: int) -> None:
 
 
 def test_each_message_is_one_of_its_topic(port: int) -> None:
-    """What was chosen arrives at its own address, with what earlier messages said of it, and nothing else does."""
+    """The chosen messages arrive at their own addresses, with fields of earlier ones, and nothing else does."""
     topics = "SensorGps,BatteryStatus,VehicleStatus,HomePosition"
     gps = dialect.MAVLink_gps_raw_int_message(5_000_000, 3, 10, 20, 30, 65535, 150, 65535, 9000, 255)
     cells = [4000, 4100, *[65535] * 8]
@@ -254,7 +254,7 @@ def test_denied_origin_is_told_once_and_not_before_there_can_be_one(
     with Listener(f"mavlink:udpin:127.0.0.1:{port}?topics={VLP}") as listener, Autopilot(port) as vehicle:
 
         def deny(flags: int, *, times: int) -> None:
-            """Deny what is requested until this was the origin, so many times."""
+            """Deny requests until the origin was denied `times` times."""
             nonlocal now
             while times:
                 now += 0.1

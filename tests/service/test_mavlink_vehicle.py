@@ -1,4 +1,4 @@
-"""What one MAVLink vehicle is asked for, and its estimates, at times that the test gives."""
+"""Requests to one MAVLink vehicle, and its estimates, at times that the test gives."""
 
 from __future__ import annotations
 

@@ -165,7 +165,7 @@ def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> N
 def publish_over_a_break(
     publisher: nedbus.Publisher, subscription: nedbus.Subscription, clock: Clock, link: Link, seconds: int
 ) -> list[nedbus.Sample]:
-    """Publish 1 s of 100 Hz, so many while the link is cut, and on; return what arrived, up to something after that."""
+    """Publish 1 s of 100 Hz, the rest while the link is cut, and on; return all that arrived until a later one."""
     take_last(publisher, subscription)
     taken = []
     for first in range(1, 101, 20):
@@ -193,7 +193,7 @@ def publish_over_a_break(
 
 @pytest.mark.parametrize(("mode", "seconds"), [("every", 10), ("every", 40), ("latest", 10)])
 def test_broken_link(endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, seconds: int) -> None:
-    """What a broken link lost of a thinned stream is recovered in mode "every", for 20 s; all else is counted."""
+    """Losses of a downsampled stream by a broken link are recovered in mode "every", for 20 s; the rest is counted."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with (
@@ -322,7 +322,7 @@ def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, cap
 def test_vehicle_that_thins_is_never_read_whole(
     bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Who sends thinned is not read whole, also when the last message was long ago."""
+    """A downsampled stream is not read at full rate, also when its last message was long ago."""
     looks: list[set[str]] = []
     unthinned = ThinnedQueue.unthinned
 

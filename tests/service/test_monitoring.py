@@ -147,7 +147,7 @@ def test_vehicles_page_of_a_service(serve: Serve, pages: Pages, tmp_path: Path) 
 
 
 def test_vehicle_that_is_not_well(serve: Serve, pages: Pages, tmp_path: Path) -> None:
-    """What holds is told by /vehicles and by metrics; /healthz and /readyz are of the service, and stay 200.
+    """Conditions are told by /vehicles and by metrics; /healthz and /readyz are of the service, and stay 200.
 
     The peers are a real service in another process, and replays of logs that this test writes.
     """
@@ -399,7 +399,7 @@ def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
 def test_vehicle_that_was_switched_off_has_no_age(
     bus: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who is silent for long, and has no liveliness token, keeps its counts and is not stale; it may come back."""
+    """A stream silent for long, without a token, keeps its counts and is not stale; it may come back."""
     with (
         exporting(bus) as pages,
         nedbus.connect(endpoint) as other,
@@ -431,7 +431,7 @@ def test_vehicle_that_was_switched_off_has_no_age(
 def test_stream_that_has_ended_has_no_age(
     monkeypatch: pytest.MonkeyPatch, state: State, limit: float, active: set[str]
 ) -> None:
-    """What a live source withdrew long ago, or a replay that has ended, has only counts; what is stale has its age."""
+    """A stream that was withdrawn long ago, or a replay that has ended, has only counts; a stale one has its age."""
     status = SourceStatus(
         "px4-zenoh:", state, (f"on/{VLP}",), (f"off/{VLP}",), *(0, 0, {}, 0, 0, 0, None, 0, "", (), None, ())
     )

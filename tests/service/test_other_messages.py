@@ -122,7 +122,7 @@ def test_rows_and_batches_hold_everything(
 
 
 def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
-    """What arrives mixed is read as arrays of one dtype each, of all addresses of that message."""
+    """Messages that arrive mixed are read as arrays of one dtype each, of all addresses of that message."""
     addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
     publishers = {address: publisher_of(bus, address) for address in addresses}
     for publisher in publishers.values():
@@ -194,7 +194,7 @@ def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: nedbus.Bus) -> None:
-    """What is published can be described, whoever defined it; anything else is an error that names what is known."""
+    """Any published message can be described, whatever defined it; another name is an error with the known ones."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )

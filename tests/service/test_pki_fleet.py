@@ -208,7 +208,7 @@ def test_documented_commands_lead_from_nothing_to_a_vehicle_that_is_read(run_ned
 
 
 def test_each_suggested_source_is_one(pki: Path, tmp_path: Path) -> None:
-    """Who removes a # in nedbus.toml has a configuration without a mistake."""
+    """Removing any # in nedbus.toml leaves a configuration without a mistake."""
     bundle = tmp_path / "wing"
     make_bundle(pki, "wing", bundle, routers=["tls/127.0.0.1:7447"], target=bundle)
     text = (bundle / "nedbus.toml").read_text()

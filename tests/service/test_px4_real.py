@@ -1,4 +1,4 @@
-"""What a real PX4 sent (../shared/data/px4), played into a service as fast as it takes it, beside the vehicle's log."""
+"""Messages of a real PX4 (../shared/data/px4), played into a service at full speed, beside the vehicle's log."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class Px4:
 
 
 def play(bus: nedbus.Bus, px4s: Sequence[Px4], lines: Iterable[Sent], played: int) -> int:
-    """Send what each PX4 sent, after so many messages, as fast as the service takes it; return how many there are."""
+    """Send the messages of each PX4 as fast as the service takes them; `played` counts them, and is returned."""
     for sent in lines:
         px4s[sent.px4].send(sent)
         played += bool(sent.payload)
@@ -161,7 +161,7 @@ def play(bus: nedbus.Bus, px4s: Sequence[Px4], lines: Iterable[Sent], played: in
 
 
 def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
-    """Wait until the service published or rejected so many messages; it counts one after it was sent."""
+    """Wait until the service published or rejected `count` messages; it counts one after it was sent."""
 
     def is_counted() -> bool:
         now = status_of_source(bus)

@@ -378,7 +378,7 @@ def test_hostile_keys_leave_the_status_readable(serve: Callable[[], Process], ra
 
 
 def test_what_waits_to_be_decoded_is_small(listener: Listener, raw: Session) -> None:
-    """What is too long for ROS 2, and large payloads, do not wait; they are counted."""
+    """Messages that are too long for ROS 2, and large payloads, do not wait; they are counted."""
     name = dds_type(ROS2_TYPE)
     wait_for_reader(raw, f"0/a/{name}/hash")
     for topic, payload in (("a", bytes(300)), ("b", bytes(5000)), ("x" * 2000, bytes(300)), ("last", bytes(300))):

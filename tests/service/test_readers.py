@@ -191,7 +191,7 @@ def test_reader_that_dies_is_given_up(
 def test_flush_waits_for_arrival_and_not_for_scripts(
     stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
 ) -> None:
-    """What has arrived at a script that reads nothing is safe: the end of a replay does not wait until it is read."""
+    """Messages at a script that reads nothing are safe: the end of a replay does not wait until they are read."""
     publisher, sending = publish_all(bus, count=WINDOW // 2)
     assert take(reader, WINDOW // 2)[-1] == WINDOW // 2
     reader.close()

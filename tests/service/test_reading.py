@@ -89,7 +89,7 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
 
 
 def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
-    """What several streams differ in is what has to be named; a topic that only another vehicle has is to blame."""
+    """The property in which several streams differ has to be named; a topic of another vehicle alone is to blame."""
     path = tmp_path / "a.mcap"
     addresses = [Address(str(vehicle), VLP) for vehicle in range(1, 14)]
     addresses += [Address("99", "estimator_local_position", instance) for instance in (0, 1)]
@@ -284,7 +284,7 @@ def test_missing_fields_of_some_messages_are_null_there(tmp_path: Path) -> None:
 
 
 def test_names_in_the_pages_exist(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What docs/data.md and docs/recordings.md name is in `nedbus`, and the scripts about files run."""
+    """The names in docs/data.md and docs/recordings.md are in `nedbus`, and the scripts about files run."""
     data, recordings = ((DOCS / name).read_text() for name in ("data.md", "recordings.md"))
     names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)", re.sub(r"nedbus\.toml", "", data + recordings)))
     names |= set(re.findall(r"`(\w+_to_\w+)`", data))
@@ -380,7 +380,7 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     ],
 )
 def test_plot_that_cannot_be_drawn_is_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:
-    """What is not in the file is exit code 2; a folder that does not exist, or no valid message, is exit code 1."""
+    """A stream that is not in the file is exit code 2; a missing folder, or no valid message, is exit code 1."""
     array = to_array([message(1), message(2)])
     array["xy_valid"] = True
     with RecordingWriter(flight.with_name("invalid.mcap")) as writer:

@@ -193,7 +193,7 @@ def empty_recording() -> bytes:
     ],
 )
 def test_file_without_a_position_is_an_error(tmp_path: Path, content: bytes | None, reason: str) -> None:
-    """What is no recording, and a recording without local positions, has nothing to replay."""
+    """A file that is no recording, or one without local positions, has nothing to replay."""
     path = tmp_path / "a.mcap"
     if content is not None:
         path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""What a reader of mode `every` does about messages that do not arrive: real publishers and sessions on loopback.
+"""Recovery of lost messages by a reader of mode `every`: real publishers and sessions on loopback.
 
 Nothing is lost there, so what arrives at one reader goes missing behind Zenoh, just before its queue. In the last test
 it is a router that dies, and nothing is made.
@@ -205,7 +205,7 @@ def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, housekeepi
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
 def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> None:
-    """What no publisher of Zenoh sends asks for nothing, and keeps nobody else from being asked."""
+    """A heartbeat that no publisher of Zenoh sends makes no request, and keeps no other from being made."""
     raw.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     raw.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
@@ -253,7 +253,7 @@ def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pyte
 
 
 def test_only_so_many_questions_are_open(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What 60 vehicles miss at the same moment is asked for a few at a time, and all of it comes."""
+    """Gaps of 60 vehicles at the same moment are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
@@ -286,7 +286,7 @@ def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyP
 
 
 def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is recovered does not push out what a slow reader has not read yet."""
+    """Recovered messages do not push out those that a slow reader has not read yet."""
     monkeypatch.setattr(retransmission, "_BEHIND", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))

@@ -90,7 +90,7 @@ def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> No
 
 
 def test_address_can_move_from_one_source_to_another(run_nedbus: Start, tmp_path: Path) -> None:
-    """What is gone has given its addresses back before what is new takes them; a replay as fast as possible too.
+    """A removed source has given its addresses back before a new one takes them; a replay at full speed too.
 
     A source that names no vehicle is another one where the default vehicle is.
     """

@@ -112,7 +112,7 @@ def as_json(fields: dict[str, object]) -> str:
 
 
 def test_ros_2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bus: nedbus.Bus) -> None:
-    """What a ROS 2 node publishes arrives field for field, with the layout found by its hash."""
+    """A message of a ROS 2 node arrives field for field, with the layout found by its hash."""
     rows = [downgrade(each, "1.14") for each in flight()]
     with bus.subscribe(mode="every") as subscription:
         run_nedbus("serve", "--connect", endpoint, "-s", "px4-zenoh:")
@@ -128,7 +128,7 @@ def test_ros_2_node_is_received(run_nedbus: Start, peer: Peer, endpoint: str, bu
 def test_ros_2_node_receives_and_lists(
     run_bridge: RunBridge, peer: Peer, raw: Session, bus: nedbus.Bus, layout: str
 ) -> None:
-    """What the bridge publishes arrives at a ROS 2 node field for field, and its topics are listed."""
+    """A message of the bridge arrives at a ROS 2 node field for field, and its topics are listed."""
     messages = flight()
     expected = [downgrade(each, layout) for each in messages]
     publisher = bus.publisher(VLP, vehicle="7")
@@ -228,7 +228,7 @@ def test_home_of_a_vehicle_that_appears_reaches_ros_2(
 def test_last_value_does_not_reach_ros_2(
     run_bridge: RunBridge, bus: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """What a vehicle sent before the bridge began is held back, and from then on it is published whole."""
+    """Messages from before the bridge began are held back, and from then on a vehicle is published whole."""
     publisher = bus.publisher(VLP, vehicle="1")
     publisher.publish(message(1))
     wait_for(bus.latest, what="the last value")
@@ -338,7 +338,7 @@ def test_topic_of_another_node_is_left_to_it(
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """What a PX4 publishes itself is not published twice; the same topic in another layout is a translation."""
+    """A topic that a PX4 publishes itself is not published twice; the same one in another layout is a translation."""
     monkeypatch.setattr("nedbus.bridges.ros2_arbiter.TAKE_OVER_DELAY", 0.1)
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))

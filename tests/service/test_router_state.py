@@ -1,4 +1,4 @@
-"""How near a router is to its limits: what it says of itself, who shows it, and how many files it may open."""
+"""Limits of a router: its own report, the command that shows it, and the files that it may open."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def test_limits_that_make_no_sense(room: object) -> None:
 
 
 def test_large_and_many_answers(endpoint: str, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who claims to be many routers, or one with a book of sessions, fills nobody's memory."""
+    """A peer that claims to be many routers, or one with a book of sessions, fills no reader's memory."""
     (real,) = ask_routers(raw, timeout=5.0)
 
     def answer(query: zenoh.Query) -> None:
@@ -278,7 +278,7 @@ def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 class Once(threading.Event):
-    """What ends a loop where it would wait."""
+    """The exception that ends a loop where it would wait."""
 
     def wait(self, timeout: float | None = None) -> bool:
         self.set()

@@ -132,7 +132,7 @@ def test_message_without_a_file_is_read(join: Join) -> None:
 
 @pytest.mark.parametrize("intruder", ["vehicle-2", "reader", "operator"])
 def test_nobody_else_writes_a_vehicles_keys(join: Join, intruder: str) -> None:
-    """What an intruder publishes as vehicle 1 reaches nobody: no data, no liveliness, no last value."""
+    """Messages of an intruder as vehicle 1 reach no reader: no data, no liveliness, no last value."""
     genuine = join("vehicle-1").publisher(VLP, vehicle="1")
     genuine.publish(message(1))
     reader = join("reader")
@@ -287,7 +287,7 @@ def test_missing_certificate_is_named(run_nedbus: Start, tmp_path: Path) -> None
 def test_refused_clients_are_logged(
     run_nedbus: Start, pki: Path, configured: tuple[Path, str], *, command: tuple[str, ...], environment: dict[str, str]
 ) -> None:
-    """Who is refused is told what to check; the router's log on stderr says why; what RUST_LOG asks is on stdout."""
+    """A refused client learns what to check; the log on stderr says why; lines of RUST_LOG are on stdout."""
     file, endpoint = configured
     router = run_nedbus(*command, str(file), **environment)
     wait_for(lambda: f"router on {endpoint}" in router.err, what="the router")
@@ -422,7 +422,7 @@ def test_refusal_is_believed_when_it_is_repeated(
 
 
 def test_router_that_joins_is_refused_as_a_client_is(secure: str, pki: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the service of an embedded router publishes passes the router that it joins, or not, by its certificate."""
+    """Messages of an embedded router's service pass the router that it joins, or not, by its certificate."""
     monkeypatch.setattr(f"{PERMISSION}_ARRIVED", 0.5)
     with open_router(listen=(free_endpoint(),), connect=(secure,), tls=tls_of(pki, "vehicle-1")) as session:
         permission = permission_of(session, secure, pki, "1", "2")

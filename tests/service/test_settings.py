@@ -183,7 +183,7 @@ def test_mistaken_certificate_is_found_locally(keys: Path, ca: str, certificate:
 
 
 def test_certificate_that_is_refused_is_explained(keys: Path, tmp_path: Path) -> None:
-    """What depends on the clock or on the peer is said when nothing answers: expired, or of another authority."""
+    """A certificate that is expired, or of another authority, is named when nothing answers."""
     other = tmp_path / "other"
     make_authority(other)
     tls = Tls(keys / "ca.crt", keys / "wing.crt", keys / "wing.key")

@@ -95,7 +95,7 @@ def test_rates_are_px4s(streams: dict[str, list[VehicleLocalPosition]]) -> None:
 
 @pytest.mark.parametrize("options", ["?duration=3.3", "?duration=0.5", "?duration=3.3&topics=home_position,SensorGps"])
 def test_messages_are_in_time_order_and_counted(options: str) -> None:
-    """A finite flight has as many messages as its total, in order of `due`, and those of all its addresses."""
+    """A finite flight has exactly `total` messages, in order of `due`, and those of all its addresses."""
     run = open_replay(f"sim:{options}")
     messages = list(run.messages)
     due = [each.due for each in messages]

@@ -1,4 +1,4 @@
-"""What a service tells systemd: a real datagram socket in its place, and real services; and its units."""
+"""Notifications to systemd: a real datagram socket in its place, and real services; and its units."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Datagram = dict[str, str]
 
 
 class Systemd:
-    """What systemd is to a service: a socket that takes datagrams."""
+    """A socket that takes datagrams, in the place of systemd."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -274,7 +274,7 @@ def test_nothing_without_notify_socket(caplog: pytest.LogCaptureFixture) -> None
 
 
 def test_systemd_that_does_not_listen(systemd: Systemd) -> None:
-    """What cannot be told now, is told later; nothing waits for it."""
+    """A notification that cannot be sent now is sent later; nothing waits for it."""
     notify = NotifySocket(systemd.address)
     taken = sum(1 for _ in iter(lambda: notify.send(READY=1), False))  # until the queue of the socket is full
     for _ in range(taken):

@@ -1,4 +1,4 @@
-"""What a person meets at a terminal: tables of any width, hostile text, closed streams, signals at any moment."""
+"""Terminals: tables of any width, hostile text, closed streams, signals at any moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a browser is sent, without a browser: tracks, the list, what the page says, moments, live vehicles of a bus."""
+"""The documents sent to a browser, without one: tracks, the list, texts, moments, live vehicles of a bus."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_tracks_send_only_what_is_new(sky: Sky) -> None:
 
 
 def test_many_tracks_have_fewer_points_each(sky: Sky) -> None:
-    """With 200 vehicles a track has a point a second, so that a browser draws as many points as with 20."""
+    """With 200 vehicles a track has a point a second, so a browser draws no more points than with 20."""
     sky.fly(0.1, *[Address(f"v{number}", VLP) for number in range(200)])
     tracks = Tracks()
     tracks.update(tracks_of(sky))
@@ -147,7 +147,7 @@ def test_many_tracks_have_fewer_points_each(sky: Sky) -> None:
 
 
 class Page(Shown):
-    """What a viewer of a sky sees."""
+    """The document of a viewer of a sky."""
 
     def __init__(self, sky: Sky, **options: Any) -> None:
         super().__init__(sky.fleet, sky.chronicle, **options)
@@ -224,7 +224,7 @@ def test_bad_estimates_beside_the_main_one_make_nothing_red(sky: Sky) -> None:
 
 
 def test_page_that_is_behind_says_so(sky: Sky) -> None:
-    """What this reader did not read in time is told in the header as the page's own fault; no vehicle changes."""
+    """Messages that this reader did not read in time are the page's own fault, in the header; no vehicle changes."""
     sky.fly(3, WING, QUAD)
     page = Page(sky)
     assert "this page reads all of it" in page.part("head")
@@ -556,7 +556,7 @@ def test_address_shows_the_same_to_somebody_else(flown: Sky, event: str | None) 
     ],
 )  # fmt: skip
 def test_any_address_is_survived(flown: Sky, asked: str) -> None:
-    """What makes no sense in an address is left out; where it names no vehicle there is, another can be chosen."""
+    """Nonsense in an address is left out; where it names an unknown vehicle, another can be chosen."""
     page = Page(flown, asked=asked)
     page.update()
     assert page.vehicles == ["wing", "quad"]
@@ -685,7 +685,7 @@ def open_page(endpoint: str) -> Iterator[tuple[Shown, Callable[[Callable[[], obj
 
 
 def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session) -> None:
-    """What is published is in the list and on the map; what is not valid any more, or switched off, stays there."""
+    """Published vehicles are in the list and on the map; those no longer valid, or switched off, stay there."""
     fields = {**VALID, "x": 5.0}
     wing, quad = (bus.publisher(VLP, vehicle=name) for name in ("wing", "quad"))
     with open_page(endpoint) as (page, until):

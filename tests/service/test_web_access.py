@@ -1,4 +1,4 @@
-"""Who may look at the page of `nedbus web`, and what the others are told; spoken by hand, without a browser."""
+"""Access to the page of `nedbus web`, and the answers to those refused; spoken by hand, without a browser."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_nothing_can_be_sent_and_bodies_are_not_kept(url: str) -> None:
 
 
 def test_browser_says_little_at_a_time(url: str) -> None:
-    """What comes through the socket of a page has a limit of 1 MiB, which ends it."""
+    """A message on the socket of a page has a limit of 1 MiB, which ends it."""
     with open_socket(url, url) as connection:
 
         def is_closed() -> bool:

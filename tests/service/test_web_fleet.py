@@ -1,4 +1,4 @@
-"""What the page in the browser knows of vehicles, without a browser: their states, where they were, and when not."""
+"""The page's own knowledge of vehicles, without a browser: their states, their places, and silence."""
 
 from __future__ import annotations
 
@@ -255,7 +255,7 @@ def test_vehicles_with_origins_share_one(sky: Sky) -> None:
 
 
 def test_invalid_position_is_no_place(sky: Sky) -> None:
-    """What is not valid is NaN in the history, each quantity by its own flag; the last valid place stays."""
+    """Invalid values are NaN in the history, each quantity by its own flag; the last valid place stays."""
     sky.fly(1, x=1.0, y=2.0, z=-3.0, vx=4.0, vz=-5.0)
     before = sky.stream().valid
     sky.fly(1, xy_valid=False, z_valid=False, v_xy_valid=False, v_z_valid=False, x=9.0, y=9.0, z=9.0, vx=9.0, vz=9.0)

@@ -1,4 +1,4 @@
-"""What lies under the tracks of the page: GeoJSON, or a picture with a world file, and what cannot be drawn."""
+"""The layer under the tracks of the page: GeoJSON, or a picture with a world file, and errors of both."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
     ],
 )
 def test_file_that_is_no_map_is_named(tmp_path: Path, content: str | None, said: str) -> None:
-    """What cannot be drawn is an error of --map that names the file and says what would do."""
+    """A map that cannot be drawn is an error of --map that names the file and the accepted ones."""
     file = tmp_path / "field.geojson"
     if content is not None:
         file.write_text(content)

@@ -201,7 +201,7 @@ def on_each_other(page: Tab) -> list[str]:
 
 
 def test_hostile_words_are_text(fly: Fly, tab: Open, raw: Session, endpoint: str, tmp_path: Path) -> None:
-    """What a peer wrote in a reason, or somebody in a GeoJSON file, is shown as text and makes no element."""
+    """Text of a peer in a reason, or in a GeoJSON file, is shown as text and makes no element."""
     field = tmp_path / f"{HOSTILE[:24].replace('/', '')}.geojson"
     line = {"type": "LineString", "coordinates": [[8.545, 47.397], [8.546, 47.398]]}
     field.write_text(json.dumps({"type": "Feature", "properties": {"name": HOSTILE}, "geometry": line, "id": HOSTILE}))

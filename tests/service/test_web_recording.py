@@ -123,7 +123,7 @@ def test_any_speed_of_a_browser_is_survived(recording: Recording, clock: SimpleN
 
 
 class Page(Shown):
-    """What a viewer of a recording sees, as `nedbus web` shows it."""
+    """The document of a viewer of a recording, as `nedbus web` shows it."""
 
     def __init__(self, recording: Recording, player: Player, **options: Any) -> None:
         super().__init__(
@@ -186,7 +186,7 @@ def test_event_is_jumped_to(recording: Recording) -> None:
 
 @pytest.mark.usefixtures("clock")
 def test_address_of_a_recording_names_its_moment(recording: Recording) -> None:
-    """Who opens the address of a page of a recording sees the same vehicle, view and moment."""
+    """The address of a page of a recording opens the same vehicle, view and moment."""
     page = open_page(recording)
     for do in (("next", ""), ("focus:vehicle", ""), ("right", "")):
         page.say(*do)

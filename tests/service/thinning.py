@@ -64,7 +64,7 @@ class Link:
 
 
 class Clock:
-    """What publishers take for the time."""
+    """The clock of publishers."""
 
     def __init__(self) -> None:
         self.now = 10**18

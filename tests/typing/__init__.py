@@ -1,1 +1,1 @@
-"""What type checkers must accept and reject; read by mypy, never run."""
+"""Calls that type checkers must accept or reject; read by mypy, never run."""

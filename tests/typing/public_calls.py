@@ -49,7 +49,7 @@ def subscribe_to_another(bus: nedbus.Bus, any_topic: str) -> None:
 
 
 def use(sample: nedbus.Sample, row: nedbus.Sample[nedbus.VehicleLocalPosition]) -> None:
-    """What takes a message takes a row as well."""
+    """A function that takes a message takes a row as well."""
     assert_type(nedbus.to_global(sample.message), nedbus.GlobalPosition | nedbus.NoOrigin)
     assert_type(nedbus.to_global(row.message), nedbus.GlobalPosition | nedbus.NoOrigin)
     assert_type(nedbus.ResetTracker().add(row.message), nedbus.Continuous)
