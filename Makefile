@@ -19,6 +19,7 @@ run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints
 check: $(DEV)  ## lint and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
 	$(BIN)/mypy
 
 generated: $(DEV)  ## what is made from the files of messages: the stubs of type checkers, and a page each

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from nedbus_msgs import MESSAGES, Definition, hash_of, ros2_type
-from nedbus_msgs.rules import FiniteWhile, NotLater, Rule, UnitQuaternion
+from nedbus_msgs.model.rules import FiniteWhile, NotLater, Rule, UnitQuaternion
 
 ROOT = Path(__file__).parents[1]
 

@@ -2,8 +2,6 @@
 
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
-from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .definition import Definition, Row
 from .errors import (
     AddressError,
     DecodeError,
@@ -39,19 +37,20 @@ from .functions import (
     definition_of,
     encode,
 )
-from .layouts import upgrade_fields, upgrade_with
-from .message import Message
 from .messages.vehicle_local_position import VehicleLocalPosition
-from .msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
-from .other import define
+from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
+from .model.definition import Definition, Row
+from .model.layouts import upgrade_fields, upgrade_with
+from .model.message import Message
+from .model.px4_types import BASES, FieldType, field_type
+from .model.registry import BY_TOPIC, MESSAGES, TOPICS
+from .model.rules import UnitQuaternion
+from .model.schema import json_schema_of, layout_table_of, schema_of
 from .provenance import Provenance, encoding_of, message_name_of, provenance_of
-from .px4_types import BASES, FieldType, field_type
-from .registry import BY_TOPIC, MESSAGES, TOPICS
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
-from .ros2_topics import ros2_topic_of, split_ros2_topic
-from .ros2_types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
-from .rules import UnitQuaternion
-from .schema import json_schema_of, layout_table_of, schema_of
+from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
+from .ros2.topics import ros2_topic_of, split_ros2_topic
+from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
 from .topics import (
     ANY,
     DEFAULT_PREFIX,
@@ -69,6 +68,7 @@ from .topics import (
     status_key,
     vehicle_name,
 )
+from .undeclared import define
 
 __all__ = [
     "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAGS",

@@ -12,7 +12,7 @@ import numpy as np
 
 from .codecs.arrays import Arrays, MessageArray, arrays_of
 from .functions import DEFAULT, M, definition_of
-from .message import Message
+from .model.message import Message
 
 __all__ = [
     "DTYPE", "Arrays", "MessageArray", "arrays_of", "dtype_of", "to_array", "to_message",

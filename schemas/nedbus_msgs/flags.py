@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from .messages.vehicle_local_position import VehicleLocalPosition
-from .rules import FiniteWhile
+from .model.rules import FiniteWhile
 
 _PARTLY_BAD: Final = (1, 99)  # the percentages that a share between 0 and 1 is shown with
 

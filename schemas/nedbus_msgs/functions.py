@@ -7,11 +7,11 @@ from typing import Any, Final, cast
 from typing_extensions import TypeVar
 
 from .codecs.msgpack import Newer, codec_of
-from .declaration import DEFAULT_TOPIC
-from .definition import Definition
-from .message import Message
 from .messages.vehicle_local_position import VehicleLocalPosition
-from .registry import BY_TOPIC, MESSAGES
+from .model.declaration import DEFAULT_TOPIC
+from .model.definition import Definition
+from .model.message import Message
+from .model.registry import BY_TOPIC, MESSAGES
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 _FIRST: Final = cast("type[Any]", VehicleLocalPosition)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
 
-from .definition import Definition
 from .errors import AddressError
+from .model.definition import Definition
 
 _SOURCE = re.compile(r"[a-z0-9_-]{1,32}")
 _MISSING = re.compile(r"[0-9a-f]+")

@@ -8,9 +8,9 @@ from difflib import get_close_matches
 from functools import lru_cache
 from typing import Final, cast
 
-from .declaration import Topic
 from .errors import AddressError
-from .registry import MESSAGES, TOPICS
+from .model.declaration import Topic
+from .model.registry import MESSAGES, TOPICS
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"

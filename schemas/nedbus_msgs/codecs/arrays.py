@@ -15,12 +15,12 @@ from typing import Any, Final, Generic
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs.declaration import Layout
-from nedbus_msgs.definition import Definition, M
 from nedbus_msgs.errors import InvalidMessageError
-from nedbus_msgs.px4_types import BASES, FieldType
-from nedbus_msgs.rules import passes_all
-from nedbus_msgs.validation import Values
+from nedbus_msgs.model.declaration import Layout
+from nedbus_msgs.model.definition import Definition, M
+from nedbus_msgs.model.px4_types import BASES, FieldType
+from nedbus_msgs.model.rules import passes_all
+from nedbus_msgs.model.validation import Values
 
 from .cdr import HEAD, cdr_layout
 from .msgpack import codec_of

@@ -12,11 +12,11 @@ from functools import cache
 from itertools import islice
 from typing import Any, Final
 
-from nedbus_msgs.declaration import Layout
-from nedbus_msgs.definition import Definition
 from nedbus_msgs.errors import DecodeError, EncodeError
-from nedbus_msgs.layouts import require_fields
-from nedbus_msgs.px4_types import BASES, FieldType
+from nedbus_msgs.model.declaration import Layout
+from nedbus_msgs.model.definition import Definition
+from nedbus_msgs.model.layouts import require_fields
+from nedbus_msgs.model.px4_types import BASES, FieldType
 
 HEAD: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
 _PX4_EXTRA: Final = 24  # bytes that PX4 sends beyond the header and its own struct, of which CDR may need less

@@ -16,13 +16,13 @@ import msgpack
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from nedbus_msgs.definition import Definition, M
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
-from nedbus_msgs.layouts import upgrade_with
-from nedbus_msgs.message import fill
-from nedbus_msgs.px4_types import BASES, FieldType
-from nedbus_msgs.rules import evaluated
-from nedbus_msgs.validation import Values
+from nedbus_msgs.model.definition import Definition, M
+from nedbus_msgs.model.layouts import upgrade_with
+from nedbus_msgs.model.message import fill
+from nedbus_msgs.model.px4_types import BASES, FieldType
+from nedbus_msgs.model.rules import evaluated
+from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
 """Bytes of the largest payload that is decoded, and of the largest message that can be carried."""

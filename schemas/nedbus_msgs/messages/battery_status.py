@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Bool, Float32, Float32x14, Uint8, Uint16, Uint32, Uint64
-from nedbus_msgs.rules import InRange
+from nedbus_msgs.model.declaration import Topic
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float32x14, Uint8, Uint16, Uint32, Uint64
+from nedbus_msgs.model.rules import InRange
 
 
 class BatteryStatus(Message):

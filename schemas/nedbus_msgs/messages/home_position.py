@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Bool, Float32, Float64, Uint32, Uint64
-from nedbus_msgs.rules import FiniteWhile, Within
+from nedbus_msgs.model.declaration import Topic
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float64, Uint32, Uint64
+from nedbus_msgs.model.rules import FiniteWhile, Within
 
 
 class HomePosition(Message):

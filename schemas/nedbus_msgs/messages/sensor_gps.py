@@ -7,10 +7,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic, older
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64
-from nedbus_msgs.rules import FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model.declaration import Topic, older
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64
+from nedbus_msgs.model.rules import FiniteWhile, NotLater, NotNegative, Within
 
 
 def _integer(value: float, scale: float) -> int:

@@ -6,9 +6,9 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import Int64, Uint8, Uint32, Uint64
+from nedbus_msgs.model.declaration import Topic
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64
 
 
 class TimesyncStatus(Message):

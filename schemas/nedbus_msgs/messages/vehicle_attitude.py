@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Float32x4, Uint8, Uint64
-from nedbus_msgs.rules import NotLater, UnitQuaternion
+from nedbus_msgs.model.declaration import Topic
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Float32x4, Uint8, Uint64
+from nedbus_msgs.model.rules import NotLater, UnitQuaternion
 
 
 class VehicleAttitude(Message):

@@ -9,10 +9,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic, older
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
-from nedbus_msgs.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model.declaration import Topic, older
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
+from nedbus_msgs.model.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
 
 
 class VehicleLocalPosition(Message):

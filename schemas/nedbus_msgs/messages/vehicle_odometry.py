@@ -6,10 +6,10 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic, older
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import NAN, Float32x3, Float32x4, Int8, Uint8, Uint64
-from nedbus_msgs.rules import UnitQuaternion
+from nedbus_msgs.model.declaration import Topic, older
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import NAN, Float32x3, Float32x4, Int8, Uint8, Uint64
+from nedbus_msgs.model.rules import UnitQuaternion
 
 
 class VehicleOdometry(Message):

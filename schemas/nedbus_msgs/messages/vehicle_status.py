@@ -6,9 +6,9 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.declaration import Topic, older
-from nedbus_msgs.message import Message
-from nedbus_msgs.px4_types import Bool, Uint8, Uint16, Uint32, Uint64
+from nedbus_msgs.model.declaration import Topic, older
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import Bool, Uint8, Uint16, Uint32, Uint64
 
 
 class VehicleStatus(Message):

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
+from nedbus_msgs.errors import LayoutError
+
 from .declaration import Layout
 from .definition import Definition, M
-from .errors import LayoutError
 from .px4_types import NAN
 
 

@@ -8,8 +8,9 @@ from functools import cached_property, lru_cache
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
 
+from nedbus_msgs.errors import LayoutError
+
 from .declaration import ALL, DEFAULT_TOPIC, EVERY, RELEASES, Layout, Older, Topic
-from .errors import LayoutError
 from .px4_types import FieldType, field_type, type_of_marks
 from .rules import Rule
 from .validation import Validation, Values

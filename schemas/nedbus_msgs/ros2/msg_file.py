@@ -9,12 +9,13 @@ from functools import lru_cache
 from itertools import islice
 from typing import Final, NamedTuple
 
-from .definition import Definition
-from .message import Message
-from .other import define
-from .px4_types import ALIASES, BASES, FieldType, field_type
-from .ros2_types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
-from .rules import InRange, Rule
+from nedbus_msgs.model.definition import Definition
+from nedbus_msgs.model.message import Message
+from nedbus_msgs.model.px4_types import ALIASES, BASES, FieldType, field_type
+from nedbus_msgs.model.rules import InRange, Rule
+from nedbus_msgs.undeclared import define
+
+from .types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
 
 _FIELD = re.compile(r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]+)\s*(?:=\s*(?P<value>[^#]*))?(?P<comment>#.*)?")
 _NUMBER: Final = r"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|inf)"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from .registry import TOPICS
-from .topics import Address, get_topic
+from nedbus_msgs.model.registry import TOPICS
+from nedbus_msgs.topics import Address, get_topic
 
 _PX4_PATH: Final = ("fmu", "out")
 _TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")

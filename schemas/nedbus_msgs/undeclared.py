@@ -9,11 +9,11 @@ from typing import Any, Final
 from pydantic import Field, create_model
 
 from .codecs.msgpack import PAYLOAD_LIMIT, full_width
-from .declaration import EVERY
-from .definition import Definition
-from .message import Message
-from .px4_types import FieldType
-from .rules import Rule
+from .model.declaration import EVERY
+from .model.definition import Definition
+from .model.message import Message
+from .model.px4_types import FieldType
+from .model.rules import Rule
 
 PX4: Final = "PX4"
 """Name of the only layout of such a message."""

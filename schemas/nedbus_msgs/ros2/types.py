@@ -8,10 +8,10 @@ from functools import cache
 from hashlib import sha256
 from typing import Any, Final
 
-from .declaration import Layout
-from .definition import Definition
-from .px4_types import BASES, FieldType
-from .registry import MESSAGES
+from nedbus_msgs.model.declaration import Layout
+from nedbus_msgs.model.definition import Definition
+from nedbus_msgs.model.px4_types import BASES, FieldType
+from nedbus_msgs.model.registry import MESSAGES
 
 PACKAGE: Final = "px4_msgs/msg"
 ARRAY: Final = 48  # of type_description_interfaces/msg/FieldType, for an array of fixed size

@@ -1,0 +1,1 @@
+"""The definition of a message: fields and types, layouts, rules, validation; made from its file in `messages/`."""

@@ -1,0 +1,73 @@
+"""The public interface: complete, documented, made of public names only, with every error in one drawing."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import typing
+from pathlib import Path
+
+import pytest
+
+import nedbus
+
+ROOT = Path(__file__).parents[1]
+OURS = {
+    node.name
+    for folder in ("service", "schemas")
+    for path in ROOT.glob(f"{folder}/**/*.py")
+    for node in ast.walk(ast.parse(path.read_text()))
+    if isinstance(node, ast.ClassDef)
+}
+# Generic over all messages, or returned by properties for other libraries only.
+ALLOWED = {"Definition"}
+
+
+@pytest.mark.parametrize("name", ["nedbus", "nedbus_msgs"])
+def test_public_interface_is_complete(name: str) -> None:
+    """Each name of __all__ is there, once and documented, and nothing public is missing."""
+    module = importlib.import_module(name)
+    assert len(module.__all__) == len(set(module.__all__))
+    for word in module.__all__:
+        public = getattr(module, word)
+        ours = (inspect.isclass(public) or inspect.isfunction(public)) and public.__module__.startswith("nedbus")
+        assert not ours or public.__doc__, word
+    public = {word for word in vars(module) if not word.startswith("_")}
+    submodules = {path.stem for path in Path(str(module.__file__)).parent.iterdir()}
+    assert public - submodules - {"annotations", "TYPE_CHECKING"} <= set(module.__all__)
+
+
+def annotations_of(public: object) -> typing.Iterator[str]:
+    """Yield the annotations of a function, or of the public methods and fields of a class, as they are written."""
+    if inspect.isfunction(public):
+        yield from map(str, inspect.get_annotations(public).values())
+    elif inspect.isclass(public):
+        yield from (str(text) for name, text in inspect.get_annotations(public).items() if not name.startswith("_"))
+        for name, member in list(vars(public).items()):
+            function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+            made_by_users = name == "__init__" and not re.search(r"get one from|from `connect", public.__doc__ or "")
+            if inspect.isfunction(function) and (not name.startswith("_") or made_by_users):
+                yield from map(str, inspect.get_annotations(function).values())
+
+
+@pytest.mark.parametrize("name", nedbus.__all__)
+def test_public_signatures_mention_public_names_only(name: str) -> None:
+    """A script can import from nedbus whatever it gets from nedbus, or gives to it."""
+    for annotation in annotations_of(getattr(nedbus, name)):
+        expression = annotation.removeprefix("<class '").removesuffix("'>")
+        mentioned = {node.id for node in ast.walk(ast.parse(expression)) if isinstance(node, ast.Name)}
+        assert mentioned & OURS <= {*nedbus.__all__, *ALLOWED}, annotation
+
+
+def test_error_tree_is_drawn() -> None:
+    """The docstring of nedbus.errors draws every error, with the built-in error that each one also is."""
+    errors = importlib.import_module("nedbus.errors")
+    for name in errors.__all__:
+        assert name in (errors.__doc__ or ""), name
+        assert re.match("Raised (when|for) |Base of", getattr(errors, name).__doc__), name
+        bases = [base.__name__ for base in getattr(errors, name).__mro__ if base.__module__ == "builtins"]
+        drawn = next(line for line in (errors.__doc__ or "").splitlines() if f" {name}" in f" {line.strip()}")
+        if "(" in drawn.partition(name)[2][:2]:
+            assert drawn.split("(")[1].split(")")[0] in bases
