@@ -25,7 +25,7 @@ def definition_of(message: type[M] | str) -> Definition[M]:
 
 
 DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
-"""The message of whoever names none."""
+"""The message of a call that names none."""
 
 
 def encode(message: Message) -> bytes:

@@ -20,7 +20,7 @@ _TOPIC_LENGTH: Final = 64
 _SIMILAR: Final = 0.9  # of two names from which one is taken for a misspelling of the other
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
-_RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is thinned
+_RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is downsampled
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -69,14 +69,14 @@ class Address:
 
     @classmethod
     def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Return the address in the key of a thinned stream; raise AddressError for any other key."""
+        """Return the address in the key of a downsampled stream; raise AddressError for any other key."""
         whole, rate, _ = key.rpartition(_RATE)
         if not rate:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]{_RATE}<messages a second>")
         return cls.from_key(whole, prefix=prefix)
 
     def rate_key(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of this stream, thinned to so many messages a second; "*" stands for any rate."""
+        """Return the key expression of this stream, downsampled to `rate` messages a second; "*" is any rate."""
         return f"{self.key(prefix=prefix)}{_RATE}{rate}"
 
     @property
@@ -130,7 +130,7 @@ class Selection:
         return f"{prefix}/{self.vehicle}/@alive/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
 
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of these streams, thinned to so many messages a second; "*" is any rate."""
+        """Return the key expression of these streams, downsampled to `rate` messages a second; "*" is any rate."""
         return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
 
 

@@ -132,7 +132,7 @@ class Arrays(Generic[M]):
         return np.array([tuple(message.__dict__.values()) for message in messages], self.dtype)
 
     def absent(self, count: int) -> MessageArray:
-        """Return so many messages of which nothing is provided: NaN, false and 0."""
+        """Return `count` messages of which nothing is provided: NaN, false and 0."""
         return np.repeat(np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype), count)
 
     def to_row(self, element: np.void) -> Values:

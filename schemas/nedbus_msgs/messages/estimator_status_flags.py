@@ -13,7 +13,7 @@ from nedbus_msgs.model.rules import NotLater
 
 
 class EstimatorStatusFlags(Message):
-    """What one EKF2 instance fuses (cs_), which fusions failed (fs_) and, up to 1.17, which data it rejected (reject_).
+    """Fusions of one EKF2 instance: active (cs_), failed (fs_) and, up to 1.17, rejected data (reject_).
 
     Published when a flag changes and about once a second, by each instance of several.
     While cs_inertial_dead_reckoning is set nothing holds the horizontal position: it drifts, and is not valid for long.

@@ -12,7 +12,7 @@ from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, Uint64
 
 
 class FailsafeFlags(Message):
-    """What the modes of a vehicle need and what is missing: why it does not arm, and what its failsafes act upon.
+    """Requirements of the modes and which are missing: why a vehicle does not arm, and what its failsafes act upon.
 
     A mask mode_req_ has bit n (1 << n) for the mode n of VehicleStatus.NAVIGATION_STATE_.
     A mode is blocked while what it needs is missing: its bit in mode_req_local_position, and local_position_invalid.

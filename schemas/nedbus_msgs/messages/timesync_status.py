@@ -12,7 +12,7 @@ from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64
 
 
 class TimesyncStatus(Message):
-    """How far the clock of a companion or ground station is from the vehicle's, as the vehicle measures it.
+    """Offset between the clock of a companion or ground station and the vehicle's, as the vehicle measures it.
 
     Vehicle's time (its `timestamp`) = remote time + estimated_offset.
     Where the other side has Unix time, the offset is negative, and -estimated_offset is when the vehicle booted.

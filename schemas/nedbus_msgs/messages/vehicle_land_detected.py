@@ -12,7 +12,7 @@ from nedbus_msgs.model.px4_types import Bool, Uint64
 
 
 class VehicleLandDetected(Message):
-    """What the land detector says of a vehicle: in the air, on the ground, and why.
+    """Output of the land detector: in the air, on the ground, and why.
 
     A multicopter lands in three steps, each after some time of its signs: ground_contact, maybe_landed, landed.
     So landed comes some time after touchdown; other kinds of vehicles mostly use landed alone.

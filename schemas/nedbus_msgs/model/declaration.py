@@ -1,4 +1,4 @@
-"""What the file of a message says of it beside its fields: topics, layouts, and what fields were called before."""
+"""Parts of a message's file beside its fields: topics, layouts, and older names of fields."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 from .px4_types import FieldType, field_type
 
 DEFAULT_TOPIC: Final = "vehicle_local_position"
-"""The topic of whoever names none."""
+"""The topic of a call that names none."""
 EVERY: Final = "*"
 """In place of the fields of a layout: those of the model."""
 _KEPT_FOR: Final = 20.0  # s
@@ -26,7 +26,7 @@ class Topic:
     """One uORB topic.
 
     `rate`: the nominal rate at which PX4 publishes or logs it [Hz], 0 where there is none.
-    `doc`: who publishes it.
+    `doc`: its publisher.
     `on_change`: PX4 sends it whenever it changes, and at `rate` otherwise: bursts and pauses are no faults.
     `instances`: it has uORB instances, one per EKF or sensor; None for a topic of which that is not known.
     `plain_first`: in ROS 2 the topic of its instance 0 has no number, as PX4 calls it by default.
@@ -45,7 +45,7 @@ class Topic:
 
     @property
     def kept(self) -> int:
-        """How many messages a publisher keeps."""
+        """Number of messages that a publisher keeps."""
         return self.cache or max(_LEAST_CACHE, round(_KEPT_FOR * self.rate))
 
 

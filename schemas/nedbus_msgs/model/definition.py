@@ -1,4 +1,4 @@
-"""What a message is, in one object: made from the class in its file, and what everything else is derived from."""
+"""Definition of a message in one object, made from the class in its file; everything else is derived from it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Row(tuple[Any, ...]):
 
 
 class Plan(NamedTuple):
-    """How fields of some layout become those of the model.
+    """Mapping of the fields of some layout to those of the model.
 
     `names`: the field of the model, and that with its value. `converted`: the same, with a function of the value.
     `parts`: the field of the model, and those with its elements, None for an element that no field has.
@@ -133,7 +133,7 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def validation(self) -> Validation:
-        """How fields become a valid message."""
+        """Validation of fields, and of rows."""
         return Validation(self.types, self.rules)
 
     @cached_property

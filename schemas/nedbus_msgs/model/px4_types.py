@@ -66,7 +66,7 @@ class FieldType:
 
     @cached_property
     def count(self) -> int:
-        """How many values it has."""
+        """Number of values."""
         return self.length or 1
 
     @cached_property
@@ -76,12 +76,12 @@ class FieldType:
 
     @cached_property
     def is_float(self) -> bool:
-        """Whether its values may be NaN."""
+        """True for floats, whose values may be NaN."""
         return self.base.startswith("float")
 
     @cached_property
     def absent(self) -> object:
-        """What stands for a field that is not provided: NaN, false or 0, in each element of an array."""
+        """Value of a field that is not provided: NaN, false or 0, in each element of an array."""
         absent = BASES[self.base].absent
         return absent if self.length is None else (absent,) * self.length
 

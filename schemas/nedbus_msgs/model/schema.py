@@ -8,7 +8,7 @@ from .definition import Definition
 
 
 def schema_of(definition: Definition[Any]) -> dict[str, object]:
-    """Return what publishers answer to who asks for a message: its JSON Schema and its layouts."""
+    """Return the description of a message that publishers answer queries with: its JSON Schema and its layouts."""
     return {"json_schema": json_schema_of(definition), "layouts": layout_table_of(definition)}
 
 

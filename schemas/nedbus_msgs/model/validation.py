@@ -25,7 +25,7 @@ Values = tuple[object, ...]
 
 
 class Validation:
-    """How the fields of one message are validated, and rounded to float32: the nearest, as a C float would hold it.
+    """Validation of the fields of one message, rounded to the nearest float32, as a C float would hold them.
 
     `passes_rules`: return whether the values of all fields, which have the right types, pass the rules.
     `template`: the names of all fields, for a copy that is filled: that takes less time than a dict that grows.
