@@ -96,22 +96,17 @@ _TLS_HINT = (
 
 
 class ConnectError(NedbusError, ConnectionError):
-    """Raised when no endpoint answered in time; `full` is the one whose router has no room for more sessions."""
+    """Raised when no endpoint answered in time."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "", *, full: str = "") -> None:
-        self.endpoints, self.full = tuple(endpoints), full
-        if full:
-            super().__init__(
-                f"the router at {full} has no room for more sessions (tried for {seconds:.3g} s): raise max_sessions"
-                " in its configuration, or name a router that has room with --connect or NEDBUS_CONNECT"
-            )
-            return
+    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
+        self.endpoints = tuple(endpoints)
         secure = any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         super().__init__(
             f"nothing answers at {' or '.join(endpoints)} ({tried}): start 'nedbus serve' or a Zenoh router there, or"
-            " name another endpoint with --connect or NEDBUS_CONNECT"
-            + ("; a router that does answer refuses a certificate without a word:" + _TLS_HINT if secure else "")
+            " name another endpoint with --connect or NEDBUS_CONNECT; a router that has no room for more sessions"
+            " refuses without a word: 'nedbus doctor' tells more"
+            + ("; so does one that does not accept a certificate:" + _TLS_HINT if secure else "")
         )
 
 

@@ -1,7 +1,6 @@
 """Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
 
 The common name of a certificate is what the access control of `config/router-secure.json5` matches.
-Needs the package `cryptography`, the extra `pki`.
 """
 
 from __future__ import annotations
@@ -23,13 +22,12 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from nedbus.errors import PkiError
 from nedbus.whole_file import whole_file
 
-CA_DAYS: Final = 3650
-DAYS: Final = 825
+from .certificate import DAYS, MAX_NAME
 
-_NAME_LENGTH: Final = 64  # X.509's limit of a common name
+_CA_DAYS: Final = 3650
 
 
-def make_authority(folder: Path, *, days: int = CA_DAYS) -> list[Path]:
+def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     """Make the CA of a fleet, `ca.key` and `ca.crt`, and return both paths.
 
     The key signs everything else and belongs to no vehicle and no router.
@@ -40,7 +38,7 @@ def make_authority(folder: Path, *, days: int = CA_DAYS) -> list[Path]:
     return write_pair(folder, "ca", key, sign_authority(key, days=days))
 
 
-def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int = DAYS) -> list[Path]:
+def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
     """Make `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
 
     `hosts` are the names and addresses under which a router is reached: clients check them.
@@ -48,8 +46,8 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
 
     Raises PkiError when there is a key of that name already, no CA, or the folder cannot be written.
     """
-    if not name or len(name) > _NAME_LENGTH or "/" in name or name.startswith("."):
-        raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {_NAME_LENGTH} characters without /")
+    if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
+        raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {MAX_NAME} characters without /")
     authority = Authority.read(folder)
     key = new_key()
     return write_pair(folder, name, key, authority.sign(name, key.public_key(), hosts=hosts, days=days))
@@ -78,38 +76,21 @@ class Authority:
         return cls(certificate, key)
 
     def sign(
-        self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int = DAYS
+        self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
     ) -> x509.Certificate:
         """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
-        builder = _builder(_name(name), self.certificate.subject, key, days, end=self.certificate.not_valid_after_utc)
-        builder = builder.add_extension(self._identifier(), critical=False)
-        builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        builder = builder.add_extension(_usage(sign_certificates=False), critical=True)
         # A router is a client of other routers too.
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+        builder = _builder(name, key, self.key, DAYS if days is None else days, issuer=self.certificate)
         builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
         if hosts:
             builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
         return builder.sign(self.key, hashes.SHA256())
 
-    def _identifier(self) -> x509.AuthorityKeyIdentifier:
-        """Return the identifier of the CA's key; a CA without one is given this one when it is renewed."""
-        try:
-            own = self.certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier).value
-        except x509.ExtensionNotFound:
-            return x509.AuthorityKeyIdentifier.from_issuer_public_key(self.key.public_key())
-        return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(own)
 
-
-def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int = CA_DAYS) -> x509.Certificate:
+def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
     """Return the certificate of a CA for its key; what that key signed before stays valid under it."""
-    name = _name("nedbus CA")
-    builder = _builder(name, name, key.public_key(), days)
-    identifier = x509.AuthorityKeyIdentifier.from_issuer_public_key(key.public_key())
-    builder = builder.add_extension(identifier, critical=False)
-    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-    builder = builder.add_extension(_usage(sign_certificates=True), critical=True)
-    return builder.sign(key, hashes.SHA256())
+    return _builder("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days).sign(key, hashes.SHA256())
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -117,12 +98,10 @@ def new_key() -> ec.EllipticCurvePrivateKey:
     return ec.generate_private_key(ec.SECP256R1())
 
 
-def write_secret(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
     """Write a key into a new file that only its owner can read."""
-    secret = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    _write_new(path, secret, 0o600)
+    pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    _write_new(path, key.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600)
 
 
 def write_certificate(path: Path, certificate: x509.Certificate) -> None:
@@ -133,7 +112,7 @@ def write_certificate(path: Path, certificate: x509.Certificate) -> None:
 def write_pair(
     folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate, *, replace: bool = False
 ) -> list[Path]:
-    """Write key and certificate, both or neither, and return their paths; nobody else may read the key.
+    """Write key and certificate, both or neither, and return their paths.
 
     Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
     """
@@ -141,7 +120,7 @@ def write_pair(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with whole_file(paths[0], replace=replace) as first, whole_file(paths[1], replace=replace) as second:
-            write_secret(first, key)
+            write_key(first, key)
             write_certificate(second, certificate)
     except FileExistsError as exc:
         reason = "it is not overwritten; move it away, or take another folder or name"
@@ -157,29 +136,22 @@ def _write_new(path: Path, content: bytes, mode: int) -> None:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: CertificatePublicKeyTypes, days: int, *, end: dt.datetime | None = None
+    name: str,
+    key: CertificatePublicKeyTypes,
+    signer: ec.EllipticCurvePrivateKey,
+    days: int,
+    *,
+    issuer: x509.Certificate | None = None,
 ) -> x509.CertificateBuilder:
+    """Begin the certificate of a key; without an issuer it is that of an authority, signed by itself."""
+    is_authority = issuer is None
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = dt.datetime.now(dt.UTC)
     until = now + dt.timedelta(days=days)
-    return (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(issuer)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
-        # A vehicle's clock may be behind when it boots.
-        .not_valid_before(min(now, until) - dt.timedelta(days=1))
-        .not_valid_after(until if end is None else min(until, end))
-        # Python asks for both key identifiers from 3.13 on, Zenoh does not.
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-    )
-
-
-def _usage(*, sign_certificates: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=not sign_certificates,
-        key_cert_sign=sign_certificates,
-        crl_sign=sign_certificates,
+    usage = x509.KeyUsage(
+        digital_signature=not is_authority,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
         content_commitment=False,
         key_encipherment=False,
         data_encipherment=False,
@@ -187,10 +159,21 @@ def _usage(*, sign_certificates: bool) -> x509.KeyUsage:
         encipher_only=False,
         decipher_only=False,
     )
-
-
-def _name(common_name: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject if issuer is None else issuer.subject)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        # A vehicle's clock may be behind when it boots.
+        .not_valid_before(min(now, until) - dt.timedelta(days=1))
+        .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
+        # Python asks for both key identifiers from 3.13 on, Zenoh does not.
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
+        .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
+        .add_extension(usage, critical=True)
+    )
 
 
 def _host(host: str) -> x509.GeneralName:
