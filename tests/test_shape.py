@@ -55,7 +55,7 @@ ONLY_BY_FOLDER = {
         "nedbus/client/publishing": "publisher_registry",
         "nedbus/settings": "load",
     },
-    "pydantic_settings": {"nedbus/settings": "model load"},
+    "pydantic_settings": {"nedbus/settings": "model"},
     "typing_extensions": {"nedbus_msgs": "functions", "nedbus/client": "sample subscription"},
     "pyulog": {"nedbus/recording": "ulog"},
     "mcap": {"nedbus/recording": "writer reader chunks records"},

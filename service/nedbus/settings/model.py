@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,16 +28,6 @@ def split_values(value: object) -> object:
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
-def _endpoint(value: str) -> str:
-    check_endpoints((value,), where="endpoint")
-    return value
-
-
-def _prefix(value: str) -> str:
-    check_prefix(value)
-    return value
-
-
 def split_http(where: str) -> tuple[str, int]:
     """Return host and port of HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
     host, _, port = where.rpartition(":")
@@ -51,21 +42,22 @@ def is_loopback(host: str) -> bool:
     return host in {"127.0.0.1", "::1", "localhost"}
 
 
-def _http(value: str) -> str:
-    split_http(value)
-    return value
+def _number_as_text(value: object) -> object:
+    return str(value) if type(value) is int else value
 
 
-def _text(value: object) -> object:
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+def _checked(check: Callable[[str], object]) -> AfterValidator:
+    """Return a validator that runs a check, which raises, and keeps the value."""
+
+    def validate(value: str) -> str:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
 
 
-def _vehicle(value: str) -> str:
-    check_vehicle(value)
-    return value
-
-
-Endpoints = Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], NoDecode, BeforeValidator(split_values)]
+_Endpoint = Annotated[str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))]
+Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_values)]
 
 
 class Settings(BaseSettings):
@@ -83,14 +75,14 @@ class Settings(BaseSettings):
     tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
-    prefix: Annotated[str, AfterValidator(_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
-    vehicle: Annotated[str, BeforeValidator(_text), AfterValidator(_vehicle)] = Field(
+    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
+    vehicle: Annotated[str, BeforeValidator(_number_as_text), _checked(check_vehicle)] = Field(
         "1", description="Vehicle of sources that name none"
     )
     source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
-        (), description="What is published: texts, or tables of TOML"
+        (), description="Published sources: texts, or tables of TOML"
     )
-    http: Annotated[str, AfterValidator(_http)] | None = Field(
+    http: Annotated[str, _checked(split_http)] | None = Field(
         None, description="HOST:PORT of /metrics, /healthz, /readyz, /vehicles and /status"
     )
     until_done: bool = Field(False, description="End when every finite source has ended")
@@ -114,18 +106,13 @@ class Settings(BaseSettings):
         """Whether a service with these settings joins other routers without being one itself."""
         return bool(self.connect) and not (self.listen or self.router_config)
 
-    @property
-    def file(self) -> Path | None:
-        """The file that was read, if there is one."""
-        return self._file
-
     def set_by(self, name: str) -> str:
-        """Return what sets a setting: the name of a flag, an environment variable, or a file; "" for a default."""
+        """Return the name of the flag, the environment variable or the file that sets this; "" for a default."""
         return self._set_by.get(name, "")
 
     @property
     def left_out(self) -> frozenset[str]:
-        """The settings of which `find_mistakes` left something out, as it is wrong or cannot be read."""
+        """The settings of which `find_mistakes` left something out, because it is wrong or cannot be read."""
         return self._left_out
 
     @property
