@@ -119,7 +119,7 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # else type checkers would accept any name
 
     def __getattr__(name: str) -> object:
-        """Import what a public name needs when it is first used."""
+        """Import the module of a public name when it is first used."""
         if name in __all__:
             module = next(each for each in map(_import_module, _MODULES) if name in each.__all__)
             return globals().setdefault(name, getattr(module, name))

@@ -1,4 +1,4 @@
-"""Optional dependencies: modules that are imported when they are first used, and what to install for them."""
+"""Optional dependencies: modules that are imported when they are first used, with a hint where they are missing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pk
 def needs(extra: str, module: str) -> Any:
     """Import and return a module that needs an extra, or another package.
 
-    Raises ConfigError, which says what to install, when something that it imports is missing.
+    Raises ConfigError, with the command that installs it, when a module is missing.
     """
     collects = gc.isenabled()
     gc.disable()  # as in the command line: nothing that is imported is garbage

@@ -158,11 +158,11 @@ def rules(
     if unknown := sorted(given - set(before)) if remove else []:
         raise ConfigError(str(file), f"it does not name vehicle {unknown[0]!r}")
     wanted = {*before, *given} if add else set(before) - given if remove else given
-    change = certificates.write_access_rules(file, wanted, prefix=prefix)
-    for line in [*(f"+ {name}" for name in change.added), *(f"- {name}" for name in change.removed)]:
+    added, removed = certificates.write_access_rules(file, wanted, prefix=prefix)
+    for line in [*(f"+ {name}" for name in added), *(f"- {name}" for name in removed)]:
         write(line)
-    changed = "the router takes it when it starts again" if change.added or change.removed else "no change"
-    write_stderr(f"{file} names {len(change.vehicles)} vehicles: {changed}")
+    changed = "the router takes it when it starts again" if added or removed else "no change"
+    write_stderr(f"{file} names {len(wanted)} vehicles: {changed}")
 
 
 def _read_names(source: Path) -> list[str]:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 from nedbus.extras import lazy_exports
 
-from .access_rules import RulesChange, read_access_rules, write_access_rules
+from .access_rules import read_access_rules, write_access_rules
 from .certificate import CERTIFICATE_PREFIX, DAYS, RENEW_WITHIN, Certificate, certificate_name
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ else:
     )
 
 __all__ = [
-    "CERTIFICATE_PREFIX", "DAYS", "RENEW_WITHIN", "Certificate", "CertificateEntry", "RulesChange", "certificate_name",
+    "CERTIFICATE_PREFIX", "DAYS", "RENEW_WITHIN", "Certificate", "CertificateEntry", "certificate_name",
     "list_certificates", "make_authority", "make_bundle", "make_certificate", "read_access_rules", "renew_certificate",
     "write_access_rules",
 ]  # fmt: skip

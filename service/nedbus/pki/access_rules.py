@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -27,7 +26,7 @@ _BLOCK: Final = re.compile(
 _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
 )
-# What a vehicle sends: data, last values, retransmissions (@adv), downsampled copies (@rate), liveliness, probes of
+# A vehicle sends: data, last values, retransmissions (@adv), downsampled copies (@rate), liveliness, probes of
 # `nedbus doctor`, rejection reports, and a status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (
@@ -42,24 +41,18 @@ _KEYS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class RulesChange:
-    """The vehicles that a router's file names now, and those that it did not name before, or names no more."""
-
-    vehicles: tuple[str, ...]
-    added: tuple[str, ...]
-    removed: tuple[str, ...]
-
-
 def read_access_rules(file: Path) -> list[str]:
     """Return the vehicles that a router's file names between its marks; raise ConfigError as `write_access_rules`."""
     return _SUBJECT.findall(_find_blocks(file)[1]["content"])
 
 
-def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> RulesChange:
+def write_access_rules(
+    file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX
+) -> tuple[list[str], list[str]]:
     """Write rules for exactly these vehicles into a router's file, whole or not at all; nothing else in it changes.
 
-    The names are sorted as people do, 2 before 10, and each is written once.
+    The names are sorted as people do, 2 before 10, and each is written once. Returns those that the file did not name
+    before, and those that it names no more.
 
     Raises AddressError for an invalid vehicle; ConfigError for no vehicle at all, and for a file that cannot be read or
     written or has no marks, which are those of `config/router-secure.json5`.
@@ -81,8 +74,7 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
             part.chmod(file.stat().st_mode)
     except OSError as exc:
         raise ConfigError.in_file(file, f"cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
-    added = tuple(name for name in names if name not in before)
-    return RulesChange(tuple(names), added, tuple(sorted(before - set(names), key=_natural)))
+    return [name for name in names if name not in before], sorted(before - set(names), key=_natural)
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:

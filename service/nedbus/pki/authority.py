@@ -1,6 +1,6 @@
 """Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
 
-The common name of a certificate is what the access control of `config/router-secure.json5` matches.
+The access control of `config/router-secure.json5` matches the common name of a certificate.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import datetime as dt
 import ipaddress
 import os
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -35,7 +36,7 @@ def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
     Raises PkiError when there is one already, or the folder cannot be written.
     """
     key = new_key()
-    return write_pair(folder, "ca", key, sign_authority(key, days=days))
+    return write_files(folder / "ca", sign_authority(key, days=days), key)
 
 
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
@@ -50,7 +51,7 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
         raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {MAX_NAME} characters without /")
     authority = Authority.read(folder)
     key = new_key()
-    return write_pair(folder, name, key, authority.sign(name, key.public_key(), hosts=hosts, days=days))
+    return write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +64,15 @@ class Authority:
     @classmethod
     def read(cls, folder: Path) -> Authority:
         """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
+        certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
         try:
-            certificate = x509.load_pem_x509_certificate((folder / "ca.crt").read_bytes())
-            key = serialization.load_pem_private_key((folder / "ca.key").read_bytes(), password=None)
+            key = serialization.load_pem_private_key(path.read_bytes(), password=None)
         except OSError as exc:
-            reason = (exc.strerror or "").lower()
-            raise PkiError(f"{exc.filename}: {reason}: make the CA first, 'nedbus pki ca'") from exc
-        except ValueError as exc:
-            raise PkiError(f"{folder}: ca.crt and ca.key are not a certificate and its key in PEM") from exc
+            raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: may this user read it?") from exc
+        except (ValueError, TypeError):
+            key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise PkiError(f"{folder / 'ca.key'} is not a key that 'nedbus pki ca' made")
+            raise PkiError(f"{path} is not a key that 'nedbus pki ca' made")
         return cls(certificate, key)
 
     def sign(
@@ -89,7 +89,7 @@ class Authority:
 
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
-    """Return the certificate of a CA for its key; what that key signed before stays valid under it."""
+    """Return the certificate of a CA for its key; certificates that the key signed before stay valid."""
     return _builder("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days).sign(key, hashes.SHA256())
 
 
@@ -109,25 +109,38 @@ def write_certificate(path: Path, certificate: x509.Certificate) -> None:
     _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
-def write_pair(
-    folder: Path, name: str, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate, *, replace: bool = False
+def write_files(
+    stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
 ) -> list[Path]:
-    """Write key and certificate, both or neither, and return their paths.
+    """Write `STEM.crt`, and `STEM.key` if a key is given, both or neither, and return their paths.
 
     Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
     """
-    paths = [folder / f"{name}.key", folder / f"{name}.crt"]
+    paths = [Path(f"{stem}.key")] * (key is not None) + [Path(f"{stem}.crt")]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with whole_file(paths[0], replace=replace) as first, whole_file(paths[1], replace=replace) as second:
-            write_key(first, key)
-            write_certificate(second, certificate)
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as opened:
+            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in paths]
+            if key is not None:
+                write_key(parts[0], key)
+            write_certificate(parts[-1], certificate)
     except FileExistsError as exc:
         reason = "it is not overwritten; move it away, or take another folder or name"
         raise PkiError(f"{exc.filename} exists: {reason}") from exc
     except OSError as exc:
-        raise PkiError(f"{folder / name} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+        raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
     return paths
+
+
+def load_certificate(path: Path) -> x509.Certificate:
+    """Read the certificate in a PEM file; raise PkiError when it is missing or damaged."""
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except OSError as exc:
+        hint = "make the CA first, 'nedbus pki ca'" if path.name == "ca.crt" else "may this user read it?"
+        raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
+    except ValueError as exc:
+        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
 
 
 def _write_new(path: Path, content: bytes, mode: int) -> None:

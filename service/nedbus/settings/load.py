@@ -28,7 +28,7 @@ _MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters of a variable that is taken
 def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if there is one) and the environment.
 
-    What is given here and not None overrides both.
+    Values given here that are not None override both.
 
     Raises ConfigError, with file, line and column or the name of the flag or variable.
     """
@@ -39,7 +39,7 @@ def load_settings(file: str | Path | None = None, **given: object) -> Settings:
 
 
 def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings, list[ConfigError]]:
-    """Return the settings as `load_settings` does, and all mistakes; what is wrong is left out of the settings."""
+    """Return the settings as `load_settings` does, and all mistakes; wrong values are left out of the settings."""
     flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
     path, content = None, dict[str, object]()

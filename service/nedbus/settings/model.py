@@ -24,7 +24,7 @@ def split_sources(value: object) -> object:
 
 
 def split_values(value: object) -> object:
-    """Split at commas what is one text."""
+    """Split one text at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
@@ -38,7 +38,7 @@ def split_http(where: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this host reaches what listens on this address."""
+    """Return whether only this host reaches a server on this address."""
     return host in {"127.0.0.1", "::1", "localhost"}
 
 
@@ -103,7 +103,7 @@ class Settings(BaseSettings):
 
     @property
     def is_client(self) -> bool:
-        """Whether a service with these settings joins other routers without being one itself."""
+        """True if a service with these settings joins other routers without being one itself."""
         return bool(self.connect) and not (self.listen or self.router_config)
 
     def set_by(self, name: str) -> str:
@@ -117,7 +117,7 @@ class Settings(BaseSettings):
 
     @property
     def tls(self) -> Tls | None:
-        """The files of a client of tls/ endpoints; raise ConfigError for half of what is needed."""
+        """The files of a client of tls/ endpoints; raise ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
                 raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")

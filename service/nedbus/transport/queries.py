@@ -25,7 +25,7 @@ MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
 _MAX_BYTES: Final = 2**26  # of the payloads and keys that are accepted from one query
-_CHANNEL: Final = 1024  # answers that wait; while it is full, the session waits for the thread that takes them
+_MAX_WAITING: Final = 1024  # answers
 _MAX_TOKENS: Final = 131_072  # that wait; Zenoh must never wait for room while it holds the lock of its session
 _MAX_CHANGES: Final = 4096  # of tokens, that wait
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
@@ -37,7 +37,7 @@ class Answers:
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply]) -> None:
         self.ended = False
-        """Whether the last answer was taken: all have answered, or the timeout has passed."""
+        """True once the last answer was taken: all have answered, or the timeout has passed."""
         self._handler = handler
 
     def take(self) -> list[zenoh.Reply]:
@@ -56,17 +56,20 @@ def ask(
     selector: str,
     *,
     timeout: float,
+    room: int = _MAX_WAITING,
+    accept_replies: zenoh.ReplyKeyExpr | None = None,
     priority: zenoh.Priority | None = None,
     congestion_control: zenoh.CongestionControl | None = None,
 ) -> Answers:
-    """Query all that answer on a selector, and return at once."""
+    """Query all that answer on a selector, and return at once; while `room` answers wait, the session waits too."""
     with while_open():
         handler = session.get(
             selector,
-            zenoh.handlers.FifoChannel(_CHANNEL),
+            zenoh.handlers.FifoChannel(room),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=zenoh_timeout(timeout),
+            accept_replies=accept_replies,
+            timeout=_zenoh_timeout(timeout),
             priority=priority,
             congestion_control=congestion_control,
         )
@@ -98,7 +101,7 @@ def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True
 
 def _wait(queries: Sequence[Answers], timeout: float) -> Iterator[zenoh.Reply]:
     """Yield answers as they come, until all queries have ended, or their timeout has passed."""
-    end = time.monotonic() + zenoh_timeout(timeout) + _GRACE
+    end = time.monotonic() + _zenoh_timeout(timeout) + _GRACE
     pause, longest = _PAUSES
     while (still := [answers for answers in queries if not answers.ended]) and time.monotonic() < end:
         taken = [reply for answers in still for reply in answers.take()]
@@ -117,7 +120,7 @@ def ask_alive(session: Session, key_expr: str, *, timeout: float) -> Answers:
     """Ask for the liveliness tokens that match, and return at once; one token is in each answer that has no error."""
     channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_MAX_TOKENS)
     with while_open():
-        return Answers(session.liveliness().get(key_expr, channel, timeout=zenoh_timeout(timeout)))
+        return Answers(session.liveliness().get(key_expr, channel, timeout=_zenoh_timeout(timeout)))
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
@@ -148,7 +151,7 @@ class AliveChanges:
         with while_open():
             subscriber = session.liveliness().declare_subscriber(key_expr, channel, history=True)
         self.missed = False
-        """Whether the channel overflowed; the reader clears it when it asks for all tokens."""
+        """True after the channel overflowed; the reader clears it when it asks for all tokens."""
         self.undeclare: Callable[[], object] = subscriber.undeclare
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
 
@@ -162,6 +165,6 @@ class AliveChanges:
         return changes
 
 
-def zenoh_timeout(timeout: float) -> float:
+def _zenoh_timeout(timeout: float) -> float:
     """Return a timeout that Zenoh accepts: neither 0 nor infinity."""
     return min(max(timeout, 0.001), 86_400.0)

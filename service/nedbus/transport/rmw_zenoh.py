@@ -25,7 +25,7 @@ NO_HASH: Final = "TypeHashNotSupported"
 BRIDGED_ENCODING: Final = "application/cdr;nedbus"
 """The encoding of messages that nedbus published to ROS 2: they must not be bridged back. ROS 2 does not look at it."""
 
-_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: what PX4 offers
+_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: as PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
 _MAX_KEY: Final = 512  # characters; PX4 and ROS 2 have half of that

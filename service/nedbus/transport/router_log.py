@@ -91,7 +91,7 @@ def _protocol_and_port(locator: str) -> tuple[str, str]:
 def log_refusals() -> None:
     """Log each client that a router of this process refuses from now on; Zenoh does not say from where it connects.
 
-    It takes the place of stdout, to which all else passes on: what RUST_LOG asks of Zenoh.
+    It takes the place of stdout, to which all else passes on: the lines that RUST_LOG asks of Zenoh.
     """
     stdout = os.dup(1)
     read, write = os.pipe()

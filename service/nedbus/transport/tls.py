@@ -1,4 +1,4 @@
-"""TLS of a client: the files that it needs for `tls/` endpoints, and what is wrong with them."""
+"""TLS of a client: the files that it needs for `tls/` endpoints, and the mistakes in them."""
 
 from __future__ import annotations
 

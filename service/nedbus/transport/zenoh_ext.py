@@ -15,7 +15,7 @@ from typing import Final
 
 import zenoh
 
-from .queries import MAX_ANSWERS, Answers, zenoh_timeout
+from .queries import MAX_ANSWERS, Answers, ask
 from .session import RawSample, Session, entity_name, while_open
 
 Heartbeats = dict[tuple[str, str], int]
@@ -59,7 +59,7 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
 
 @lru_cache(_MAX_HEARTBEATS)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
-    """Return the stream and the name of the publisher on whose key a heartbeat came."""
+    """Return the stream and the name of the publisher in the key of a heartbeat."""
     found = _KEY.fullmatch(heartbeat)
     return None if found is None else (found[1], f"{found[2]}:{found[3]}")
 
@@ -75,7 +75,7 @@ class RetransmitRequest:
 
     @property
     def ended(self) -> bool:
-        """Whether the last answer was taken, or the timeout has passed."""
+        """True once the last answer was taken, or the timeout has passed."""
         return self._answers.ended
 
     def take(self) -> dict[int, RawSample]:
@@ -96,14 +96,7 @@ def request_samples(session: Session, key: str, publisher: str, numbers: range, 
     `publisher` is its name as `entity_name` returns it. The key is that of its cache, without wildcards: a router finds
     it at once, while a key expression is compared with the queryables of all publishers.
     """
-    with while_open():
-        handler = session.get(
-            f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}",
-            # With room for all: a channel that is full holds up all that its session receives.
-            zenoh.handlers.FifoChannel(min(len(numbers), MAX_ANSWERS) + _SPARE),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            accept_replies=zenoh.ReplyKeyExpr.ANY,
-            timeout=zenoh_timeout(timeout),
-        )
-    return RetransmitRequest(Answers(handler), key, publisher, numbers)
+    selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
+    room = min(len(numbers), MAX_ANSWERS) + _SPARE
+    answers = ask(session, selector, timeout=timeout, room=room, accept_replies=zenoh.ReplyKeyExpr.ANY)
+    return RetransmitRequest(answers, key, publisher, numbers)
