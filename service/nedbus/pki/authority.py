@@ -116,7 +116,7 @@ def write_files(
 
     Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
     """
-    paths = [Path(f"{stem}.key")] * (key is not None) + [Path(f"{stem}.crt")]
+    paths = [Path(f"{stem}.crt")] if key is None else [Path(f"{stem}.key"), Path(f"{stem}.crt")]
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:

@@ -1,4 +1,4 @@
-"""Zenoh endpoints: the default, their form, and the one that a client on this host dials for one that a router listens on."""
+"""Zenoh endpoints: the default, their form, and where a client on this host dials a router."""
 
 from __future__ import annotations
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 from .queries import query
@@ -39,13 +40,10 @@ def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
     A router is left out whose admin space is off or denied, or whose answer is larger than this session takes: 2**18
     bytes for a client, about 1,400 sessions.
     """
-    states: dict[str, RouterState] = {}
-    for answer in query(session, "@/*/router", timeout=timeout):
-        if len(answer.payload) <= _MAX_ANSWER_BYTES and len(states) < _MAX_ROUTERS:
-            state = read_state(str(answer.key_expr), answer.payload.to_bytes())
-            if state is not None:
-                states[state.zid] = state
-    return [states[zid] for zid in sorted(states)]
+    answers = query(session, "@/*/router", timeout=timeout)
+    small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
+    states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
+    return sorted(islice(states, _MAX_ROUTERS), key=lambda state: state.zid)
 
 
 def read_state(key: str, payload: bytes) -> RouterState | None:
