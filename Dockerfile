@@ -6,7 +6,7 @@ FROM ${NEDBUS_BASE_IMAGE} AS dependencies
 RUN python3 -m venv /opt/nedbus
 WORKDIR /build
 COPY pyproject.toml LICENSE ./
-RUN mkdir -p service/nedbus schemas/nedbus_msgs \
+RUN mkdir -p service/nedbus schemas/nedbus_msgs packaging/fleet \
     && echo '__version__ = "0"' > service/nedbus/__init__.py \
     && touch schemas/nedbus_msgs/__init__.py README.md \
     && /opt/nedbus/bin/pip install --no-cache-dir ".[mavlink,mcap,metrics,pki,web]" \
@@ -17,6 +17,7 @@ FROM dependencies AS code
 COPY README.md ./
 COPY service service
 COPY schemas schemas
+COPY packaging/fleet packaging/fleet
 RUN /opt/nedbus/bin/pip install --no-cache-dir --no-deps --prefix /code .
 
 FROM ${NEDBUS_BASE_IMAGE}

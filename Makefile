@@ -48,8 +48,10 @@ wheel: $(DEV)  ## build the wheel, install it in a new virtual environment, and 
 	rm -rf dist build/wheel-venv
 	$(BIN)/python -m build --wheel
 	$(PYTHON) -m venv build/wheel-venv
-	build/wheel-venv/bin/pip install -q dist/nedbus-*.whl
+	build/wheel-venv/bin/pip install -q "$$(echo dist/nedbus-*.whl)[pki]"
 	cd build && wheel-venv/bin/python -c "import nedbus, nedbus_msgs" && wheel-venv/bin/nedbus --version
+	rm -rf build/pki build/vehicle-1
+	cd build && wheel-venv/bin/nedbus pki ca pki && wheel-venv/bin/nedbus pki enroll pki 1 -r tls/127.0.0.1:7447
 
 bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck readers, pacing of a replay, an idle service
 	$(BIN)/pip install -q --group bench

@@ -8,7 +8,7 @@ from typing import Final
 import pytest
 
 import nedbus
-from nedbus.transport import make_authority, make_certificate
+from nedbus.pki import make_authority, make_certificate
 from tests.ports import free_endpoint
 
 CONFIG: Final = Path(__file__).parents[1] / "config"

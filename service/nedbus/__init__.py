@@ -106,13 +106,8 @@ __all__ = [
 # `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.
 _MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client")
 _WITH_NUMPY = {
-    "DTYPE": "nedbus_msgs.arrays",
-    "MessageArray": "nedbus_msgs.arrays",
-    "dtype_of": "nedbus_msgs.arrays",
-    "to_array": "nedbus_msgs.arrays",
-    "to_message": "nedbus_msgs.arrays",
-    "Batch": "nedbus.client",
-    **dict.fromkeys(("UtcOffset", "addresses_of", "align", "missing_of", "read", "utc_of"), "nedbus.recording"),
+    "nedbus_msgs.arrays": ("DTYPE", "MessageArray", "dtype_of", "to_array", "to_message"),
+    "nedbus.recording": ("UtcOffset", "addresses_of", "align", "missing_of", "read", "utc_of"),
 }
 
 
@@ -124,13 +119,11 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:  # else type checkers would accept any name
 
     def __getattr__(name: str) -> object:
-        """Import what a public name needs when it is first used."""
-        if name not in __all__ and name in _import_module("nedbus_msgs").MESSAGES:
+        """Import the module of a public name when it is first used."""
+        if name in __all__:
+            modules = [module for module, names in _WITH_NUMPY.items() if name in names] or _MODULES
+            module = next(each for each in map(_import_module, modules) if name in each.__all__)
+            return globals().setdefault(name, getattr(module, name))
+        if name in _import_module("nedbus_msgs").MESSAGES:
             return getattr(_import_module("nedbus_msgs.messages"), name)
-        if name not in __all__:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        if name in _WITH_NUMPY:
-            return getattr(_import_module(_WITH_NUMPY[name]), name)
-        for module in map(_import_module, _MODULES):
-            globals().update({each: vars(module)[each] for each in __all__ if each in vars(module)})
-        return globals()[name]
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -42,24 +42,10 @@ from nedbus_msgs import (
 )
 
 __all__ = [
-    "AddressError",
-    "AddressInUseError",
-    "ClosedError",
-    "ConfigError",
-    "ConnectError",
-    "DecodeError",
-    "EncodeError",
-    "ForkError",
-    "InvalidMessageError",
-    "LayoutError",
-    "ListenError",
-    "NedbusError",
-    "NoDataError",
-    "OutputError",
-    "PkiError",
-    "SourceError",
-    "UnknownLayoutError",
-]
+    "AddressError", "AddressInUseError", "ClosedError", "ConfigError", "ConnectError", "DecodeError", "EncodeError",
+    "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError", "OutputError",
+    "PkiError", "SourceError", "UnknownLayoutError",
+]  # fmt: skip
 
 
 class AddressInUseError(NedbusError, ValueError):
@@ -89,30 +75,24 @@ class ConfigError(NedbusError, ValueError):
         return cls(f"{path}{position}", reason)
 
 
-_TLS_HINT = (
-    " check that tls_ca is the router's authority, that it signed tls_certificate, that neither has expired, and that"
-    " the host in the endpoint is one of the router certificate's"
-)
-
-
 class ConnectError(NedbusError, ConnectionError):
-    """Raised when no endpoint answered in time; `full` is the one whose router has no room for more sessions."""
+    """Raised when no endpoint answered in time."""
 
-    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "", *, full: str = "") -> None:
-        self.endpoints, self.full = tuple(endpoints), full
-        if full:
-            super().__init__(
-                f"the router at {full} has no room for more sessions (tried for {seconds:.3g} s): raise max_sessions"
-                " in its configuration, or name a router that has room with --connect or NEDBUS_CONNECT"
-            )
-            return
-        secure = any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints)
+    def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
+        self.endpoints = tuple(endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
-        super().__init__(
+        text = (
             f"nothing answers at {' or '.join(endpoints)} ({tried}): start 'nedbus serve' or a Zenoh router there, or"
-            " name another endpoint with --connect or NEDBUS_CONNECT"
-            + ("; a router that does answer refuses a certificate without a word:" + _TLS_HINT if secure else "")
+            " name another endpoint with --connect or NEDBUS_CONNECT; a router that has no room for more sessions"
+            " refuses without a word: 'nedbus doctor' tells more"
         )
+        if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
+            text += (
+                "; so does one that does not accept a certificate: check that tls_ca is the router's authority, that it"
+                " signed tls_certificate, that neither has expired, and that the host in the endpoint is one of the"
+                " router certificate's"
+            )
+        super().__init__(text)
 
 
 class ListenError(NedbusError, OSError):
@@ -141,7 +121,7 @@ class PkiError(NedbusError):
 
 
 class OutputError(NedbusError, OSError):
-    """Raised when a file cannot be written; of a recording, what was flushed before can be read."""
+    """Raised when a file cannot be written; of a recording, the messages flushed before can be read."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {

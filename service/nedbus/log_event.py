@@ -1,4 +1,4 @@
-"""What a line of the log is about: one of a closed list of events, and the stream, the source and the reason."""
+"""The events of the log, a closed list, and the facts of one: stream, source and reason."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from nedbus_msgs import Address
 class Event:
     """One event.
 
-    `doc`: what happened, as the manual says it.
-    `limited`: somebody else can cause it as often as they like; the log then leaves lines out. What a process says of
-    its own life, and what its own pauses limit, is never left out.
+    `doc`: its meaning, as in the manual.
+    `limited`: a peer can cause it at any rate, so the log leaves lines out. A process's own life, and what its own
+    pauses limit, is never left out.
     """
 
     doc: str
@@ -33,7 +33,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "notice": Event("what a person at a terminal should know", limited=False),
     "error": Event("the command cannot go on; it ends", limited=False),
     "bug": Event("something unexpected, a bug of nedbus; one message, answer or page is left out"),
-    "left-out": Event("so many lines (`count`) of one event (`of`) were left out", limited=False),
+    "left-out": Event("a number of lines (`count`) of one event (`of`) were left out", limited=False),
     # a source
     "listening": Event("a live source is open", limited=False),
     "opened": Event("a replay is open: what is in it", limited=False),
@@ -78,7 +78,7 @@ EVENTS: Final[Mapping[str, Event]] = {
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What is known of a line besides its text; a log record carries it as `about`."""
+    """The facts of a line besides its text; a log record carries them as `about`."""
 
     event: str
     vehicle: str | None = None
@@ -93,7 +93,7 @@ class About:
 def about(
     event: str, address: Address | None = None, *, source: str | None = None, reason: str | None = None
 ) -> dict[str, About]:
-    """Return the `extra` of a log call: an event of EVENTS, and what is known of where it happened and why."""
+    """Return the `extra` of a log call: an event of EVENTS, and where it happened and why, if known."""
     if address is None:
         return {"about": About(event, source=source, reason=reason)}
     return {"about": About(event, address.vehicle, address.topic, address.instance, source, reason)}

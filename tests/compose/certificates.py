@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 import nedbus
-from nedbus.transport import make_authority, make_certificate
+from nedbus.pki import make_authority, make_certificate
 from tests.waits import DEADLINE
 
 from .stack import ROOT, Stack

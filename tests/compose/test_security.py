@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import nedbus
-from nedbus.transport import make_authority, make_certificate
+from nedbus.pki import make_authority, make_certificate
 from nedbus_msgs import Address
 from tests.messages import VLP, message
 from tests.processes import Process

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from nedbus.transport import make_authority, make_bundle, make_certificate
+from nedbus.pki import make_authority, make_bundle, make_certificate
 from tests.waits import wait_for
 
 from .machine import Machine

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import nedbus
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
-from nedbus.transport import KeptAnswers, RawSample, Session, ask_kept
+from nedbus.transport import RawSample, RetransmitRequest, Session, request_samples
 
 from .publishing import publish, take
 
@@ -44,13 +44,13 @@ class Lossy:
             return SimpleNamespace(ended=True, take=dict)
         self.open += 1
         self.most = max(self.most, self.open)
-        return Counted(ask_kept(session, key, publisher, numbers, timeout=timeout), self)
+        return Counted(request_samples(session, key, publisher, numbers, timeout=timeout), self)
 
 
 class Counted:
     """Answers of a question that counts as open until they have ended."""
 
-    def __init__(self, answers: KeptAnswers, lossy: Lossy) -> None:
+    def __init__(self, answers: RetransmitRequest, lossy: Lossy) -> None:
         self._answers = answers
         self._lossy = lossy
 

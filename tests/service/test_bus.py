@@ -124,7 +124,7 @@ def test_more_vehicles_come_than_are_kept_until_somebody_asks(
     endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then all are asked for once more: none is missing, and none that has gone is still there."""
-    monkeypatch.setattr("nedbus.transport.queries._CHANGES", 4)
+    monkeypatch.setattr("nedbus.transport.queries._MAX_CHANGES", 4)
     gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
     gone.undeclare()

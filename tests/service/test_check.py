@@ -9,9 +9,9 @@ import pytest
 
 from nedbus.daemon import check_router_file
 from nedbus.errors import ConfigError
+from nedbus.pki import make_authority, make_certificate
 from nedbus.settings import load_settings
 from nedbus.sources import parse_source
-from nedbus.transport import make_authority, make_certificate
 from tests.command_line import run_command
 from tests.ports import free_endpoint
 from tests.processes import Start

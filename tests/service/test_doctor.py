@@ -24,8 +24,9 @@ from pymavlink.dialects.v20 import common as mavlink
 import nedbus
 from nedbus.client import QueryServer
 from nedbus.doctor import Finding, State, examine
+from nedbus.pki import Certificate
 from nedbus.settings import load_settings
-from nedbus.transport import NO_HASH, Certificate, Session, TopicKey, open_client, open_router, publisher_token
+from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router, publisher_token
 from nedbus_msgs import dds_type, encode, status_key
 from tests.certificates import files_of, pki, secure_endpoint, tls_of, write_config
 from tests.command_line import run_command
@@ -112,7 +113,6 @@ def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
     """An HTTP server is told from a router and from TLS; whoever never answers does not hold up the doctor."""
     for name in ("doctor.endpoint._OPEN", "doctor.handshake._TIMEOUT", "doctor.speaker._TIMEOUT"):
         monkeypatch.setattr(f"nedbus.{name}", 0.2)
-    monkeypatch.setattr("nedbus.transport.full_router._PATIENCE", 0.2)
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
         thread.start()

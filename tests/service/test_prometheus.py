@@ -16,7 +16,8 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.transport import Session, make_authority, make_certificate, write_access_rules
+from nedbus.pki import make_authority, make_certificate, write_access_rules
+from nedbus.transport import Session
 from nedbus_msgs import encode
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleStatus

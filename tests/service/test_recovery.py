@@ -19,7 +19,7 @@ from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import take_all
-from nedbus.transport import KeptAnswers, Session, ask_kept, open_client, open_router
+from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
 from nedbus_msgs import encode
 from tests.first_message import encoding_of
 from tests.messages import VLP, message
@@ -48,7 +48,7 @@ def lossy(
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue, housekeeping=housekeeping), publisher)
-        monkeypatch.setattr(retransmission, "ask_kept", lossy.ask)
+        monkeypatch.setattr(retransmission, "request_samples", lossy.ask)
         with lossy.subscription:
             wait_for_subscriber(publisher)
             yield lossy
@@ -71,10 +71,10 @@ def test_what_is_missing_is_asked_for_by_the_exact_key(lossy: Lossy, unanswered:
 def test_what_a_publisher_keeps_no_more_is_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """A publisher that sends the newest one has no more: the rest is lost, once it was asked for a second time."""
 
-    def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> KeptAnswers:
-        return ask_kept(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
+    def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
+        return request_samples(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
 
-    monkeypatch.setattr(retransmission, "ask_kept", forget)
+    monkeypatch.setattr(retransmission, "request_samples", forget)
     lossy.queue.missing = {1, 2, 3, 4}
     lossy.publish(*range(6))
     samples = [lossy.subscription.receive(DEADLINE) for _ in range(4)]

@@ -17,20 +17,13 @@ import zenoh
 import nedbus
 from nedbus.daemon import Daemon
 from nedbus.doctor import Finding
+from nedbus.doctor.endpoint import check_endpoint
 from nedbus.doctor.network import check_network
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, router_watch, service_pages
 from nedbus.settings import load_settings
-from nedbus.transport import (
-    RouterState,
-    Session,
-    ask_routers,
-    file_limit,
-    open_client,
-    open_router,
-    router_max_sessions,
-)
-from nedbus.transport.file_limit import allow_sessions
+from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, router, router_max_sessions
+from nedbus.transport.router import allow_sessions
 from nedbus.transport.router_state import read_state
 from tests.certificates import CONFIG
 from tests.certificates import write_config as write_shipped
@@ -277,6 +270,19 @@ def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         wait_for(lambda: shows("sessions{"), what="room")
 
 
+def test_client_of_a_full_router(tmp_path: Path) -> None:
+    """It is told of the sessions as one cause, in the error and by the doctor; when one has gone it gets in."""
+    endpoint = free_endpoint()
+    unicast = {"unicast": {"max_sessions": 1}}
+    with open_router(config_file=write_config(tmp_path, endpoint, transport=unicast)):
+        with open_client([endpoint], timeout=5.0):
+            with pytest.raises(nedbus.ConnectError, match=r"no room for more sessions .*'nedbus doctor'"):
+                nedbus.connect(endpoint, timeout=0.1)
+            *_, finding = check_endpoint(endpoint, None)
+            assert (finding.state, "max_sessions" in finding.advice) == ("wrong", True)
+        nedbus.connect(endpoint, timeout=DEADLINE).close()
+
+
 class Once(threading.Event):
     """The exception that ends a loop where it would wait."""
 
@@ -338,7 +344,7 @@ def test_files_of_a_router(
     limits: Limits, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The soft limit is raised as far as sessions and handshakes need, and what is missing is told."""
-    monkeypatch.setattr(file_limit, "resource", limits)
+    monkeypatch.setattr(router, "resource", limits)
     with caplog.at_level(logging.WARNING):
         allow_sessions(1000, pending=1000)
     assert limits.now[0] == soft

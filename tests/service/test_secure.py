@@ -18,7 +18,8 @@ import zenoh
 import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.daemon.write_permission import WritePermission
-from nedbus.transport import Session, open_client, open_router, write_access_rules
+from nedbus.pki import write_access_rules
+from nedbus.transport import Session, open_client, open_router
 from nedbus_msgs import Address, define, encode, field_type
 from nedbus_msgs.arrays import to_array
 from tests.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config

@@ -10,9 +10,10 @@ import pytest
 import nedbus
 from nedbus import Tls
 from nedbus.errors import ConfigError, ConnectError, ListenError
+from nedbus.pki import make_authority, make_certificate
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import make_authority, make_certificate, open_client, open_router
+from nedbus.transport import open_client, open_router
 from nedbus.transport.endpoints import explain_endpoints
 from tests.command_line import run_command
 from tests.ports import free_endpoint

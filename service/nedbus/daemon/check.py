@@ -14,9 +14,10 @@ from urllib.parse import urlsplit
 
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.log_event import about
+from nedbus.pki import Certificate
 from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
 from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
-from nedbus.transport import Certificate, Tls, check_pem, read_router_config, router_endpoints
+from nedbus.transport import Tls, check_pem, read_router_config, router_endpoints
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .plan import Planned, plan_sources

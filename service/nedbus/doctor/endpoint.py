@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Final
 
-from nedbus.errors import ConnectError, NedbusError
-from nedbus.transport import Certificate, Tls, open_client, split_endpoint
+from nedbus.errors import NedbusError
+from nedbus.pki import Certificate
+from nedbus.transport import Tls, open_client, split_endpoint
 
 from .finding import Finding, brief
 from .handshake import look_at, verify
@@ -29,13 +30,16 @@ _KINDS: Final = {  # what listens there, and what to do
     "zenoh": ("a Zenoh router answers there, without TLS", "write tcp/ in place of tls/"),
     "silent": (
         "it accepts the connection and says nothing",
-        f"is the process stuck, or is it no Zenoh router? {_OTHER}",
+        f"has the router no room for more sessions (max_sessions, docs/hosts.md), or is it stuck? else {_OTHER}",
     ),
     "closes": (
         "it closes the connection without an answer",
         f"is it none of Zenoh's? {_OTHER}",
     ),
-    "no session": ("no session opens", "is it of another version of Zenoh? the log of the router says more"),
+    "no session": (
+        "no session opens",
+        "has it no room for more sessions (max_sessions, docs/hosts.md), or another version of Zenoh?",
+    ),
 }
 
 
@@ -98,9 +102,6 @@ def _open(endpoint: str, tls: Tls | None, where: tuple[str, str, int] | None) ->
         with open_client([endpoint], timeout=_OPEN, tls=tls):
             return Finding(_NAME, endpoint, "ok", "a Zenoh router answers")
     except NedbusError as exc:
-        if isinstance(exc, ConnectError) and exc.full:
-            advice = "raise max_sessions in the router's configuration, or name another router: docs/hosts.md"
-            return Finding(_NAME, endpoint, "wrong", "the router has no room for more sessions", advice)
         if where is None or where[0] not in {"tcp", "tls"}:
             return Finding(_NAME, endpoint, "wrong", str(exc), "start a Zenoh router there")
     return _explain(endpoint, *where)

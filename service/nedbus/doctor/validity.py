@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from typing import Final
 
 from nedbus.errors import ConfigError
-from nedbus.transport import Certificate, Tls
+from nedbus.pki import Certificate
+from nedbus.transport import Tls
 
 from .finding import Finding, brief
 

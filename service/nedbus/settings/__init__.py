@@ -5,12 +5,6 @@ from .model import Settings, is_loopback, split_http
 from .toml_file import place_at
 
 __all__ = [
-    "Settings",
-    "find_mistakes",
-    "is_loopback",
-    "load_settings",
-    "locate_setting",
-    "locate_source",
-    "place_at",
+    "Settings", "find_mistakes", "is_loopback", "load_settings", "locate_setting", "locate_source", "place_at",
     "split_http",
-]
+]  # fmt: skip

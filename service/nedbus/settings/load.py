@@ -6,13 +6,12 @@ import difflib
 import logging
 import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
-from pydantic_settings import BaseSettings, InitSettingsSource, PydanticBaseSettingsSource
 
 from nedbus.errors import ConfigError
 from nedbus.log_event import about
@@ -23,13 +22,13 @@ from .toml_file import find_key, find_source, read_text, read_toml
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_BEGUN: Final = len("NEDBUS_TLS")  # characters of a variable from which on it is taken for the beginning of a setting
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters of a variable that is taken for the beginning of a setting
 
 
 def load_settings(file: str | Path | None = None, **given: object) -> Settings:
     """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if there is one) and the environment.
 
-    What is given here and not None overrides both.
+    Values given here that are not None override both.
 
     Raises ConfigError, with file, line and column or the name of the flag or variable.
     """
@@ -40,8 +39,8 @@ def load_settings(file: str | Path | None = None, **given: object) -> Settings:
 
 
 def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings, list[ConfigError]]:
-    """Return the settings as `load_settings` does, and all mistakes; what is wrong is left out of the settings."""
-    flags: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    """Return the settings as `load_settings` does, and all mistakes; wrong values are left out of the settings."""
+    flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
     path, content = None, dict[str, object]()
     try:
@@ -50,14 +49,14 @@ def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Sett
     except ConfigError as exc:
         mistakes.append(exc)
     is_read, wrong = not mistakes, set[str]()
+    values: dict[str, Any] = {name: value for name, value in content.items() if not _from_environment(name)} | flags
     try:
-        settings = _with_file(content)(**flags)
+        settings = Settings(**values)
     except ValidationError as exc:
         details = exc.errors()
         mistakes += [_setting_error(path, flags, detail) for detail in details]
         wrong = {str(detail["loc"][0]) for detail in details}
-        rest = {name: value for name, value in content.items() if name not in wrong}
-        settings = _with_file(rest)(**_without_mistakes(content, flags, details))
+        settings = Settings(**_without_mistakes(values, details))
     _warn_of_misspelt_variables()
     settings._set_by.update({name: _set_by(name, path, flags) for name in settings.model_fields_set})
     settings._file = path
@@ -67,40 +66,51 @@ def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Sett
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
     """Return the error of a setting with its place: file, line and column, or the name of the flag or variable."""
-    setter = settings.set_by(name)
-    if settings.file is None or setter != str(settings.file):
-        return ConfigError(setter or name, reason)
-    line, column = find_key(read_text(settings.file), name)
-    return ConfigError.in_file(settings.file, reason, line=line, column=column)
+    return _locate(settings._file, settings.set_by(name) or name, name, reason)
 
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
     """Return the error of a source with its place: file, line and column, or the name of the variable."""
     setter = settings.set_by("source")
-    if settings.file is None or setter != str(settings.file):
+    if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
-    line, column = find_source(read_text(settings.file), settings.source, index, error.key)
-    return ConfigError.in_file(settings.file, str(error), line=line, column=column)
+    line, column = find_source(read_text(settings._file), settings.source, index, error.key)
+    return ConfigError.in_file(settings._file, str(error), line=line, column=column)
+
+
+def _locate(path: Path | None, setter: str, name: str, reason: str) -> ConfigError:
+    if path is None or setter != str(path):
+        return ConfigError(setter, reason)
+    line, column = find_key(read_text(path), name)
+    return ConfigError.in_file(path, reason, line=line, column=column)
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
     """Return the file to read, None if there is none; raise ConfigError when one is named that does not exist."""
-    path = Path(given) if given else (Path(os.environ["NEDBUS_CONFIG"]) if os.environ.get("NEDBUS_CONFIG") else None)
-    if path is not None and not path.is_file():
-        raise ConfigError.in_file(path, "there is no such file")
-    return path or (DEFAULT_FILE if DEFAULT_FILE.is_file() else None)
+    named = given or os.environ.get("NEDBUS_CONFIG")
+    if not named:
+        return DEFAULT_FILE if DEFAULT_FILE.is_file() else None
+    if not Path(named).is_file():
+        raise ConfigError.in_file(Path(named), "there is no such file")
+    return Path(named)
 
 
-def _without_mistakes(
-    content: Mapping[str, object], flags: Mapping[str, Any], details: Sequence[ErrorDetails]
-) -> dict[str, Any]:
-    """Return the flags, with the default of each wrong setting in its place, or with what is right of a list."""
+def _variable(name: str) -> str:
+    return f"NEDBUS_{name.upper()}"
+
+
+def _from_environment(name: str) -> str | None:
+    return os.environ.get(_variable(name))
+
+
+def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
+    """Return the values, with the default in place of each wrong setting, or a list without its wrong items."""
     wrong: dict[str, set[int | str]] = defaultdict(set)
     for detail in details:
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
-    kept = {name: value for name, value in flags.items() if name not in wrong}
+    kept = {name: value for name, value in values.items() if name not in wrong}
     for name in wrong.keys() & Settings.model_fields.keys():
-        value = flags.get(name) or os.environ.get(f"NEDBUS_{name.upper()}") or content.get(name)
+        value = values.get(name) or _from_environment(name)
         items = split_sources(value) if name == "source" else split_values(value)
         if wrong[name] and isinstance(items, list | tuple):
             kept[name] = tuple(item for index, item in enumerate(items) if index not in wrong[name])
@@ -109,50 +119,27 @@ def _without_mistakes(
     return kept
 
 
-def _set_by(name: str, path: Path | None, flags: Mapping[str, object]) -> str:
-    """Return what sets a setting: the flag or argument of that name, its environment variable, or the file."""
-    variable = f"NEDBUS_{name.upper()}"
-    if name in flags or not (os.environ.get(variable) or path):
+def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
+    """Return the name of the flag or argument, of the environment variable, or of the file that sets a setting."""
+    if name in flags:
         return name
-    return variable if os.environ.get(variable) else str(path)
+    return _variable(name) if _from_environment(name) else str(path or name)
 
 
 def _warn_of_misspelt_variables() -> None:
     """Warn of environment variables that look like a setting, and are none."""
-    known = {f"NEDBUS_{name.upper()}" for name in (*Settings.model_fields, "config", "log_level", "log_format")}
+    known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
-        begun = sorted(each for each in known if each.startswith(variable) and len(variable) >= _BEGUN)
-        if near := begun or difflib.get_close_matches(variable, known, 1, 0.85):
+        longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)
+        if near := longer or difflib.get_close_matches(variable, known, 1, 0.85):
             _log.warning("%s is not a setting: did you mean %s?", variable, " or ".join(near), extra=about("setting"))
 
 
-def _with_file(content: Mapping[str, object]) -> type[Settings]:
-    """Return Settings with this content of a file below the environment, which is below flags and arguments."""
-
-    class FileSettings(Settings):
-        @classmethod
-        def settings_customise_sources(
-            cls,
-            settings_cls: type[BaseSettings],
-            init_settings: PydanticBaseSettingsSource,
-            env_settings: PydanticBaseSettingsSource,
-            dotenv_settings: PydanticBaseSettingsSource,
-            file_secret_settings: PydanticBaseSettingsSource,
-        ) -> tuple[PydanticBaseSettingsSource, ...]:
-            return init_settings, env_settings, InitSettingsSource(settings_cls, dict(content))
-
-    return FileSettings
-
-
-def _setting_error(path: Path | None, flags: Mapping[str, object], detail: ErrorDetails) -> ConfigError:
+def _setting_error(path: Path | None, flags: Collection[str], detail: ErrorDetails) -> ConfigError:
     name = str(detail["loc"][0])
     reason = detail["msg"].removeprefix("Value error, ").removeprefix("endpoint: ")
     if detail["type"] == "extra_forbidden":
         reason = f"there is no setting {name!r}: choose from {', '.join(Settings.model_fields)}"
     elif "ctx" not in detail:
         reason = f"{name}: {reason} (is {detail['input']!r:.60})"
-    setter = _set_by(name, path, flags)
-    if path is None or setter != str(path):
-        return ConfigError(setter, reason)
-    line, column = find_key(read_text(path), name)
-    return ConfigError.in_file(path, reason, line=line, column=column)
+    return _locate(path, _set_by(name, path, flags), name, reason)

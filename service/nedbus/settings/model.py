@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,18 +24,8 @@ def split_sources(value: object) -> object:
 
 
 def split_values(value: object) -> object:
-    """Split at commas what is one text."""
+    """Split one text at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
-
-
-def _endpoint(value: str) -> str:
-    check_endpoints((value,), where="endpoint")
-    return value
-
-
-def _prefix(value: str) -> str:
-    check_prefix(value)
-    return value
 
 
 def split_http(where: str) -> tuple[str, int]:
@@ -47,25 +38,26 @@ def split_http(where: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this host reaches what listens on this address."""
+    """Return whether only this host reaches a server on this address."""
     return host in {"127.0.0.1", "::1", "localhost"}
 
 
-def _http(value: str) -> str:
-    split_http(value)
-    return value
+def _number_as_text(value: object) -> object:
+    return str(value) if type(value) is int else value
 
 
-def _text(value: object) -> object:
-    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+def _checked(check: Callable[[str], object]) -> AfterValidator:
+    """Return a validator that runs a check, which raises, and keeps the value."""
+
+    def validate(value: str) -> str:
+        check(value)
+        return value
+
+    return AfterValidator(validate)
 
 
-def _vehicle(value: str) -> str:
-    check_vehicle(value)
-    return value
-
-
-Endpoints = Annotated[tuple[Annotated[str, AfterValidator(_endpoint)], ...], NoDecode, BeforeValidator(split_values)]
+_Endpoint = Annotated[str, _checked(lambda endpoint: check_endpoints((endpoint,), where="endpoint"))]
+Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_values)]
 
 
 class Settings(BaseSettings):
@@ -83,14 +75,14 @@ class Settings(BaseSettings):
     tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
-    prefix: Annotated[str, AfterValidator(_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
-    vehicle: Annotated[str, BeforeValidator(_text), AfterValidator(_vehicle)] = Field(
+    prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
+    vehicle: Annotated[str, BeforeValidator(_number_as_text), _checked(check_vehicle)] = Field(
         "1", description="Vehicle of sources that name none"
     )
     source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(
-        (), description="What is published: texts, or tables of TOML"
+        (), description="Published sources: texts, or tables of TOML"
     )
-    http: Annotated[str, AfterValidator(_http)] | None = Field(
+    http: Annotated[str, _checked(split_http)] | None = Field(
         None, description="HOST:PORT of /metrics, /healthz, /readyz, /vehicles and /status"
     )
     until_done: bool = Field(False, description="End when every finite source has ended")
@@ -111,26 +103,21 @@ class Settings(BaseSettings):
 
     @property
     def is_client(self) -> bool:
-        """Whether a service with these settings joins other routers without being one itself."""
+        """True if a service with these settings joins other routers without being one itself."""
         return bool(self.connect) and not (self.listen or self.router_config)
 
-    @property
-    def file(self) -> Path | None:
-        """The file that was read, if there is one."""
-        return self._file
-
     def set_by(self, name: str) -> str:
-        """Return what sets a setting: the name of a flag, an environment variable, or a file; "" for a default."""
+        """Return the name of the flag, the environment variable or the file that sets this; "" for a default."""
         return self._set_by.get(name, "")
 
     @property
     def left_out(self) -> frozenset[str]:
-        """The settings of which `find_mistakes` left something out, as it is wrong or cannot be read."""
+        """The settings of which `find_mistakes` left something out, because it is wrong or cannot be read."""
         return self._left_out
 
     @property
     def tls(self) -> Tls | None:
-        """The files of a client of tls/ endpoints; raise ConfigError for half of what is needed."""
+        """The files of a client of tls/ endpoints; raise ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
                 raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")

@@ -1,4 +1,4 @@
-"""A settings file in TOML: reading it, and finding where in it a setting is, for whoever has to correct it."""
+"""A settings file in TOML: reading it, and finding the place of a setting in it, for error messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zenoh endpoints: the default, their form, and where a client on this host dials what a router listens on."""
+"""Zenoh endpoints: the default, their form, and where a client on this host dials a router."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from nedbus.errors import ConfigError
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 """Where `nedbus serve` listens, and what clients join, unless something else is set."""
 
-_MAX_PORT: Final = 65_535
-_ENDPOINT = re.compile(
+_ENDPOINT: Final = re.compile(
     r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
 )
 
@@ -23,11 +22,10 @@ def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
     for endpoint in endpoints:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is None:
-            raise ConfigError(
-                where, f"{endpoint!r} is not an endpoint: write PROTOCOL/HOST:PORT, as in {DEFAULT_ENDPOINT}"
-            )
-        if int(found["port"] or 0) > _MAX_PORT:
-            raise ConfigError(where, f"{endpoint!r} has port {found['port']}: ports are 0 to {_MAX_PORT}")
+            reason = f"{endpoint!r} is not an endpoint: write PROTOCOL/HOST:PORT, as in {DEFAULT_ENDPOINT}"
+            raise ConfigError(where, reason)
+        if int(found["port"] or 0) > 65_535:
+            raise ConfigError(where, f"{endpoint!r} has port {found['port']}: ports are 0 to 65535")
 
 
 def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
@@ -40,20 +38,18 @@ def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
 
 def explain_endpoints(endpoints: Sequence[str]) -> str | None:
     """Return why none of these can be reached, as far as this host knows: names without an address; else None."""
-    unknown = []
-    for endpoint in endpoints:
-        parts = split_endpoint(endpoint)
+    hosts = []
+    for parts in map(split_endpoint, endpoints):
         if parts is None:
             return None
-        host = parts[1]
         try:
-            socket.getaddrinfo(host, None)
+            socket.getaddrinfo(parts[1], None)
         except OSError:
-            unknown.append(host)
+            hosts.append(parts[1])
         else:
             return None
-    hosts = " and ".join(unknown)
-    return f"this host finds no address of {hosts}: correct the name, or write the IP address" if unknown else None
+    names = " and ".join(hosts)
+    return f"this host finds no address of {names}: correct the name, or write the IP address" if hosts else None
 
 
 def dial_endpoint(endpoint: str) -> str:

@@ -1,4 +1,4 @@
-"""Queries: what is answered on a key expression, and which liveliness tokens there are.
+"""Queries: the answers on a key expression, and the liveliness tokens that there are.
 
 Answers and changes wait in channels in Rust until a thread of ours takes them: a Python callback, or its drop, would
 wait for the interpreter's lock on a thread of Zenoh's, for a liveliness query even while that thread holds the lock of
@@ -24,20 +24,20 @@ _log = logging.getLogger(__name__)
 MAX_ANSWERS: Final = 10_000
 """Answers that are kept of one query; more are not sent by honest peers."""
 
-_MAX_BYTES: Final = 2**26  # of the payloads that are kept of one query
-_CHANNEL: Final = 1024  # answers that wait; while there are more, the session waits for whoever asked
-_TOKENS: Final = 131_072  # tokens that wait; Zenoh must never wait for room while it holds the lock of its session
-_CHANGES: Final = 4096  # of tokens, that wait until somebody takes them
+_MAX_BYTES: Final = 2**26  # of the payloads and keys that are accepted from one query
+_MAX_WAITING: Final = 1024  # answers
+_MAX_TOKENS: Final = 131_072  # that wait; Zenoh must never wait for room while it holds the lock of its session
+_MAX_CHANGES: Final = 4096  # of tokens, that wait
 _GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
-_PAUSES: Final = (0.0005, 0.01)  # s between two looks for answers: the first, and the longest
+_PAUSES: Final = (0.0005, 0.01)  # s between two polls for answers: the first, and the longest
 
 
 class Answers:
-    """The answers to one query, for the thread of whoever asked, which takes them by polling."""
+    """The answers to one query, which the thread that sent it takes by polling."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply]) -> None:
         self.ended = False
-        """Whether the last answer was taken: all have answered, or the timeout has passed."""
+        """True once the last answer was taken: all have answered, or the timeout has passed."""
         self._handler = handler
 
     def take(self) -> list[zenoh.Reply]:
@@ -50,38 +50,26 @@ class Answers:
             self.ended = True
         return taken
 
-    def wait(self, timeout: float) -> Iterator[zenoh.Reply]:
-        """Yield the answers as they come, until the query has ended, or its timeout has passed."""
-        return _replies([self], timeout)
-
-
-def _replies(asked: Sequence[Answers], timeout: float) -> Iterator[zenoh.Reply]:
-    end = time.monotonic() + zenoh_timeout(timeout) + _GRACE
-    pause, longest = _PAUSES
-    while (still := [answers for answers in asked if not answers.ended]) and time.monotonic() < end:
-        taken = [reply for answers in still for reply in answers.take()]
-        yield from taken
-        if not taken:
-            time.sleep(pause)
-            pause = min(2 * pause, longest)
-
 
 def ask(
     session: Session,
     selector: str,
     *,
     timeout: float,
+    room: int = _MAX_WAITING,
+    accept_replies: zenoh.ReplyKeyExpr | None = None,
     priority: zenoh.Priority | None = None,
     congestion_control: zenoh.CongestionControl | None = None,
 ) -> Answers:
-    """Query all that answer on a selector, and return at once."""
+    """Query all that answer on a selector, and return at once; while `room` answers wait, the session waits too."""
     with while_open():
         handler = session.get(
             selector,
-            zenoh.handlers.FifoChannel(_CHANNEL),
+            zenoh.handlers.FifoChannel(room),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=zenoh_timeout(timeout),
+            accept_replies=accept_replies,
+            timeout=_zenoh_timeout(timeout),
             priority=priority,
             congestion_control=congestion_control,
         )
@@ -89,26 +77,38 @@ def ask(
 
 
 def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True) -> list[RawSample]:
-    """Return what is answered on any of these within `timeout` seconds: the newest answer for each key, or all.
+    """Return the answers on any of these within `timeout` seconds: the newest answer for each key, or all.
 
-    At most 10,000 answers of 64 MB in all are kept, whoever sends them; that there are more is logged.
+    At most 10,000 answers of 64 MB in all are accepted, from any peers; that there are more is logged.
     """
     kept: dict[object, RawSample] = {}
     size = left_out = 0
-    replies = _replies([ask(session, key_expr, timeout=timeout) for key_expr in key_exprs], timeout)
-    for sample in filter(None, (reply.ok for reply in replies)):
+    queries = [ask(session, key_expr, timeout=timeout) for key_expr in key_exprs]
+    for sample in filter(None, (reply.ok for reply in _wait(queries, timeout))):
         key: object = str(sample.key_expr) if newest else len(kept)
         other = kept.get(key)
         if other is not None and not _is_newer(sample, other):
             continue
-        new_size = size + _size(sample) - (_size(other) if other is not None else 0)
-        fits = new_size <= _MAX_BYTES and (other is not None or len(kept) < MAX_ANSWERS)
-        left_out += not fits
-        if fits:
+        new_size = size + len(sample.payload) + len(str(sample.key_expr))
+        if new_size > _MAX_BYTES or (other is None and len(kept) >= MAX_ANSWERS):
+            left_out += 1
+        else:
             kept[key], size = sample, new_size
     if left_out:
         _log.warning("%s: %d answers too many are left out", ", ".join(key_exprs), left_out, extra=about("incomplete"))
     return list(kept.values())
+
+
+def _wait(queries: Sequence[Answers], timeout: float) -> Iterator[zenoh.Reply]:
+    """Yield answers as they come, until all queries have ended, or their timeout has passed."""
+    end = time.monotonic() + _zenoh_timeout(timeout) + _GRACE
+    pause, longest = _PAUSES
+    while (still := [answers for answers in queries if not answers.ended]) and time.monotonic() < end:
+        taken = [reply for answers in still for reply in answers.take()]
+        yield from taken
+        if not taken:
+            time.sleep(pause)
+            pause = min(2 * pause, longest)
 
 
 def _is_newer(sample: RawSample, other: RawSample) -> bool:
@@ -116,15 +116,11 @@ def _is_newer(sample: RawSample, other: RawSample) -> bool:
     return others is None or (mine is not None and mine.get_time() > others.get_time())
 
 
-def _size(sample: RawSample) -> int:
-    return len(sample.payload) + len(str(sample.key_expr))
-
-
 def ask_alive(session: Session, key_expr: str, *, timeout: float) -> Answers:
     """Ask for the liveliness tokens that match, and return at once; one token is in each answer that has no error."""
-    channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_TOKENS)
+    channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_MAX_TOKENS)
     with while_open():
-        return Answers(session.liveliness().get(key_expr, channel, timeout=zenoh_timeout(timeout)))
+        return Answers(session.liveliness().get(key_expr, channel, timeout=_zenoh_timeout(timeout)))
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
@@ -133,29 +129,29 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 
 
 def ask_alive_keys(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
-    """Return what `alive_keys` returns, and whether these are all: the router was in time, and there are no more."""
+    """Return the same keys, and whether these are all: the router was in time, and there are no more."""
     answers = ask_alive(session, key_expr, timeout=timeout)
     keys: set[str] = set()
-    failed = False  # Zenoh reports a timeout as an error
-    size = 0
-    for reply in answers.wait(timeout):
-        key = "" if reply.ok is None else str(reply.ok.key_expr)
+    size, complete = 0, True
+    for reply in _wait([answers], timeout):
+        key = "" if reply.ok is None else str(reply.ok.key_expr)  # Zenoh reports a timeout as an error
         size += len(key)
-        failed |= not key or len(keys) >= MAX_ANSWERS or size > _MAX_BYTES
         if key and len(keys) < MAX_ANSWERS and size <= _MAX_BYTES:
             keys.add(key)
-    return sorted(keys), answers.ended and not failed
+        else:
+            complete = False
+    return sorted(keys), answers.ended and complete
 
 
 class AliveChanges:
-    """The liveliness tokens that are there, appear and go, for the thread of whoever follows them."""
+    """The liveliness tokens that are there, appear and go, for one thread."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
-        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_CHANGES)
+        channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_CHANGES)
         with while_open():
             subscriber = session.liveliness().declare_subscriber(key_expr, channel, history=True)
         self.missed = False
-        """Whether more tokens changed than are kept until they are taken; cleared by whoever asks for all of them."""
+        """True after the channel overflowed; the reader clears it when it asks for all tokens."""
         self.undeclare: Callable[[], object] = subscriber.undeclare
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
 
@@ -163,12 +159,12 @@ class AliveChanges:
         """Return the key of each token that changed since the last call, and whether it appeared, in order."""
         changes: list[tuple[str, bool]] = []
         with suppress(zenoh.ZError):  # the session is closed
-            while len(changes) < _CHANGES and (sample := self._handler.try_recv()) is not None:
+            while len(changes) < _MAX_CHANGES and (sample := self._handler.try_recv()) is not None:
                 changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-        self.missed |= len(changes) == _CHANGES
+        self.missed |= len(changes) == _MAX_CHANGES
         return changes
 
 
-def zenoh_timeout(timeout: float) -> float:
+def _zenoh_timeout(timeout: float) -> float:
     """Return a timeout that Zenoh accepts: neither 0 nor infinity."""
     return min(max(timeout, 0.001), 86_400.0)

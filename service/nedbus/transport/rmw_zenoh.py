@@ -20,20 +20,23 @@ import xxhash
 from nedbus_msgs import DecodeError
 
 NO_HASH: Final = "TypeHashNotSupported"
-"""What stands in place of the type hash in keys of ROS 2 Humble, and of a PX4 that is built for it."""
+"""The type hash in keys of ROS 2 Humble, and of a PX4 that is built for it."""
 
 BRIDGED_ENCODING: Final = "application/cdr;nedbus"
 """The encoding of messages that nedbus published to ROS 2: they must not be bridged back. ROS 2 does not look at it."""
 
-_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: what PX4 offers
+_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: as PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
-_DOMAINS: Final = 10**9
-_LENGTH: Final = 512  # characters of a key; PX4 and ROS 2 have half as many
-_PX4_NODE = re.compile(r"px4_([0-9a-f]{32})")
+_MAX_KEY: Final = 512  # characters; PX4 and ROS 2 have half of that
+_KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
+_PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
 
-LONGEST_TOKEN: Final = 2 * _LENGTH
+LONGEST_TOKEN: Final = 2 * _MAX_KEY
 """Characters of a liveliness token; a longer one is none of ROS 2's."""
+
+PX4_TYPES: Final = "px4_msgs$*"
+"""The DDS types of PX4's messages, as a chunk of a key expression; those of its translation node too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +51,12 @@ class TopicKey:
     @classmethod
     def parse(cls, key: str) -> Self:
         """Parse a key; raise DecodeError for any key that is not one of rmw_zenoh."""
-        domain, *topic, dds_type, type_hash = [*key.split("/"), "", "", ""][: max(4, key.count("/") + 1)]
-        if len(key) > _LENGTH:
+        if len(key) > _MAX_KEY:
             raise DecodeError(f"a key of {len(key)} characters")
-        digits = domain.isascii() and domain.isdigit() and len(domain) < len(str(_DOMAINS))
-        if not digits or not all(topic) or "*" in key or not type_hash:
+        found = _KEY.fullmatch(key)
+        if found is None or "//" in key:
             raise DecodeError("a key that is not <domain>/<topic>/<type>/<hash>")
-        return cls(int(domain), "/".join(topic), dds_type, type_hash)
+        return cls(int(found[1]), found[2], found[3], found[4])
 
     def __str__(self) -> str:
         return f"{self.domain}/{self.topic}/{self.dds_type}/{self.type_hash}"
@@ -137,20 +139,11 @@ def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> s
     return _endpoint_token("MS", key, session, node, entity)
 
 
-PX4_TYPES: Final = "px4_msgs$*"
-"""The DDS types of PX4's messages, as a chunk of a key expression; those of its translation node too."""
+def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
+    topic = "%" + key.topic.replace("/", "%")
+    return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:
     """Return the key expression for the tokens of all publishers of PX4's messages, in one domain or in all."""
     return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"
-
-
-def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: int) -> str:
-    topic = _mangle(key.topic)
-    return f"@ros2_lv/{key.domain}/{session}/0/{entity}/{kind}/%/%/{node}/{topic}/{key.dds_type}/{key.type_hash}/{_QOS}"
-
-
-def _mangle(topic: str) -> str:
-    """Return a topic as one chunk of a token."""
-    return "%" + topic.replace("/", "%")

@@ -6,9 +6,11 @@ import json
 import logging
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import resource
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import zenoh
 
@@ -16,7 +18,6 @@ from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
 
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints
-from .file_limit import allow_sessions
 from .session import COMMON_SETTINGS, Session, draw_retry, error_reason, insert_settings, open_session
 from .tls import Tls
 
@@ -25,6 +26,7 @@ _log = logging.getLogger(__name__)
 # Longer than that of clients, so that a router gives up a client that falls silent before that one goes to another
 # router. Zenoh 1.10.2 forgets queryables of a client that two routers have for a moment, where a third one joins later.
 _LEASE: Final = 8.0  # s
+_OTHER_FILES: Final = 100  # open files that are no sessions: a router has 21, a service its sources and HTTP clients
 
 
 def open_router(
@@ -40,7 +42,7 @@ def open_router(
     `tls` is for the `tls/` routers that it joins, unless the file has a TLS section of its own.
 
     Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
-    The admin space shows `max_sessions` in `metadata`, and as many files may be open as these sessions need.
+    The admin space shows `max_sessions` in `metadata`, and the limit of open files is raised for these sessions.
 
     Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, a TLS file that cannot be
     read, or a plugin that the file requires.
@@ -48,6 +50,7 @@ def open_router(
     check_endpoints(listen, where="listen")
     check_endpoints(connect, where="connect")
     if config_file is None:
+        config = zenoh.Config()
         settings = {
             **COMMON_SETTINGS,
             "mode": "router",
@@ -60,33 +63,54 @@ def open_router(
             "transport/unicast/accept_pending": 1000,
             "transport/link/rx/max_message_size": 2**20,
         }
-        config = insert_settings(zenoh.Config(), settings, where="listen")
     else:
-        given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
         config = _read_config(config_file)
-        plugins = json.loads(config.get_json("plugins"))
-        if plugins:
-            _log.warning(
-                "%s: without %s: this router loads no plugins, as zenohd does",
-                config_file,
-                _names(plugins),
-                extra=about("router"),
-            )
-        _check_tls_files(config_file, config)
-        insert_settings(config, {name: endpoints for name, endpoints in given.items() if endpoints}, where="listen")
-    if tls is not None and not json.loads(config.get_json("transport/link/tls")).get("root_ca_certificate"):
+        _check_files(config_file, config)
+        given = {"listen/endpoints": list(listen), "connect/endpoints": list(connect)}
+        settings = {name: endpoints for name, endpoints in given.items() if endpoints}
+    insert_settings(config, settings, where="listen")
+    if tls is not None and not _get(config, "transport/link/tls").get("root_ca_certificate"):
         files = {f"transport/link/tls/{name}": value for name, value in tls.zenoh_settings().items()}
         insert_settings(config, files, where="tls")
-    sessions = _tell_max_sessions(config)
-    allow_sessions(sessions, pending=json.loads(config.get_json("transport/unicast/accept_pending")))
+    sessions = _get(config, "transport/unicast/max_sessions")
+    metadata = _get(config, "metadata")
+    if metadata is None or isinstance(metadata, dict):  # it is the user's: it may be anything
+        insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
+    allow_sessions(sessions, pending=_get(config, "transport/unicast/accept_pending"))
     try:
         return open_session(config)
     except zenoh.ZError as exc:
         raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
 
 
+def allow_sessions(sessions: int, *, pending: int) -> None:
+    """Raise the soft limit of open files of this process for a router's sessions and pending handshakes.
+
+    Each is an open file; a usual soft limit is 1024. At the limit a router accepts no more connections, and Zenoh does
+    not log it. Logs a warning when the hard limit leaves no room for all sessions.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return
+    needed = sessions + pending + _OTHER_FILES
+    target = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    if soft < target:
+        with suppress(OSError, ValueError, OverflowError):  # a kernel may allow less than the hard limit says
+            resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
+            soft = target
+    if soft < sessions + _OTHER_FILES:
+        _log.warning(
+            "only %s open files are allowed: room for about %s sessions, and not for the %s of max_sessions:"
+            " raise the limit (ulimit -n, LimitNOFILE=)",
+            soft,
+            max(0, soft - _OTHER_FILES),
+            sessions,
+            extra=about("router"),
+        )
+
+
 def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None) -> tuple[str, ...]:
-    """Return what a router with these settings listens on: what is given, else what the file says, else the default.
+    """Return the endpoints of a router with these settings: those given, else those of the file, else the default.
 
     Raises ConfigError for a malformed file.
     """
@@ -96,15 +120,16 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
 
 
 def router_max_sessions(config_file: Path | None = None) -> int:
-    """Return how many sessions a router accepts: what the file says, else Zenoh's default.
+    """Return the number of sessions that a router accepts: that of the file, else Zenoh's default.
 
     Raises ConfigError for a malformed file.
     """
-    return _max_sessions(zenoh.Config() if config_file is None else _read_config(config_file))
+    config = zenoh.Config() if config_file is None else _read_config(config_file)
+    return int(_get(config, "transport/unicast/max_sessions"))
 
 
 class RouterConfig(NamedTuple):
-    """What a router's configuration file says: its endpoints, and the PEM files of its TLS section by name."""
+    """The endpoints in a router's configuration file, and the PEM files of its TLS section by name."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
@@ -114,49 +139,47 @@ class RouterConfig(NamedTuple):
 def read_router_config(path: Path) -> RouterConfig:
     """Read a file for zenohd or for a router of ours; raise ConfigError, with line and column, for a mistake."""
     config = _parse_config(path)
-    tls = json.loads(config.get_json("transport/link/tls"))
-    files = {
-        name: Path(value) for name, value in tls.items() if value and name.endswith(("_certificate", "_private_key"))
-    }
-    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), files)
+    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config))
 
 
-def _max_sessions(config: zenoh.Config) -> int:
-    return int(config.get_json("transport/unicast/max_sessions"))
-
-
-def _tell_max_sessions(config: zenoh.Config) -> int:
-    """Put `max_sessions` where the admin space shows it, in place of what a file says there; return it."""
-    sessions = _max_sessions(config)
-    metadata = json.loads(config.get_json("metadata"))
-    if metadata is None or isinstance(metadata, dict):  # it is the user's: it may be anything
-        config.insert_json5("metadata", json.dumps({**(metadata or {}), "max_sessions": sessions}))
-    return sessions
+def _get(config: zenoh.Config, key: str) -> Any:
+    return json.loads(config.get_json(key))
 
 
 def _endpoints(config: zenoh.Config, name: str) -> tuple[str, ...]:
-    found = json.loads(config.get_json(f"{name}/endpoints"))
+    found = _get(config, f"{name}/endpoints")
     return tuple(found.get("router", ()) if isinstance(found, dict) else found or ())
 
 
+def _tls_files(config: zenoh.Config) -> dict[str, Path]:
+    section = _get(config, "transport/link/tls").items()
+    return {name: Path(file) for name, file in section if file and name.endswith(("_certificate", "_private_key"))}
+
+
 def _read_config(path: Path) -> zenoh.Config:
-    """Read a file that a router in this process is to use; raise ConfigError for what it cannot do."""
+    """Read a file that a router in this process is to use; raise ConfigError if it requires a plugin."""
     config = _parse_config(path)
-    plugins = json.loads(config.get_json("plugins"))
-    required = [name for name, settings in plugins.items() if settings and settings.get("__required__")]
+    plugins = _get(config, "plugins").items()
+    required = [name for name, settings in plugins if settings and settings.get("__required__")]
     if required:
         reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
 
 
-def _check_tls_files(path: Path, config: zenoh.Config) -> None:
-    for name, value in json.loads(config.get_json("transport/link/tls")).items():
-        # Zenoh would report only that there is no such file, and not which.
-        if name.endswith(("_certificate", "_private_key")) and value and not os.access(value, os.R_OK):
-            raise ConfigError.in_file(
-                path, f"{name}: {value} cannot be read: does it exist, and may this user read it?"
-            )
+def _check_files(path: Path, config: zenoh.Config) -> None:
+    """Log the plugins of a file, and raise ConfigError for a TLS file that cannot be read: Zenoh would not name it."""
+    if plugins := list(_get(config, "plugins")):
+        text = "%s: without %s: this router loads no plugins, as zenohd does"
+        _log.warning(text, path, _names(plugins), extra=about("router"))
+    for name, file in _tls_files(config).items():
+        if not os.access(file, os.R_OK):
+            reason = f"{name}: {file} cannot be read: does it exist, and may this user read it?"
+            raise ConfigError.in_file(path, reason)
+
+
+def _names(plugins: Sequence[str]) -> str:
+    return " and ".join(f"plugin {name}" for name in plugins)
 
 
 def _parse_config(path: Path) -> zenoh.Config:
@@ -172,17 +195,8 @@ def _parse_config(path: Path) -> zenoh.Config:
         text = str(exc)
         position = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
-        raise ConfigError.in_file(path, _parser_message(text), line=line, column=column) from exc
+        # Without the drawing of Zenoh's parser and its source paths.
+        message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)
+        reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
+        raise ConfigError.in_file(path, reason, line=line, column=column) from exc
     return config
-
-
-def _names(plugins: Iterable[str]) -> str:
-    return " and ".join(f"plugin {name}" for name in plugins)
-
-
-def _parser_message(text: str) -> str:
-    """Return the message of Zenoh's parser, without its drawing and its source paths."""
-    found = re.search(r'msg: "(.*?)(?: at /|", location)', text, re.DOTALL) or re.search(
-        r"= (.*?) at /", text, re.DOTALL
-    )
-    return found[1].replace("`", "'") if found else "not a Zenoh configuration"

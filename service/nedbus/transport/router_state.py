@@ -1,24 +1,25 @@
-"""What the routers of a network say of themselves: how many sessions each has, and for how many it has room."""
+"""The state of the routers of a network, from their admin spaces: sessions, and how many there may be."""
 
 from __future__ import annotations
 
 import json
 import re
 from dataclasses import dataclass
+from itertools import islice
 from typing import Final
 
 from .queries import query
 from .session import Session
 
 _KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
-_LARGEST: Final = 2**20  # bytes of an answer that is read: about 5,700 sessions
-_MOST: Final = 2**32  # sessions that a router may say it has room for
+_MAX_ANSWER_BYTES: Final = 2**20  # about 5,700 sessions
+_MAX_SESSIONS: Final = 2**32  # that are believed
 _MAX_ROUTERS: Final = 1000  # that are returned: any peer may claim to be a router
 
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """A router by its Zenoh id, its sessions now, those with other routers included, and how many it accepts.
+    """A router by its Zenoh id, its sessions now, those with other routers included, and the number it accepts.
 
     `max_sessions` is None where the router does not say: Zenoh tells it only in `metadata` of its configuration.
     """
@@ -29,7 +30,7 @@ class RouterState:
 
     @property
     def load(self) -> float | None:
-        """Which part of its room a router has used, 1.0 when it is full; None where it does not say."""
+        """The part of its sessions that a router has in use, 1.0 when it is full; None where it does not say."""
         return None if self.max_sessions is None else self.sessions / self.max_sessions
 
 
@@ -39,17 +40,14 @@ def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
     A router is left out whose admin space is off or denied, or whose answer is larger than this session takes: 2**18
     bytes for a client, about 1,400 sessions.
     """
-    states: dict[str, RouterState] = {}
-    for answer in query(session, "@/*/router", timeout=timeout):
-        if len(answer.payload) <= _LARGEST and len(states) < _MAX_ROUTERS:
-            state = read_state(str(answer.key_expr), answer.payload.to_bytes())
-            if state is not None:
-                states[state.zid] = state
-    return [states[zid] for zid in sorted(states)]
+    answers = query(session, "@/*/router", timeout=timeout)
+    small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
+    states = filter(None, (read_state(str(answer.key_expr), answer.payload.to_bytes()) for answer in small))
+    return sorted(islice(states, _MAX_ROUTERS), key=lambda state: state.zid)
 
 
 def read_state(key: str, payload: bytes) -> RouterState | None:
-    """Return what an answer says; None for what no router says, as any peer may answer anything."""
+    """Return the state in an answer; None if it is not that of a router, as any peer may answer anything."""
     found = _KEY.fullmatch(key)
     try:
         answer = json.loads(payload)
@@ -59,6 +57,6 @@ def read_state(key: str, payload: bytes) -> RouterState | None:
     if found is None or not isinstance(sessions, list):
         return None
     metadata = answer.get("metadata")
-    room = metadata.get("max_sessions") if isinstance(metadata, dict) else None
-    says = isinstance(room, int) and not isinstance(room, bool) and 0 < room <= _MOST
-    return RouterState(found[1], len(sessions), room if says else None)
+    limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
+    is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # and no bool
+    return RouterState(found[1], len(sessions), limit if is_limit else None)

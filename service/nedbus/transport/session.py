@@ -1,4 +1,4 @@
-"""Zenoh sessions of clients: opening them, and the one place where Zenoh's errors are translated."""
+"""Zenoh sessions of clients, and the translation of Zenoh's errors."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from itertools import chain, repeat
 from typing import Final
 
@@ -19,20 +20,16 @@ import zenoh
 from nedbus.errors import ClosedError, ConfigError, ConnectError, ForkError, NedbusError
 
 from .endpoints import check_endpoints, explain_endpoints
-from .full_router import full_router
 from .tls import Tls
 
 Session = zenoh.Session
 RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
 
-_CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
-_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
-
 LEASE: Final = 5.0
 """Seconds without a sign of life after which a peer is closed: a frozen host, a cut cable."""
 
-# What holds for every session of ours. Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
+# Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
 # Longer queues than Zenoh's own take up the bursts of a fleet, where two batches are full in a moment.
 # Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a timestamp.
@@ -45,18 +42,10 @@ COMMON_SETTINGS: Final = {
     "transport/link/tx/queue/size/data_high": 16,
     "transport/link/tx/queue/size/data": 16,
 }
+_CLOSED: Final = re.compile(r"session closed|undeclared|ringbuffer has been deleted", re.IGNORECASE)
+_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between the first attempts to connect
 
-
-_opened_here = False
 _forked = False
-
-
-def _after_fork() -> None:
-    global _forked  # noqa: PLW0603 - a process has one state
-    _forked = _forked or _opened_here
-
-
-os.register_at_fork(after_in_child=_after_fork)
 
 
 def is_forked() -> bool:
@@ -70,11 +59,20 @@ def require_unforked() -> None:
         raise ForkError
 
 
+@cache
+def _watch_forks() -> None:
+    os.register_at_fork(after_in_child=_mark_forked)
+
+
+def _mark_forked() -> None:
+    global _forked  # noqa: PLW0603 - a process has one state
+    _forked = True
+
+
 def open_session(config: zenoh.Config) -> Session:
     """Open a session; raise ForkError in a process that was forked from one with sessions, where Zenoh would hang."""
-    global _opened_here  # noqa: PLW0603 - a process has one state
     require_unforked()
-    _opened_here = True
+    _watch_forks()
     return zenoh.open(config)
 
 
@@ -100,32 +98,30 @@ def open_client(
         # No peer on the network is trusted: the largest answer that is expected is a status of many sources.
         "transport/link/rx/max_message_size": 2**18,
     }
-    start, reason = time.monotonic(), ""
     timeout = math.inf if timeout is None else timeout
+    end = time.monotonic() + timeout
     stop = stop or threading.Event()
+    reason = ""
     for pause in chain(_PAUSES, repeat(1.0)):
         # An endpoint that accepts and then sends nothing may not use up much more than the time that there is; but the
         # session will reconnect with the same timeout, over a slow link perhaps.
-        left = start + timeout - time.monotonic()
-        settings["transport/unicast/open_timeout"] = round(1000 * min(3.0, max(1.0, left)))
+        open_timeout = min(3.0, max(1.0, end - time.monotonic()))
+        settings["transport/unicast/open_timeout"] = round(1000 * open_timeout)
         try:
             return open_session(insert_settings(zenoh.Config(), settings, where="connect"))
         except zenoh.ZError as exc:
             reason = error_reason(exc)
-            left = start + timeout - time.monotonic()
+            left = end - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
                 break
     # Of most failures Zenoh says no more than that there is no connection.
-    full = None if stop.is_set() else full_router(endpoints, tls)
-    if full is not None:
-        raise ConnectError(endpoints, timeout, full=full)
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 
 
 def draw_retry() -> dict[str, float]:
-    """Return when a session tries again to connect; a fleet whose router is back does not come all at once."""
-    first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - nobody is to be surprised
+    """Return random pauses between attempts to reconnect, so that a fleet does not come back all at once."""
+    first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - no secret
     return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
 
 
@@ -146,7 +142,7 @@ def entity_name(entity: zenoh.EntityGlobalId) -> str:
 
 @contextmanager
 def while_open() -> Iterator[None]:
-    """Translate what Zenoh raises: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
+    """Translate Zenoh's errors: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
     try:
         yield
     except zenoh.ZError as exc:
@@ -154,7 +150,7 @@ def while_open() -> Iterator[None]:
 
 
 def translate_error(error: zenoh.ZError) -> NedbusError:
-    """Return what `while_open` raises for this error.
+    """Return the error that `while_open` raises for this one.
 
     The session itself is not asked: `is_closed` waits for a lock of Zenoh's without giving up the interpreter's.
     """

@@ -1,4 +1,4 @@
-"""TLS of a client: the files that it needs for `tls/` endpoints, and what is wrong with them."""
+"""TLS of a client: the files that it needs for `tls/` endpoints, and the mistakes in them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,11 @@ from typing import Final
 from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
-_UNSIGNED: Final = "is not signed by the authority in tls_ca"
 _VERIFY_REASONS: Final = {  # by OpenSSL's codes
-    7: _UNSIGNED,
     9: "or its authority is not valid yet: is the clock of this host right?",
     10: "or its authority has expired",
-    **dict.fromkeys((18, 19, 20, 21), _UNSIGNED),
+    **dict.fromkeys((7, 18, 19, 20, 21), "is not signed by the authority in tls_ca"),
 }
-_STEPS: Final = 10  # of a handshake; four are enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +65,7 @@ class Tls:
         except (OSError, ssl.SSLError):
             return f"{self.ca} is not the certificate of an authority"
         if self.certificate is not None and self.key is not None:
-            return _refusal(authority, self.certificate, self.key)
+            return _verify(authority, self.certificate, self.key)
         if not authority.get_ca_certs():
             return f"{self.ca} is not the certificate of an authority: it may sign nothing"
         until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
@@ -79,48 +76,42 @@ def check_pem(path: str | Path, kind: str) -> None:
     """Raise ConfigError unless a file can be read and holds a certificate, or a private key, as PEM."""
     if not os.access(path, os.R_OK) or not Path(path).is_file():
         raise ConfigError("tls", f"{path} cannot be read: does it exist, and may this user read it?")
-    labels = _LABEL.findall(Path(path).read_text(errors="replace"))
-    if any(label.endswith(kind) for label in labels):
-        return
-    found = f"a {labels[0].lower()}" if labels else "nothing" if not Path(path).stat().st_size else "no PEM"
-    hint = "are two files swapped?" if labels else "'nedbus pki' makes such files"
-    raise ConfigError("tls", f"{path} holds {found}, where a {kind.lower()} is needed: {hint}")
+    text = Path(path).read_text(errors="replace")
+    labels = _LABEL.findall(text)
+    if not any(label.endswith(kind) for label in labels):
+        found = f"a {labels[0].lower()}" if labels else "no PEM" if text else "nothing"
+        hint = "are two files swapped?" if labels else "'nedbus pki' makes such files"
+        raise ConfigError("tls", f"{path} holds {found}, where a {kind.lower()} is needed: {hint}")
 
 
 def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except ssl.SSLError as exc:
+        reason = f"{certificate} or {key} is damaged, or the key has a password: make them anew"
         if exc.reason == "KEY_VALUES_MISMATCH":
             reason = f"{key} is not the key of {certificate}: give the two that were made together"
-        else:
-            reason = f"{certificate} or {key} is damaged, or the key has a password: make them anew"
         raise ConfigError("tls", reason) from exc
 
 
-def _refusal(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
+def _verify(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
     """Return why a server that trusts this authority refuses this certificate, None if it accepts it."""
-    authority.verify_mode = ssl.CERT_REQUIRED
-    _load_pair(authority, certificate, key)
     own = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     own.check_hostname = False
-    own.verify_mode = ssl.CERT_NONE
-    _load_pair(own, certificate, key)
+    own.verify_mode = ssl.CERT_NONE  # of the server, which only exists here
+    authority.verify_mode = ssl.CERT_REQUIRED
+    for context in (authority, own):
+        _load_pair(context, certificate, key)
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    server = authority.wrap_bio(to_server, to_client, server_side=True)
     client = own.wrap_bio(to_client, to_server)
-    for _ in range(_STEPS):
-        done = 0
-        for side in (client, server):
-            try:
-                side.do_handshake()
-                done += 1
-            except ssl.SSLWantReadError:
-                continue
-            except ssl.SSLCertVerificationError as exc:
-                return f"{certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
-            except ssl.SSLError:
-                return None
-        if done == 2:
+    server = authority.wrap_bio(to_server, to_client, server_side=True)
+    for side in (client, server, client, server):  # the steps of a handshake
+        try:
+            side.do_handshake()
+        except ssl.SSLWantReadError:
+            continue
+        except ssl.SSLCertVerificationError as exc:
+            return f"{certificate} {_VERIFY_REASONS.get(exc.verify_code, exc.verify_message)}"
+        except ssl.SSLError:
             break
     return None

@@ -1,6 +1,6 @@
 """Probe which vehicles may be written: Zenoh drops what is not allowed, without an error at its sender.
 
-One session subscribes to keys under the vehicles that are nobody's topic, another one publishes there.
+One session subscribes to keys under the vehicles that are no topic, another one publishes there.
 The publisher sees whether the router told it of that subscriber. If it did, and nothing arrives, it may not write.
 """
 
@@ -20,8 +20,8 @@ from .session import Session, while_open
 Verdict = Literal["allowed", "denied", "unknown"]
 
 _POLL: Final = 0.02  # s
-_AGAIN: Final = 0.2  # s until it is published again: the declarations of a key may still be under way
-_SPARE: Final = 16  # probes that a channel has room for beyond one of each vehicle
+_RETRY: Final = 0.2  # s until it is published again: the declarations of a key may still be under way
+_SPARE: Final = 16  # room of the channel beyond one probe of each vehicle
 
 
 def probe_writes(
@@ -44,10 +44,10 @@ def probe_writes(
     with while_open():
         subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", channel)
         # It ends when nothing refers to it: `undeclare` keeps the interpreter's lock while it waits.
-        announcement = writer.declare_publisher(next(iter(keys)))
+        publisher = writer.declare_publisher(next(iter(keys)))
         # Zenoh's stubs call the status a bool; it is an object, always true.
-        announced = _wait(lambda: cast("zenoh.MatchingStatus", announcement.matching_status).matching, timeout)
-        for _ in range(round(timeout / _AGAIN)):
+        matched = _wait(lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout)
+        for _ in range(round(timeout / _RETRY)):
             for key in missing:
                 # Not behind the data in a queue that is full, where it would be dropped.
                 writer.put(
@@ -57,11 +57,10 @@ def probe_writes(
                     priority=zenoh.Priority.INTERACTIVE_HIGH,
                     express=True,
                 )
-            if _wait(receive, _AGAIN):
+            if _wait(receive, _RETRY):
                 break
-    lacking = set(missing.values())
-    refused: Verdict = "denied" if announced else "unknown"
-    return {vehicle: refused if vehicle in lacking else "allowed" for vehicle in keys.values()}
+    refused: Verdict = "denied" if matched else "unknown"
+    return {vehicle: refused if key in missing else "allowed" for key, vehicle in keys.items()}
 
 
 def _wait(condition: Callable[[], bool], seconds: float) -> bool:

@@ -13,7 +13,7 @@ from typing import Final
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import KeptAnswers, Session, ask_kept
+from nedbus.transport import RetransmitRequest, Session, request_samples
 from nedbus_msgs import PAYLOAD_LIMIT
 
 from .pending_queue import CAPACITY, PendingQueue
@@ -37,7 +37,7 @@ class Retransmission:
     def __init__(self, session: Session, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
-        self._open: dict[WriterProxy, KeptAnswers] = {}
+        self._open: dict[WriterProxy, RetransmitRequest] = {}
 
     def turn(self, now: float) -> tuple[str, float]:
         """Do what is due; return a key of which something can be read now, or "", and s until the next."""
@@ -57,7 +57,7 @@ class Retransmission:
         """Ask no more; a channel of answers that nobody takes would hold up the session."""
         self._open.clear()
 
-    def _take(self, writer: WriterProxy, answers: KeptAnswers, now: float) -> str:
+    def _take(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
         found = {number: raw for number, raw in answers.take().items() if len(raw.payload) <= PAYLOAD_LIMIT}
         ended = answers.ended
         if ended:
@@ -84,6 +84,8 @@ class Retransmission:
         if numbers is None:
             return
         try:
-            self._open[writer] = ask_kept(self._session, writer.stream.heard, writer.name, numbers, timeout=_TIMEOUT)
+            self._open[writer] = request_samples(
+                self._session, writer.stream.heard, writer.name, numbers, timeout=_TIMEOUT
+            )
         except NedbusError:  # the session is closed
             self._queue.on_retransmission(writer, {}, ended=True, now=now)

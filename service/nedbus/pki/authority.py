@@ -1,0 +1,196 @@
+"""Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
+
+The access control of `config/router-secure.json5` matches the common name of a certificate.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import ipaddress
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from nedbus.errors import PkiError
+from nedbus.whole_file import whole_file
+
+from .certificate import DAYS, MAX_NAME
+
+_CA_DAYS: Final = 3650
+
+
+def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
+    """Make the CA of a fleet, `ca.key` and `ca.crt`, and return both paths.
+
+    The key signs everything else and belongs to no vehicle and no router.
+
+    Raises PkiError when there is one already, or the folder cannot be written.
+    """
+    key = new_key()
+    return write_files(folder / "ca", sign_authority(key, days=days), key)
+
+
+def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
+    """Make `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
+
+    `hosts` are the names and addresses under which a router is reached: clients check them.
+    A certificate without hosts is for a client only.
+
+    Raises PkiError when there is a key of that name already, no CA, or the folder cannot be written.
+    """
+    if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
+        raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {MAX_NAME} characters without /")
+    authority = Authority.read(folder)
+    key = new_key()
+    return write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """The CA of a folder: its certificate, and the key that signs."""
+
+    certificate: x509.Certificate
+    key: ec.EllipticCurvePrivateKey
+
+    @classmethod
+    def read(cls, folder: Path) -> Authority:
+        """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
+        certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
+        try:
+            key = serialization.load_pem_private_key(path.read_bytes(), password=None)
+        except OSError as exc:
+            raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: may this user read it?") from exc
+        except (ValueError, TypeError):
+            key = None
+        if not isinstance(key, ec.EllipticCurvePrivateKey):
+            raise PkiError(f"{path} is not a key that 'nedbus pki ca' made")
+        return cls(certificate, key)
+
+    def sign(
+        self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
+    ) -> x509.Certificate:
+        """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
+        # A router is a client of other routers too.
+        purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
+        builder = _builder(name, key, self.key, DAYS if days is None else days, issuer=self.certificate)
+        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        if hosts:
+            builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
+        return builder.sign(self.key, hashes.SHA256())
+
+
+def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
+    """Return the certificate of a CA for its key; certificates that the key signed before stay valid."""
+    return _builder("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days).sign(key, hashes.SHA256())
+
+
+def new_key() -> ec.EllipticCurvePrivateKey:
+    """Return a new key, on the curve P-256."""
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
+    """Write a key into a new file that only its owner can read."""
+    pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    _write_new(path, key.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600)
+
+
+def write_certificate(path: Path, certificate: x509.Certificate) -> None:
+    """Write a certificate into a new file that everybody can read."""
+    _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+
+
+def write_files(
+    stem: Path, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey | None = None, *, replace: bool = False
+) -> list[Path]:
+    """Write `STEM.crt`, and `STEM.key` if a key is given, both or neither, and return their paths.
+
+    Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
+    """
+    paths = [Path(f"{stem}.crt")] if key is None else [Path(f"{stem}.key"), Path(f"{stem}.crt")]
+    try:
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as opened:
+            parts = [opened.enter_context(whole_file(path, replace=replace)) for path in paths]
+            if key is not None:
+                write_key(parts[0], key)
+            write_certificate(parts[-1], certificate)
+    except FileExistsError as exc:
+        reason = "it is not overwritten; move it away, or take another folder or name"
+        raise PkiError(f"{exc.filename} exists: {reason}") from exc
+    except OSError as exc:
+        raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
+    return paths
+
+
+def load_certificate(path: Path) -> x509.Certificate:
+    """Read the certificate in a PEM file; raise PkiError when it is missing or damaged."""
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except OSError as exc:
+        hint = "make the CA first, 'nedbus pki ca'" if path.name == "ca.crt" else "may this user read it?"
+        raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
+    except ValueError as exc:
+        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
+
+
+def _write_new(path: Path, content: bytes, mode: int) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
+
+
+def _builder(
+    name: str,
+    key: CertificatePublicKeyTypes,
+    signer: ec.EllipticCurvePrivateKey,
+    days: int,
+    *,
+    issuer: x509.Certificate | None = None,
+) -> x509.CertificateBuilder:
+    """Begin the certificate of a key; without an issuer it is that of an authority, signed by itself."""
+    is_authority = issuer is None
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    now = dt.datetime.now(dt.UTC)
+    until = now + dt.timedelta(days=days)
+    usage = x509.KeyUsage(
+        digital_signature=not is_authority,
+        key_cert_sign=is_authority,
+        crl_sign=is_authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject if issuer is None else issuer.subject)
+        .public_key(key)
+        .serial_number(x509.random_serial_number())
+        # A vehicle's clock may be behind when it boots.
+        .not_valid_before(min(now, until) - dt.timedelta(days=1))
+        .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
+        # Python asks for both key identifiers from 3.13 on, Zenoh does not.
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
+        .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
+        .add_extension(usage, critical=True)
+    )
+
+
+def _host(host: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(host))
+    except ValueError:
+        return x509.DNSName(host)

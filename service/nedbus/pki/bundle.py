@@ -1,0 +1,93 @@
+"""A bundle for a vehicle: its certificate, its key, and the configuration that uses them, ready to be copied there."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import string
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from nedbus.errors import ConfigError, PkiError
+from nedbus.transport import check_endpoints
+from nedbus.whole_file import whole_file
+
+from .authority import Authority, new_key, write_certificate, write_key
+from .certificate import certificate_name
+
+_TARGET: Final = Path("/etc/nedbus")  # where the unit and the image look for nedbus.toml
+_IN_WHEEL: Final = Path(__file__).with_name("fleet")
+_TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[3] / "packaging" / "fleet"
+
+
+class _Template(string.Template):
+    delimiter = "@"  # $ is for the shell and for Docker
+
+
+def make_bundle(
+    folder: Path,
+    vehicle: str,
+    output: Path,
+    *,
+    routers: Sequence[str],
+    sources: Sequence[str] = (),
+    target: Path | None = None,
+    days: int | None = None,
+) -> list[Path]:
+    """Make a folder of all that a vehicle needs to join these routers, whole or not at all, and return its files.
+
+    The authority's folder keeps the certificate, to be listed and renewed; the key is in the bundle only.
+    `target` is where the files will be on the vehicle, by default /etc/nedbus.
+
+    Raises PkiError when the folder, or a key or certificate of this vehicle, exists already; ConfigError for an
+    endpoint that is not tls/, AddressError for an invalid vehicle.
+    """
+    name = certificate_name(vehicle)
+    check_endpoints(routers, where="--router")
+    for router in routers:
+        if not router.startswith("tls/"):
+            raise ConfigError("--router", f"{router!r} shows no certificate: name a tls/ endpoint")
+    if not routers:
+        raise ConfigError("--router", "name at least one router, such as tls/192.168.1.5:7447")
+    authority = Authority.read(folder)
+    for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
+        if path.exists():
+            raise PkiError(f"{path} exists: it is not overwritten; 'nedbus pki list' says until when it is valid")
+    key = new_key()
+    certificate = authority.sign(name, key.public_key(), days=days)
+    target = target or _TARGET
+    strings = {  # of TOML and YAML; those of JSON are
+        "routers": list(routers),
+        "ca": f"{target}/pki/ca.crt",
+        "certificate": f"{target}/pki/{name}.crt",
+        "key": f"{target}/pki/{name}.key",
+        "name": vehicle,
+        "target": str(target),
+    }
+    facts = {fact: json.dumps(value) for fact, value in strings.items()} | {
+        "vehicle": vehicle,
+        "common_name": name,
+        "pki": f"{target}/pki",
+        "router": routers[0],
+        "source": f"source = {json.dumps(list(sources))}\n" if sources else "",
+        "until": f"{certificate.not_valid_after_utc:%Y-%m-%d}",
+    }
+    part = output.with_name(f".{os.getpid()}-part-{output.name}")
+    try:
+        with whole_file(folder / f"{name}.crt") as kept:
+            write_certificate(kept, certificate)
+            (part / "pki").mkdir(parents=True)
+            (part / "pki").chmod(0o700)
+            write_key(part / "pki" / f"{name}.key", key)
+            write_certificate(part / "pki" / f"{name}.crt", certificate)
+            write_certificate(part / "pki" / "ca.crt", authority.certificate)
+            for file in ("nedbus.toml", "compose.yml", "README.txt"):
+                (part / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(facts))
+            part.rename(output)
+    except OSError as exc:
+        raise PkiError(f"{output} cannot be made: {(exc.strerror or str(exc)).lower()}") from exc
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return sorted(path for path in output.rglob("*") if path.is_file())
