@@ -69,10 +69,10 @@ ONLY_BY_FOLDER = {
     "foxglove": {"nedbus/bridges": "foxglove foxglove_messages"},
     "prometheus_client": {"nedbus/monitoring": "families exposition service_metrics exporter"},
     "cryptography": {"nedbus/transport": "pki pki_renewal"},
-    "rich": {"nedbus/cli": "progress files live_table logs"},
+    "rich": {"nedbus/cli/output": "progress table logs"},
     "typer": {
-        "nedbus/cli": "app bridges files pki options query echo health serve run http pki_fleet check doctor web "
-        "events",
+        "nedbus/cli": "app options run",
+        "nedbus/cli/commands": "check doctor echo events files health http pki pki_fleet query ros2 serve",
     },
 }  # fmt: skip
 ONLY = {

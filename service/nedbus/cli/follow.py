@@ -1,4 +1,4 @@
-"""Follow a subscription until there was enough, and say when the link to the router breaks and when it is back."""
+"""The loop of commands that follow a subscription; it logs when the link to the router breaks and when it is back."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NoDataError
 from nedbus.log_event import about
 
-from .options import write_stderr
+from .output.streams import write_stderr
 
 _log = logging.getLogger("nedbus")
 
-_NOTICE: Final = 2.0  # s without a sample after which stderr says so
+SILENCE_TIMEOUT: Final = 2.0
+"""Time without a first sample after which stderr says so [s]."""
+
 _LINK_INTERVAL: Final = 0.5  # s between two checks of the link
 
 
@@ -49,7 +51,7 @@ def follow(
     duration: float | None,
     each_second: Callable[[], object] | None = None,
 ) -> None:
-    """Handle samples until there were enough, or for so long; raise NoDataError if there were none in that time.
+    """Handle samples until there were `count`, or for `duration` [s]; raise NoDataError if there were none.
 
     `handle` returns whether a sample counts.
     """
@@ -62,7 +64,7 @@ def follow(
             if each_second is not None:
                 each_second()
             next_second = max(next_second + 1.0, now)
-        if not seen and not noticed and now > start + _NOTICE:
+        if not seen and not noticed and now > start + SILENCE_TIMEOUT:
             noticed = True
             write_notice(subscription)
         try:

@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from nedbus import transport
+from nedbus.cli.options import JsonOption, command, require_one
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.errors import ConfigError, PkiError
-
-from .options import JsonOption, command, require_one, write, write_stderr
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
 WithinOption = Annotated[int | None, typer.Option(min=0, help="What expires within so many days is due (default: 30)")]

@@ -10,40 +10,31 @@ from typing import Annotated, Any
 
 import typer
 
-from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
-from nedbus.errors import ConfigError
-from nedbus_msgs import ANY, Address, Definition
-
-from .follow import Link, follow
-from .format import to_csv, to_csv_head, to_fields, to_json
-from .lines import Lines
-from .options import (
+from nedbus.cli.follow import Link, follow
+from nedbus.cli.options import (
     CountOption,
     CsvOption,
     DurationOption,
     FieldOption,
-    InstanceOption,
     JsonOption,
-    PositionTopicOption,
-    TopicArgument,
-    VehicleOption,
-    choose,
-    lazily_on_bus,
+    on_bus,
     parse_fields,
     require_one,
-    write,
-    write_stderr,
+    selecting,
 )
+from nedbus.cli.output.samples import Lines, to_csv, to_csv_head, to_fields, to_json
+from nedbus.cli.output.streams import write, write_stderr
+from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
+from nedbus.errors import ConfigError
+from nedbus_msgs import DEFAULT_TOPIC, Address, Definition, Selection
 
 
-@lazily_on_bus
+@on_bus
+@selecting(DEFAULT_TOPIC)
 def echo(
     open_bus: Callable[[], Bus],
-    topic: TopicArgument = None,
+    selection: Selection,
     *,
-    topic_option: PositionTopicOption = None,
-    vehicle: VehicleOption = ANY,
-    instance: InstanceOption = None,
     field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
     every: Annotated[
@@ -73,28 +64,28 @@ def echo(
     require_one({"--once": once, "--count": count is not None})
     if max_rate is not None:
         check_max_rate(max_rate)
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     fields = parse_fields(field, selection)
     form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
     show: Callable[[Sample[Any]], str] = partial(form, fields=fields)
     due: dict[Address, float] = {}
-    heads: dict[Definition[Any], str] = {}  # of CSV
+    csv_head = ""
+    csv_definition: Definition[Any] | None = None
 
     def print_one(sample: Sample[Any]) -> bool:
+        nonlocal csv_head, csv_definition
         if interval:
             now = time.monotonic()
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        definition = sample.message.DEFINITION
-        if csv_output and definition not in heads:
-            heads[definition] = to_csv_head(sample, fields)
-            if len(set(heads.values())) > 1:
-                raise ConfigError(
-                    "--csv", f"a table has one kind of message, and {sample.address} is another: name a topic"
-                )
-            if len(heads) == 1:
-                write(heads[definition])
+        if csv_output and sample.message.DEFINITION is not csv_definition:
+            csv_definition, head = sample.message.DEFINITION, to_csv_head(sample, fields)
+            if csv_head not in {"", head}:
+                text = f"a table has one kind of message, and {sample.address} is another: name a topic"
+                raise ConfigError("--csv", text)
+            if not csv_head:
+                write(head)
+            csv_head = head
         write(show(sample))
         return True
 
@@ -111,7 +102,5 @@ def _write_counts(subscription: Subscription[Any]) -> None:
     counts = subscription.counts
     if counts.lost or counts.dropped or counts.invalid or counts.discarded:
         discarded = f", {counts.discarded} discarded" if counts.discarded else ""
-        write_stderr(
-            f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
-            f"{discarded}"
-        )
+        text = f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
+        write_stderr(f"{text}{discarded}")

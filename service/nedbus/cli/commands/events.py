@@ -11,25 +11,15 @@ from typing import Annotated, Final
 
 import typer
 
+from nedbus.cli.follow import Link, follow
+from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
+from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.client import Bus, Monitor, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import SEVERITIES, WINDOW, Account, AccountReport, Event, Story, Times, by_vehicle, tell
 from nedbus.monitoring import Observer
 from nedbus.sources import read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
-
-from .follow import Link, follow
-from .format import csv_line, to_text
-from .options import (
-    CsvOption,
-    DurationOption,
-    JsonOption,
-    VehicleOption,
-    lazily_on_bus,
-    require_one,
-    write,
-    write_stderr,
-)
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
@@ -41,7 +31,7 @@ FileArgument = Annotated[
 ]
 
 
-@lazily_on_bus
+@on_bus
 def events(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
@@ -114,7 +104,7 @@ def events(
         _follow(bus, Selection(ANY, vehicle), show, duration)
 
 
-@lazily_on_bus
+@on_bus
 def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from nedbus import transport
+from nedbus.cli.options import command
+from nedbus.cli.output.streams import write, write_stderr
 
-from .options import command, write, write_stderr
 from .pki_fleet import FolderArgument, enroll, list_, renew, rules
 
 pki = typer.Typer(help="Make keys and certificates for tls/ endpoints.", no_args_is_help=True)

@@ -10,6 +10,11 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus.cli.options import FieldOption, JsonOption, VehicleOption, on_bus, parse_fields, selecting
+from nedbus.cli.output.samples import to_fields, to_json
+from nedbus.cli.output.streams import to_text, write, write_stderr
+from nedbus.cli.output.table import terminal_width, to_table
+from nedbus.cli.status import list_of, refused_of, sources_of, streams_of
 from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
@@ -27,24 +32,6 @@ from nedbus_msgs import (
     json_schema_of,
     layout_table_of,
 )
-
-from .format import to_fields, to_json, to_text
-from .options import (
-    FieldOption,
-    InstanceOption,
-    JsonOption,
-    PositionTopicOption,
-    TopicArgument,
-    VehicleOption,
-    choose,
-    lazily_on_bus,
-    on_bus,
-    parse_fields,
-    write,
-    write_stderr,
-)
-from .status import list_of, refused_of, sources_of, streams_of
-from .table import terminal_width, to_table
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
@@ -89,21 +76,12 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
 
 
 @on_bus
-def get(
-    bus: Bus,
-    topic: TopicArgument = None,
-    *,
-    topic_option: PositionTopicOption = None,
-    vehicle: VehicleOption = ANY,
-    instance: InstanceOption = None,
-    field: FieldOption = None,
-    json_output: JsonOption = False,
-) -> None:
+@selecting(DEFAULT_TOPIC)
+def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_output: JsonOption = False) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
     What only a storage kept is shown as such.
     """
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
@@ -146,7 +124,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write_stderr("no nedbus service answers here")
 
 
-@lazily_on_bus
+@on_bus
 def schema(
     open_bus: Callable[[], Bus],
     message: Annotated[

@@ -9,14 +9,13 @@ from typing import Annotated, Final
 
 import typer
 
+from nedbus.cli.options import JsonOption, on_bus
+from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
+from nedbus.cli.status import refused_of, sources_of, streams_of
 from nedbus.client import Bus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, Expectation, faults_of
 from nedbus_msgs import ANY, DEFAULT_TOPIC, check_vehicle
-
-from .format import MAX_TEXT, to_text
-from .options import JsonOption, on_bus, write, write_stderr
-from .status import refused_of, sources_of, streams_of
 
 _DENIED: Final = (
     ", though its service reports that it is: does the router let that service write this vehicle, and this client"
