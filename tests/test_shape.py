@@ -72,7 +72,7 @@ ONLY_BY_FOLDER = {
     "rich": {"nedbus/cli/output": "progress table logs"},
     "typer": {
         "nedbus/cli": "app options run",
-        "nedbus/cli/commands": "check doctor echo events files health http pki pki_fleet query ros2 serve",
+        "nedbus/cli/commands": "bridges check doctor echo events files health pki pki_fleet query serve",
     },
 }  # fmt: skip
 ONLY = {

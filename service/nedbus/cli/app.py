@@ -8,17 +8,16 @@ import typer
 
 from nedbus import __version__
 
+from .commands.bridges import export, foxglove, ros2, web
 from .commands.check import check
 from .commands.doctor import doctor
 from .commands.echo import echo
 from .commands.events import events, why
 from .commands.files import convert, plot, record
 from .commands.health import health
-from .commands.http import export, foxglove, web
 from .commands.hz import hz
 from .commands.pki import pki
 from .commands.query import get, info, list_, schema
-from .commands.ros2 import ros2
 from .commands.serve import router, serve
 from .options import command
 from .output.logs import LogFormat, LogLevel, log_to_stderr
@@ -53,9 +52,9 @@ def _set_up(
     debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
     log_level: Annotated[
         LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Log from this level on")
-    ] = LogLevel.INFO,
+    ] = "info",
     log_format: Annotated[
         LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="json: an object a line")
-    ] = LogFormat.TEXT,
+    ] = "text",
 ) -> None:
-    log_to_stderr(level=LogLevel.DEBUG if debug else log_level, log_format=log_format)
+    log_to_stderr(level="debug" if debug else log_level, log_format=log_format)

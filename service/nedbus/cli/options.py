@@ -154,14 +154,8 @@ def _open_bus(
     wait: WaitOption = False,
 ) -> Bus:
     """Connect with these options; with `wait` for as long as it takes."""
-    settings = load_settings(
-        config,
-        connect=connect and tuple(connect),
-        prefix=prefix,
-        tls_ca=tls_ca,
-        tls_certificate=tls_certificate,
-        tls_key=tls_key,
-    )
+    tls = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
+    settings = load_settings(config, connect=connect, prefix=prefix, **tls)
     try:
         return connect_with(settings, timeout=1.0)
     except ConnectError as exc:

@@ -45,7 +45,7 @@ class NotifySocket:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             try:
                 sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), self._address)
-            except OSError as exc:  # nobody there, or too many datagrams wait: what matters is sent again
+            except OSError as exc:  # no reader, or too many datagrams wait: what matters is sent again
                 _log.debug("systemd cannot be told: %s", exc)
                 return False
         return True

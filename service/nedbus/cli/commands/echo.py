@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from nedbus.cli.follow import Link, follow
+from nedbus.cli.follow import follow
 from nedbus.cli.options import (
     CountOption,
     CsvOption,
@@ -92,7 +92,7 @@ def echo(
     mode: Mode = "every" if every else "latest"
     with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
         try:
-            follow(subscription, print_one, link=Link(bus), count=1 if once else count, duration=duration)
+            follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
                 _write_counts(subscription)

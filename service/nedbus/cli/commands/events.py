@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.cli.follow import Link, follow
+from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.client import Bus, Monitor, Sample, to_age
@@ -232,7 +232,7 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         return True
 
     with bus.subscribe_to(selection, mode="every") as subscription:
-        follow(subscription, handle, link=Link(bus), count=None, duration=duration, each_second=show_new)
+        follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
 
 
 def _merge(reports: Iterable[AccountReport]) -> list[Event]:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Final
 
-from nedbus.cli.follow import Link, follow
+from nedbus.cli.follow import follow
 from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import LiveTable
@@ -42,14 +42,14 @@ def hz(
     With --json and --csv there is a line for each stream that had messages, or whose state changed.
     """
     require_one({"--json": json_output, "--csv": csv_output})
-    link, monitor = Link(bus), Monitor()
+    monitor = Monitor()
     written: dict[Address, tuple[int, str]] = {}
     with bus.subscribe_to(selection, mode="every") as subscription, LiveTable(_HEAD, _OPTIONAL) as table:
         if csv_output:
             write(csv_line(["time", "vehicle", "topic", "instance", "state", "reason", *_MEASURES, *DOUBT_FLAGS]))
 
         def show() -> None:
-            streams = sorted(_judge(bus, monitor, connected=link.connected), key=_severity)
+            streams = sorted(_judge(bus, monitor), key=_severity)
             if not (json_output or csv_output):
                 table.show([_to_row(*each) for each in streams])
                 return
@@ -59,14 +59,14 @@ def hz(
             written.clear()
             written.update({address: (health.messages, state.name) for address, health, state in streams})
 
-        follow(subscription, monitor.add, link=link, count=count, duration=duration, each_second=show)
+        follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 
 
-def _judge(bus: Bus, monitor: Monitor, *, connected: bool) -> Iterator[Stream]:
+def _judge(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
     """Yield all streams with their states; forget what has been gone for a minute."""
     alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
     for address, health in monitor.snapshot().items():
-        state = stream_state(health, alive=address in alive, connected=connected)
+        state = stream_state(health, alive=address in alive, connected=bus.connected)
         if state.name == "gone" and (health.age or 0.0) > _FORGET_AFTER:
             monitor.forget(address)
         else:

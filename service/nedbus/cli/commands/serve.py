@@ -24,8 +24,8 @@ from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
 
+from .bridges import serve_pages
 from .check import report_mistakes
-from .http import serve_pages
 
 _log = logging.getLogger("nedbus")
 _SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
@@ -67,7 +67,7 @@ def serve(
     SIGHUP reads the settings again: new sources start, those that are gone end, all others go on.
     """
     given: dict[str, object] = {
-        "source": source and tuple(source), "connect": connect and tuple(connect), "listen": listen and tuple(listen),
+        "source": source, "connect": connect, "listen": listen,
         "router_config": router_config, "tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key,
         "prefix": prefix, "vehicle": vehicle, "http": http, "until_done": until_done,
     }  # fmt: skip

@@ -9,9 +9,8 @@ import os
 import sys
 import threading
 from datetime import UTC, datetime
-from enum import StrEnum
 from types import TracebackType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
@@ -28,23 +27,9 @@ _MAX_TRACEBACK: Final = 20_000  # characters, the last ones, in which the error 
 _KEYS: Final = ("vehicle", "topic", "instance", "source", "reason", "count", "of")
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
 ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
-
-
-class LogFormat(StrEnum):
-    """How lines look."""
-
-    TEXT = "text"
-    JSON = "json"
-
-
-class LogLevel(StrEnum):
-    """From which level on lines are logged."""
-
-    DEBUG = "debug"
-    INFO = "info"
-    WARNING = "warning"
-    ERROR = "error"
 
 
 class TextFormatter(logging.Formatter):
@@ -102,9 +87,9 @@ class JournalFormatter(logging.Formatter):
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
 
 
-def log_to_stderr(*, level: LogLevel = LogLevel.INFO, log_format: LogFormat = LogFormat.TEXT) -> None:
+def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     """Log to stderr, a line for each record; with priorities where that is the journal."""
-    is_journal, is_json = _is_journal(), log_format is LogFormat.JSON
+    is_journal, is_json = _is_journal(), log_format == "json"
     formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
@@ -112,7 +97,7 @@ def log_to_stderr(*, level: LogLevel = LogLevel.INFO, log_format: LogFormat = Lo
         handler.name = FOR_PROGRAMS
         _log_uncaught_errors()
     _install(handler)
-    number = logging.getLevelNamesMapping()[level.name]
+    number = logging.getLevelNamesMapping()[level.upper()]
     logging.getLogger("nedbus").setLevel(number)
     logging.getLogger().setLevel(max(number, logging.WARNING))
 

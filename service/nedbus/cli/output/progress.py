@@ -80,7 +80,7 @@ class Display:
             self._hinted = True
             is_read = not logs_for_programs() and (self._daemon.role == "router" or sys.stderr.isatty())
             if is_read and not self._daemon.until_done:
-                self._print(what_to_type(self._daemon.endpoints))
+                write_stderr(what_to_type(self._daemon.endpoints))
         elapsed = time.monotonic() - self._reported
         if self._progress is not None:
             for status in self._daemon.sources:
@@ -102,12 +102,6 @@ class Display:
         newest = [sample for sample in self._daemon.newest() if sample.topic == DEFAULT_TOPIC]
         for sample in newest[:_MAX_REPORTED]:
             _log.info("%s", to_line(sample), extra=about("progress", sample.address))
-
-    def _print(self, text: str) -> None:
-        if self._progress is not None:
-            self._progress.console.print(text, highlight=False)
-        else:
-            write_stderr(text)
 
     def _show(self, progress: Progress, status: SourceStatus) -> None:
         if status.source not in self._tasks:

@@ -36,12 +36,20 @@ class _Wrapper(textwrap.TextWrapper):
 
 
 def to_table(
-    head: Sequence[str], rows: Sequence[Sequence[str]], *, width: int | None = None, optional: Sequence[str] = ()
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    width: int | None = None,
+    optional: Sequence[str] = (),
+    max_rows: int = 1_000_000,
 ) -> str:
     """Return rows in columns: the first and the last one are text, aligned to the left, the others numbers.
 
     In a `width` that is too small columns are left out, in the order of `optional`, and then text is wrapped.
+    A last line has the number of rows beyond `max_rows`.
     """
+    more = len(rows) - max_rows
+    rows = rows[:max_rows]
     widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
     kept = list(range(len(head)))
     last = kept[-1]
@@ -63,7 +71,7 @@ def to_table(
                 for column, part in zip(kept, parts, strict=True)
             )
             lines.append(COLUMN_GAP.join(padded).rstrip())
-    return "\n".join(lines)
+    return "\n".join([*lines, f"{more} more"] if more > 0 else lines)
 
 
 def _wrap(text: str, width: int) -> list[str]:
@@ -93,9 +101,7 @@ class LiveTable:
         """Show these rows, the first 50 at most, and on a terminal no more than it has lines."""
         width = terminal_width()
         count = _MAX_ROWS if width is None else min(_MAX_ROWS, shutil.get_terminal_size().lines - 3)
-        text = to_table(self._head, rows[:count], width=width, optional=self._optional)
-        if len(rows) > count:
-            text += f"\n{len(rows) - count} more"
+        text = to_table(self._head, rows, width=width, optional=self._optional, max_rows=count)
         if width is None:
             write(text)
             return

@@ -1,10 +1,10 @@
-"""Commands that are looked at with a browser, Prometheus or Foxglove: web, export, foxglove; HTTP pages of commands."""
+"""Commands that pass data on to browsers, Prometheus, Foxglove and ROS 2: web, export, foxglove, ros2."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
@@ -19,10 +19,10 @@ from nedbus.cli.options import InstanceOption, TopicOption, VehicleOption, on_bu
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
-from nedbus.errors import ConfigError, ListenError
+from nedbus.errors import ConfigError, ConnectError, ListenError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
-from nedbus_msgs import ANY, Selection
+from nedbus_msgs import ANY, RELEASES, Selection
 
 if TYPE_CHECKING:
     from nedbus.monitoring import Page
@@ -101,6 +101,46 @@ def foxglove(bus: Bus, *, vehicle: VehicleOption = ANY, http: HttpOption = f"127
     with bridges.FoxgloveServer(bus, host=host, port=port) as server:
         write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
+
+
+@on_bus
+@selecting(ANY)
+def ros2(
+    bus: Bus,
+    selection: Selection,
+    *,
+    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
+    layout: Annotated[
+        str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
+    ] = RELEASES[-1],
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
+    namespace: Annotated[
+        list[str] | None,
+        typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics of a vehicle, as /NAMESPACE/fmu/out/...; repeatable"),
+    ] = None,
+    to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
+) -> None:
+    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""
+    for each in namespace or ():
+        if ":" not in each:
+            raise ConfigError("--namespace", f"{each!r} is not VEHICLE:NAMESPACE")
+    namespaces = dict(each.partition(":")[::2] for each in namespace or ())
+    try:
+        session, observer = bus.open_session(to), bus.open_session(to)
+    except ConnectError as exc:
+        raise NedbusError(f"nothing answers at {to}: start the router of ROS 2 there, or correct --to") from exc
+    with closing(session), closing(observer):
+        bridge = bridges.Ros2Bridge(
+            bus,
+            session,
+            observer=observer,
+            selection=selection,
+            layout=layout,
+            domain=domain,
+            hashed=not humble,
+            namespaces=namespaces,
+        )
+        run_until_stopped(bridge.run)
 
 
 @contextmanager
