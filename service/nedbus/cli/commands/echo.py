@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Annotated, Any
 
 import typer
@@ -22,11 +21,11 @@ from nedbus.cli.options import (
     require_one,
     selecting,
 )
-from nedbus.cli.output.samples import Lines, to_csv, to_csv_head, to_fields, to_json
-from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.output.samples import Lines, to_fields, to_json, to_row
+from nedbus.cli.output.streams import csv_line, write, write_stderr
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
-from nedbus_msgs import DEFAULT_TOPIC, Address, Definition, Selection
+from nedbus_msgs import DEFAULT_TOPIC, Address, Selection
 
 
 @on_bus
@@ -65,28 +64,27 @@ def echo(
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
-    show: Callable[[Sample[Any]], str] = partial(form, fields=fields)
+    form = to_json if json_output else to_fields if full else Lines(selection)
     due: dict[Address, float] = {}
-    csv_head = ""
-    csv_definition: Definition[Any] | None = None
+    csv_head: list[str] = []
 
     def print_one(sample: Sample[Any]) -> bool:
-        nonlocal csv_head, csv_definition
         if interval:
             now = time.monotonic()
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        if csv_output and sample.message.DEFINITION is not csv_definition:
-            csv_definition, head = sample.message.DEFINITION, to_csv_head(sample, fields)
-            if csv_head not in {"", head}:
-                text = f"a table has one kind of message, and {sample.address} is another: name a topic"
-                raise ConfigError("--csv", text)
-            if not csv_head:
-                write(head)
-            csv_head = head
-        write(show(sample))
+        if not csv_output:
+            write(form(sample, fields))
+            return True
+        head, cells = zip(*to_row(sample, fields), strict=True)
+        if not csv_head:
+            csv_head.extend(head)
+            write(csv_line(head))
+        elif csv_head != list(head):
+            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
+            raise ConfigError("--csv", text)
+        write(csv_line(cells))
         return True
 
     mode: Mode = "every" if every else "latest"

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Final
+from typing import Any, Final
 
 from nedbus.cli.follow import follow
 from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
@@ -17,9 +17,9 @@ from nedbus_msgs import ANY, DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
 _OPTIONAL: Final = ("JITTER", "MAX", "LATENCY", "LOST")
-_MEASURES: Final = (
-    "rate", "usual_rate", "nominal", "jitter", "latency", "latency_max", "age", "messages", "lost", "gaps",
-    "out_of_order", "reboots",
+_CSV_HEAD: Final = (
+    "time", "vehicle", "topic", "instance", "state", "reason", "rate", "usual_rate", "nominal", "jitter", "latency",
+    "latency_max", "age", "messages", "lost", "gaps", "out_of_order", "reboots", *DOUBT_FLAGS,
 )  # fmt: skip
 _FORGET_AFTER: Final = 60.0  # s after which a stream that is gone is not shown any more
 
@@ -46,7 +46,7 @@ def hz(
     written: dict[Address, tuple[int, str]] = {}
     with bus.subscribe_to(selection, mode="every") as subscription, LiveTable(_HEAD, _OPTIONAL) as table:
         if csv_output:
-            write(csv_line(["time", "vehicle", "topic", "instance", "state", "reason", *_MEASURES, *DOUBT_FLAGS]))
+            write(csv_line(_CSV_HEAD))
 
         def show() -> None:
             streams = sorted(_judge(bus, monitor), key=_severity)
@@ -55,7 +55,7 @@ def hz(
                 return
             for address, health, state in streams:
                 if written.get(address) != (health.messages, state.name):
-                    write((_to_csv if csv_output else _to_json)(address, health, state))
+                    write((_to_csv if csv_output else json.dumps)(_to_fields(address, health, state)))
             written.clear()
             written.update({address: (health.messages, state.name) for address, health, state in streams})
 
@@ -91,12 +91,11 @@ def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
     ]
 
 
-def _to_json(address: Address, health: Health, state: StreamState) -> str:
-    head = {"time": time.time(), "vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-    return json.dumps({**head, "state": state.name, "reason": state.reason, **asdict(health)})
+def _to_fields(address: Address, health: Health, state: StreamState) -> dict[str, Any]:
+    head = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
+    return {"time": time.time(), **head, "state": state.name, "reason": state.reason, **asdict(health)}
 
 
-def _to_csv(address: Address, health: Health, state: StreamState) -> str:
-    head = f"{time.time():.3f}", address.vehicle, address.topic, address.instance, state.name, state.reason
-    flags = health.flags or {}
-    return csv_line([*head, *(getattr(health, name) for name in _MEASURES), *(flags.get(name) for name in DOUBT_FLAGS)])
+def _to_csv(fields: dict[str, Any]) -> str:
+    cells = {**fields, **(fields["flags"] or {}), "time": f"{fields['time']:.3f}"}
+    return csv_line(cells.get(name) for name in _CSV_HEAD)

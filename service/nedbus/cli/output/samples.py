@@ -11,7 +11,6 @@ from typing import Any, Final
 from nedbus.client import Sample, to_age
 from nedbus_msgs import ANY, DEFAULT, TOPICS, Message, Selection, get_topic, message_doubts
 
-from .streams import csv_line
 from .table import COLUMN_GAP, terminal_width
 
 _TIMES: Final = ("timestamp", "timestamp_sample")
@@ -193,27 +192,27 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
 
-def to_csv_head(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-    """Return the first line of a CSV file of these fields, or of all, of messages like this one."""
-    names, types = ["vehicle", "topic", "instance", "sent", "timestamp"], sample.message.DEFINITION.types
-    for name in fields or types:
-        if name != "timestamp":
-            length = types[name].length if name in types else None
-            names += [f"{name}[{index}]" for index in range(length)] if length else [name]
-    return csv_line(names)
+def to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
+    """Return the names and cells of a row of CSV: vehicle, topic, instance, when it was sent [ns], PX4's time [us], the fields.
 
-
-def to_csv(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-    """Return a line of CSV: vehicle, topic, instance, when it was sent [ns], PX4's timestamp [us], and the fields."""
+    An array has a cell for each element; a field that this message does not have is empty.
+    """
     address, message = sample.address, sample.message
-    cells: list[object] = [address.vehicle, address.topic, address.instance, sample.sent, message.timestamp]
+    row: list[tuple[str, object]] = [
+        ("vehicle", address.vehicle), ("topic", address.topic), ("instance", address.instance),
+        ("sent", sample.sent), ("timestamp", message.timestamp),
+    ]  # fmt: skip
     types = message.DEFINITION.types
     for name in fields or types:
-        if name != "timestamp":
-            value = getattr(message, name, "")
-            digits = _DIGITS.get(types[name].base) if name in types else None
-            cells += [_to_number(each, digits) for each in (value if isinstance(value, tuple) else (value,))]
-    return csv_line(cells)
+        if name == "timestamp":
+            continue
+        value = getattr(message, name, "")
+        digits = _DIGITS.get(types[name].base) if name in types else None
+        if isinstance(value, tuple):
+            row += [(f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)]
+        else:
+            row.append((name, _to_number(value, digits)))
+    return row
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
