@@ -109,13 +109,14 @@ def on_bus(function: Callable[..., None]) -> Callable[..., None]:
 
 def selecting(default: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options that select streams in place of its parameter `selection`; `default`: its topic."""
+    option = Annotated[str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {default})')]
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         def run(options: dict[str, Any], own: dict[str, Any]) -> None:
             function(**own, selection=_select(**options, default=default))
 
         *added, _ = inspect.signature(_select, eval_str=True).parameters.values()
-        added = [each.replace(default=default) if each.name == "topic_option" else each for each in added]
+        added = [each.replace(annotation=option) if each.name == "topic_option" else each for each in added]
         return _replace_parameter(function, "selection", inspect.Signature(added), run)
 
     return decorate
@@ -168,7 +169,7 @@ def _open_bus(
 def _select(
     topic: TopicArgument = None,
     *,
-    topic_option: TopicOption = ANY,
+    topic_option: str | None = None,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
     default: str,
@@ -178,8 +179,8 @@ def _select(
     Raises ConfigError when both give a topic, AddressError for a selection that is invalid.
     """
     if topic is None:
-        return Selection(topic_option, vehicle, instance)
-    if topic_option != default:
+        return Selection(default if topic_option is None else topic_option, vehicle, instance)
+    if topic_option is not None:
         raise ConfigError("--topic", f"the topic is given as {topic!r} already: remove one of the two")
     chunks = topic.strip("/").split("/")
     if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:

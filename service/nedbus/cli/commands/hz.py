@@ -49,7 +49,7 @@ def hz(
             write(csv_line(_CSV_HEAD))
 
         def show() -> None:
-            streams = sorted(_judge(bus, monitor), key=_severity)
+            streams = sorted(_states(bus, monitor), key=_severity)
             if not (json_output or csv_output):
                 table.show([_to_row(*each) for each in streams])
                 return
@@ -62,7 +62,7 @@ def hz(
         follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 
 
-def _judge(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
+def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
     """Yield all streams with their states; forget what has been gone for a minute."""
     alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
     for address, health in monitor.snapshot().items():

@@ -193,7 +193,7 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 
 
 def to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
-    """Return the names and cells of a row of CSV: vehicle, topic, instance, when it was sent [ns], PX4's time [us], the fields.
+    """Return the names and cells of a row of CSV: the address, when it was sent [ns], PX4's time [us], these fields.
 
     An array has a cell for each element; a field that this message does not have is empty.
     """

@@ -41,22 +41,21 @@ def to_table(
     *,
     width: int | None = None,
     optional: Sequence[str] = (),
-    max_rows: int = 1_000_000,
+    max_rows: int | None = None,
 ) -> str:
     """Return rows in columns: the first and the last one are text, aligned to the left, the others numbers.
 
     In a `width` that is too small columns are left out, in the order of `optional`, and then text is wrapped.
     A last line has the number of rows beyond `max_rows`.
     """
-    more = len(rows) - max_rows
+    more = 0 if max_rows is None else len(rows) - max_rows
     rows = rows[:max_rows]
     widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
     kept = list(range(len(head)))
     last = kept[-1]
     if width is not None:
-        for name in (None, *optional):
-            if name is not None:
-                kept.remove(head.index(name))
+        for omitted in range(len(optional) + 1):
+            kept = [column for column, name in enumerate(head) if name not in optional[:omitted]]
             spare = width - sum(widths[column] for column in kept[1:-1]) - len(COLUMN_GAP) * (len(kept) - 1)
             if spare >= widths[0] + min(widths[last], _READABLE):
                 break
