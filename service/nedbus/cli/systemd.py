@@ -73,6 +73,7 @@ class Notifier:
         self._counted = time.monotonic(), 0  # when, and the number of messages published by then
         self._is_ready = self._ticked = False  # READY was taken; the main thread works
         self._rejected = ""
+        self._lock = threading.Lock()  # a reload right after READY must find `_is_ready`; not for signal handlers
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
 
@@ -102,9 +103,10 @@ class Notifier:
 
         The error stays in the text of the status until the next time.
         """
-        if self._is_ready:
-            now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-            self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reads the configuration again")
+        with self._lock:
+            if self._is_ready:
+                now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+                self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reads the configuration again")
         self._rejected = ""
         try:
             yield
@@ -112,8 +114,9 @@ class Notifier:
             self._rejected = f"the new configuration is rejected, the old one works on: {exc}"
             raise
         finally:
-            if self._is_ready:  # if it is not taken, the thread sends it again: systemd waits for it
-                self._is_ready = self._socket.send(READY=1, STATUS=to_text(self._rejected or "ready", MAX_TEXT))
+            with self._lock:
+                if self._is_ready:  # if it is not taken, the thread sends it again: systemd waits for it
+                    self._is_ready = self._socket.send(READY=1, STATUS=to_text(self._rejected or "ready", MAX_TEXT))
 
     def _run(self) -> None:
         next_status = next_ping = 0.0
@@ -121,7 +124,9 @@ class Notifier:
             now = time.monotonic()
             has_waited = self._daemon.role == "client" and now >= self._router_deadline
             if not self._is_ready and (self._daemon.ready.is_set() or has_waited):
-                self._is_ready = self._socket.send(READY=1, STATUS=self._status())
+                status = self._status()
+                with self._lock:
+                    self._is_ready = self._socket.send(READY=1, STATUS=status)
                 next_status = now + _STATUS_INTERVAL
             elif now >= next_status:
                 self._socket.send(STATUS=self._status())
