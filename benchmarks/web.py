@@ -136,7 +136,7 @@ def _serve(endpoint: str) -> tuple[Process, str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    web = start("-m", "nedbus", "web", "--connect", endpoint, "--listen", f"127.0.0.1:{port}", quiet=False)
+    web = start("-m", "nedbus", "web", "--connect", endpoint, "--http", f"127.0.0.1:{port}", quiet=False)
     url = f"http://127.0.0.1:{port}"
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:

@@ -13,7 +13,7 @@ import pytest
 import nedbus
 from nedbus.cli import follow
 from nedbus.cli.app import app
-from nedbus.cli.pki import pki
+from nedbus.cli.commands.pki import pki
 from nedbus.client import Subscription, connect_with
 from nedbus.settings import Settings
 from nedbus.transport import open_router
@@ -157,7 +157,7 @@ def test_no_data_yet_is_reported(endpoint: str, bus: nedbus.Bus, monkeypatch: py
         bus.publisher(VLP, vehicle="7").publish(message(5, x=1.0))
 
     monkeypatch.setattr(follow, "write_notice", publish_after_notice)
-    monkeypatch.setattr(follow, "_NOTICE", 0.1)
+    monkeypatch.setattr(follow, "SILENCE_TIMEOUT", 0.1)
     echo = run_command("echo", "-c", endpoint, "-n", "1")
     assert echo.exit_code == 0
     assert echo.err.count("yet, waiting") == 1
@@ -214,6 +214,7 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude, of which it looks like a mis"),
         (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink says nothing of these topics"),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
+        (["echo", "vehicle_attitude", "-t", VLP], "--topic: the topic is given as 'vehicle_attitude' already"),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
         (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),
         (["get", "--field", "xx"], "--field: there is no field 'xx'"),
@@ -230,6 +231,19 @@ def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], te
     assert text in ended.err
     assert len(ended.err.splitlines()) == 1
     assert run_command(*arguments, "--no-such-flag").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["web", "--listen", "127.0.0.1:0"], ["export", "--listen", "127.0.0.1:0"], ["foxglove", "--port", "0"]],
+    ids=" ".join,
+)
+def test_address_of_http_has_one_name(endpoint: str, arguments: list[str]) -> None:
+    """Each command that serves HTTP or a WebSocket listens at --http; --listen is for endpoints of Zenoh alone."""
+    assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
+    wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=endpoint)
+    assert wrong.exit_code == 2
+    assert "--http: '8765' is not an address: write HOST:PORT" in wrong.err
 
 
 def test_version_and_help(run_nedbus: Start) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from nedbus.cli.progress import what_to_type
+from nedbus.cli.output.progress import what_to_type
 from nedbus.transport import DEFAULT_ENDPOINT
 from tests.command_line import run_command
 from tests.ports import free_endpoint, free_port

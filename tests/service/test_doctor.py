@@ -47,7 +47,7 @@ def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for a shorter time than a person would: `look` says how long."""
     monkeypatch.setattr("nedbus.doctor.observation._LEAST", 0.1)
     monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", 0.1)
-    monkeypatch.setattr("nedbus.cli.doctor.examine", partial(examine, listen=0.5))
+    monkeypatch.setattr("nedbus.cli.commands.doctor.examine", partial(examine, listen=0.5))
 
 
 def look(*endpoints: str, tls: Mapping[str, Path] | None = None, listen: float = 0.1, **options: Any) -> list[Finding]:

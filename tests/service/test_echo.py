@@ -157,7 +157,7 @@ def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedb
 
 def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """A last value is marked as old by echo, and hz does not measure it."""
-    monkeypatch.setattr("nedbus.cli.format._OLD", 0.01)
+    monkeypatch.setattr("nedbus.cli.output.samples._OLD", 0.01)
     bus.publisher(VLP, vehicle="1").publish(message(1))
     wait_for(lambda: any((sample.latency or 0) > 0.01 for sample in bus.latest()), what="the message to be old")
     assert "s old]" in echo(endpoint, "-n", "1").out

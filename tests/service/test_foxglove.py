@@ -90,7 +90,7 @@ def connected(url: str) -> Iterator[Client]:
 def test_vehicles_appear_and_every_field_can_be_plotted(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
     """Channels come with vehicles and go with them; a plot's data is the message, with its definition."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--port", url.rpartition(":")[2], measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/estimator_local_position/1"
     sent = message(5, x=0.25, vxy_max=float("inf"))
@@ -117,7 +117,7 @@ def test_what_is_said_once_is_shown_to_the_first_who_subscribes(
 ) -> None:
     """A home comes once, and brings its channel: nobody can have subscribed to that before."""
     url = f"ws://127.0.0.1:{free_port()}"
-    process = run_nedbus("foxglove", "-c", endpoint, "--port", url.rpartition(":")[2], measured=False)
+    process = run_nedbus("foxglove", "-c", endpoint, "--http", url.removeprefix("ws://"), measured=False)
     wait_for(lambda: f"open {url}" in process.err or process.popen.poll() is not None, what="the server")
     topic = "/7/home_position"
     with connected(url) as client, bus.publisher("home_position", vehicle="7") as publisher:
@@ -198,6 +198,6 @@ def test_pose_has_position_and_attitude(bus: nedbus.Bus) -> None:
 def test_port_in_use_is_reported(bus: nedbus.Bus, endpoint: str) -> None:
     """Two servers cannot have one port."""
     with FoxgloveServer(bus, port=0) as server:
-        ended = run_command("foxglove", "-c", endpoint, "--port", server.url.rpartition(":")[2])
+        ended = run_command("foxglove", "-c", endpoint, "--http", server.url.removeprefix("ws://"))
     assert ended.exit_code == 1
-    assert "address already in use): choose another port with --port" in ended.err
+    assert "address already in use): choose another address with --http" in ended.err

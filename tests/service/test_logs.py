@@ -18,8 +18,8 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.cli.log_format import JournalFormatter, JsonFormatter, TextFormatter
-from nedbus.cli.log_limit import BURST, PER_MINUTE, RateLimit
+from nedbus.cli.output.log_limit import BURST, PER_MINUTE, RateLimit
+from nedbus.cli.output.logs import JournalFormatter, JsonFormatter, TextFormatter
 from nedbus.log_event import EVENTS, about
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
@@ -153,7 +153,7 @@ def test_service_logs_json(start: Start) -> None:
     What a person would read beside the log is in an object; what to type in a second terminal is left out.
     """
     sources = ("-s", REPLAY, "-s", "sim:?vehicle=2")
-    soon = {"nedbus.cli.progress._REPORT_INTERVALS": (0.2,)}
+    soon = {"nedbus.cli.output.progress._REPORT_INTERVALS": (0.2,)}
     service = start_hasty(start, soon, "serve", "-l", "tcp/127.0.0.1:0", *sources, NEDBUS_LOG_FORMAT="json")
     for event in ("done", "progress"):  # a report comes after what to type
         wait_for(lambda: f'"event": "{event}"' in service.err, what=event)  # noqa: B023 - it is called at once

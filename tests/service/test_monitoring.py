@@ -22,7 +22,7 @@ from prometheus_client.registry import Collector
 
 import nedbus
 from nedbus import StreamHealth
-from nedbus.cli.http import serve_pages
+from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.status import SourceStatus, State, StreamStatus

@@ -119,7 +119,7 @@ def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browse
     router = run_nedbus("router", "--listen", endpoint)
     wait_for(lambda: "router on" in router.err, what="the router")
     events = run_nedbus("events", "--connect", endpoint, "--json")
-    web = run_nedbus("web", "--connect", endpoint, "--listen", f"127.0.0.1:{port}")
+    web = run_nedbus("web", "--connect", endpoint, "--http", f"127.0.0.1:{port}")
     wait_for(lambda: "open http" in web.err, what="the page")
     with open_tabs(browser, may_complain=True) as make:
         page = make(width=1280, height=800)

@@ -15,7 +15,7 @@ import pytest
 
 import nedbus
 from nedbus import Counts
-from nedbus.cli.format import to_line
+from nedbus.cli.output.samples import to_line
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver
 from nedbus.transport import open_client

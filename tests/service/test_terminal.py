@@ -21,10 +21,9 @@ import pytest
 from rich.console import Console
 
 import nedbus
-from nedbus.cli.format import printable, to_text
-from nedbus.cli.lines import Lines
-from nedbus.cli.live_table import LiveTable
-from nedbus.cli.table import to_table
+from nedbus.cli.output.samples import Lines
+from nedbus.cli.output.streams import printable, to_text
+from nedbus.cli.output.table import LiveTable, to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.command_line import fork_command, run_command
@@ -79,7 +78,7 @@ def test_text_is_folded_at_words() -> None:
     assert len(to_table(HEAD, ROWS).splitlines()) == 1 + len(ROWS)
     remark = "/a/rather/long/path/to/some/flight_of_today.ulg: no such file or directory"
     folded = to_table(("SOURCE", "REMARK"), [("sim:", remark)], width=24)
-    parts = "/a/rather/long/|path/to/some/|flight_of_today.|ulg: no such|file or|directory"
+    parts = "/a/rather/long/|path/to/some/|flight_of_|today.ulg: no|such file or|directory"
     assert "|".join(line[8:] for line in folded.splitlines()[1:]) == parts
     long = f"{'v' * 64}/vehicle_local_position"
     lines = to_table(HEAD, [(long, *ROWS[0][1:])], width=80, optional=OPTIONAL).splitlines()
@@ -101,7 +100,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
     monkeypatch.setenv("LINES", "24")
 
     def make(width: int) -> Lines:
-        monkeypatch.setattr("nedbus.cli.lines.terminal_width", lambda: width)
+        monkeypatch.setattr("nedbus.cli.output.samples.terminal_width", lambda: width)
         return Lines(nedbus.Selection())
 
     return make
@@ -291,7 +290,7 @@ def test_signal_while_a_table_starts(
         return True
 
     monkeypatch.setattr(Console, "show_cursor", show_cursor)
-    monkeypatch.setattr("nedbus.cli.live_table.terminal_width", lambda: 80)
+    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: 80)
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -472,12 +471,12 @@ STUCK = """
 import time
 from nedbus.cli import run
 
-def stand_still():
+def stand_still(stop):
     print("started", flush=True)
     time.sleep(100)
 
-run._LIMIT = 100.0
-run.run_until_signal(stand_still, lambda: print("stopping", flush=True))
+run._END_TIMEOUT = 100.0
+run.run_until_stopped(stand_still, on_stop=lambda: print("stopping", flush=True))
 """
 
 

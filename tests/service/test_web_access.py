@@ -129,9 +129,9 @@ def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) ->
 
 
 def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: str) -> None:
-    """With --listen 0.0.0.0 the command says who can look, --origin adds a name, and Ctrl-C ends it."""
+    """With --http 0.0.0.0 the command says who can look, --origin adds a name, and Ctrl-C ends it."""
     port = free_port()
-    url, listen = f"http://127.0.0.1:{port}", f"--listen=0.0.0.0:{port}"
+    url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
     process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", measured=False)
     wait_for(lambda: "without a password" in process.err, what="the warning")
     assert status_of(f"{url}/healthz", Host="evil.example") == 200

@@ -40,7 +40,7 @@ def web(run_nedbus: Start) -> Web:
     """Start `nedbus web` on a port, and wait until it serves its page."""
 
     def serve(port: int, *arguments: str) -> Process:
-        process = run_nedbus("web", "--listen", f"127.0.0.1:{port}", *arguments)
+        process = run_nedbus("web", "--http", f"127.0.0.1:{port}", *arguments)
         wait_for(lambda: "open http" in process.err or process.popen.poll() is not None, what="the page")
         assert process.popen.poll() is None, process.err
         return process

@@ -37,7 +37,7 @@ from .foxglove_messages import MapFrame, has_position, orientation_of, to_locati
 
 _ATTITUDE: Final = "vehicle_attitude"
 _POLL: Final = 1.0  # s between two queries for the addresses that are published
-_HINT: Final = "choose another port with --port"
+_HINT: Final = "choose another address with --http"
 
 
 class FoxgloveServer:

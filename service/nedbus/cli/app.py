@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import Annotated
 
 import typer
 
 from nedbus import __version__
 
-from .bridges import foxglove, ros2
-from .check import check
-from .doctor import doctor
-from .echo import echo
-from .events import events, why
-from .files import convert, plot, record
-from .health import health
-from .http import export
-from .hz import hz
-from .logs import LogFormat, LogLevel, log_to_stderr
-from .options import command, write
-from .pki import pki
-from .query import get, info, list_, schema
-from .serve import router, serve
-from .web import web
+from .commands.bridges import export, foxglove, ros2, web
+from .commands.check import check
+from .commands.doctor import doctor
+from .commands.echo import echo
+from .commands.events import events, why
+from .commands.files import convert, plot, record
+from .commands.health import health
+from .commands.hz import hz
+from .commands.pki import pki
+from .commands.query import get, info, list_, schema
+from .commands.serve import router, serve
+from .options import command
+from .output.logs import LogFormat, LogLevel, log_to_stderr
+from .output.streams import write
 
 app = typer.Typer(
     name="nedbus",
@@ -32,30 +30,11 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-_COMMANDS: Mapping[str, Callable[..., None]] = {
-    "serve": serve,
-    "router": router,
-    "list": list_,
-    "echo": echo,
-    "hz": hz,
-    "get": get,
-    "info": info,
-    "events": events,
-    "why": why,
-    "health": health,
-    "doctor": doctor,
-    "check": check,
-    "export": export,
-    "schema": schema,
-    "ros2": ros2,
-    "foxglove": foxglove,
-    "web": web,
-    "record": record,
-    "convert": convert,
-    "plot": plot,
-}
-for _name, _function in _COMMANDS.items():
-    app.command(_name)(_function)
+for _command in (
+    serve, router, list_, echo, hz, get, info, events, why, health, doctor, check, export, schema, ros2, foxglove, web,
+    record, convert, plot,
+):  # fmt: skip
+    app.command(_command.__name__.rstrip("_"))(_command)
 app.add_typer(pki, name="pki")
 
 
@@ -73,9 +52,9 @@ def _set_up(
     debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
     log_level: Annotated[
         LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Log from this level on")
-    ] = LogLevel.INFO,
+    ] = "info",
     log_format: Annotated[
         LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="json: an object a line")
-    ] = LogFormat.TEXT,
+    ] = "text",
 ) -> None:
-    log_to_stderr(level=LogLevel.DEBUG if debug else log_level, log_format=log_format)
+    log_to_stderr(level="debug" if debug else log_level, log_format=log_format)

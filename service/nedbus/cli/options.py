@@ -1,16 +1,12 @@
-"""What all commands share: options, the open bus, output, exit codes, one line for an error."""
+"""The options that commands share: how to connect, which streams, how many; errors as one line and an exit code."""
 
 from __future__ import annotations
 
-import errno
 import functools
 import inspect
 import logging
-import os
 import signal
-import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec
 
@@ -21,10 +17,9 @@ from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, 
 from nedbus.log_event import about
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, MESSAGES, TOPICS, Selection
 
-from .format import MAX_TEXT, printable, to_text
-from .logs import logs_for_programs
+from .output.streams import MAX_TEXT, discard_stdout, logs_for_programs, to_text, write_stderr
 
 P = ParamSpec("P")
 _log = logging.getLogger("nedbus")
@@ -46,10 +41,7 @@ TopicArgument = Annotated[
         metavar="TOPIC", help="TOPIC, or what nedbus list prints: VEHICLE/TOPIC/INSTANCE", show_default=False
     ),
 ]
-TopicOption = Annotated[str | None, typer.Option("--topic", "-t", help='Topic, "*" for all (default: all)')]
-PositionTopicOption = Annotated[
-    str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {DEFAULT_TOPIC})')
-]
+TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
     int | None, typer.Option("--instance", "-i", help="Instance, of topics that have some (default: all)")
@@ -81,7 +73,7 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(130) from None
         except BrokenPipeError:
             # The reader of a pipe is gone (`| head`): nothing can be written, at exit either.
-            _discard_stdout()
+            discard_stdout()
             raise typer.Exit(0) from None
         except OSError as exc:
             where = f"{exc.filename}: " if exc.filename else ""
@@ -99,30 +91,57 @@ def command(function: Callable[P, None]) -> Callable[P, None]:
 
 
 def on_bus(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function: it gets an open bus as its first argument, and the options for connecting."""
+    """Make a command of a function that has a parameter `bus`, an open one, or `open_bus`, which opens one.
+
+    The command has the options for connecting in its place.
+    """
+    name = "bus" if "bus" in inspect.signature(function).parameters else "open_bus"
+
+    def run(options: dict[str, Any], own: dict[str, Any]) -> None:
+        if name == "open_bus":
+            function(**own, open_bus=functools.partial(_open_bus, **options))
+            return
+        with _open_bus(**options) as bus:
+            function(**own, bus=bus)
+
+    return command(_replace_parameter(function, name, inspect.signature(_open_bus, eval_str=True), run))
+
+
+def selecting(default: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options that select streams in place of its parameter `selection`; `default`: its topic."""
+    option = Annotated[str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {default})')]
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        def run(options: dict[str, Any], own: dict[str, Any]) -> None:
+            function(**own, selection=_select(**options, default=default))
+
+        *added, _ = inspect.signature(_select, eval_str=True).parameters.values()
+        added = [each.replace(annotation=option) if each.name == "topic_option" else each for each in added]
+        return _replace_parameter(function, "selection", inspect.Signature(added), run)
+
+    return decorate
+
+
+def _replace_parameter(
+    function: Callable[..., None],
+    name: str,
+    added: inspect.Signature,
+    run: Callable[[dict[str, Any], dict[str, Any]], None],
+) -> Callable[..., None]:
+    """Return a function that has other parameters in place of one, as Typer reads them.
+
+    `run` gets the values of those, and the values of the function's own.
+    """
 
     @functools.wraps(function)
-    def run(open_bus: Callable[[], Bus], **options: Any) -> None:
-        with open_bus() as bus:
-            function(bus, **options)
+    def replaced(**options: Any) -> None:
+        run({each: options.pop(each) for each in added.parameters}, options)
 
-    return lazily_on_bus(run)
-
-
-def lazily_on_bus(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function that opens the bus itself: its first argument is what returns one."""
-
-    @command
-    def run(**options: Any) -> None:
-        open_bus = functools.partial(_open_bus, **{name: options.pop(name) for name in _BUS_OPTIONS})
-        function(open_bus, **options)
-
-    _, *own = inspect.signature(function, eval_str=True).parameters.values()
-    parameters = [*own, *_BUS_OPTIONS.values()]
-    run.__doc__ = function.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # Typer reads both
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return run
+    own = [each for each in inspect.signature(function, eval_str=True).parameters.values() if each.name != name]
+    parameters = sorted([*own, *added.parameters.values()], key=lambda each: each.kind)
+    replaced.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # Typer reads both
+    replaced.__annotations__ = {each.name: each.annotation for each in parameters}
+    return replaced
 
 
 def _open_bus(
@@ -136,14 +155,8 @@ def _open_bus(
     wait: WaitOption = False,
 ) -> Bus:
     """Connect with these options; with `wait` for as long as it takes."""
-    settings = load_settings(
-        config,
-        connect=connect and tuple(connect),
-        prefix=prefix,
-        tls_ca=tls_ca,
-        tls_certificate=tls_certificate,
-        tls_key=tls_key,
-    )
+    tls = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
+    settings = load_settings(config, connect=connect, prefix=prefix, **tls)
     try:
         return connect_with(settings, timeout=1.0)
     except ConnectError as exc:
@@ -153,35 +166,28 @@ def _open_bus(
     return connect_with(settings, timeout=None)
 
 
-_BUS_OPTIONS = inspect.signature(_open_bus, eval_str=True).parameters
+def _select(
+    topic: TopicArgument = None,
+    *,
+    topic_option: str | None = None,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    default: str,
+) -> Selection:
+    """Return the selection of the options, or of an argument as `nedbus list` prints it: [VEHICLE/]TOPIC[/INSTANCE].
 
-
-def write_stderr(text: str) -> None:
-    """Write a line for a person to stderr, at once, or log it for programs; if nobody can read it any more, go on."""
-    if logs_for_programs():
-        for line in text.splitlines():
-            _log.info("%s", line, extra=about("notice"))
-        return
-    with suppress(OSError):
-        sys.stderr.write(f"{printable(text)}\n")
-        sys.stderr.flush()
-
-
-def write(line: str) -> None:
-    """Write a line of output, or several, at once.
-
-    Raises BrokenPipeError when its reader is gone, NedbusError when it cannot be written.
+    Raises ConfigError when both give a topic, AddressError for a selection that is invalid.
     """
-    try:
-        if sys.stdout is None:
-            raise OSError(errno.EBADF, "standard output is closed")
-        sys.stdout.write(f"{printable(line)}\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as exc:
-        _discard_stdout()
-        raise NedbusError(f"cannot write: {(exc.strerror or str(exc)).lower()}") from exc
+    if topic is None:
+        return Selection(default if topic_option is None else topic_option, vehicle, instance)
+    if topic_option is not None:
+        raise ConfigError("--topic", f"the topic is given as {topic!r} already: remove one of the two")
+    chunks = topic.strip("/").split("/")
+    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
+        vehicle = chunks.pop(0)
+    if len(chunks) == 2 and chunks[1].isdecimal():
+        instance = int(chunks.pop())
+    return Selection("/".join(chunks), vehicle, instance)
 
 
 def require_one(flags: Mapping[str, bool]) -> None:
@@ -202,27 +208,6 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     return names
 
 
-def choose(
-    argument: str | None, *, topic: str | None, vehicle: str, instance: int | None, default: str = DEFAULT_TOPIC
-) -> Selection:
-    """Return the selection of the options, or of an argument as `nedbus list` prints it: [VEHICLE/]TOPIC[/INSTANCE].
-
-    `default` is the topic if none is given.
-
-    Raises ConfigError when both give a topic, AddressError for a selection that is invalid.
-    """
-    if argument is None:
-        return Selection(default if topic is None else topic, vehicle, instance)
-    if topic is not None:
-        raise ConfigError("--topic", f"the topic is given as {argument!r} already: remove one of the two")
-    chunks = argument.strip("/").split("/")
-    if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
-        vehicle = chunks.pop(0)
-    if len(chunks) == 2 and chunks[1].isdecimal():
-        instance = int(chunks.pop())
-    return Selection("/".join(chunks), vehicle, instance)
-
-
 def _exit_with(error: NedbusError, code: int) -> typer.Exit:
     """Return the exit for an error that is reported in one line; raise the error itself with --debug."""
     if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
@@ -232,9 +217,3 @@ def _exit_with(error: NedbusError, code: int) -> typer.Exit:
     else:
         write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))
     return typer.Exit(code)
-
-
-def _discard_stdout() -> None:
-    """Redirect stdout to the null device, so that flushing it at exit does not fail again."""
-    if sys.stdout is not None:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -18,7 +18,7 @@ from nedbus.log_event import about
 
 _log = logging.getLogger("nedbus")
 
-_LIMIT: Final = 1.6  # s after a signal by which the process has ended
+_END_TIMEOUT: Final = 1.6  # s after a signal by which the process has ended
 
 
 def _ignore_hangup() -> None:
@@ -28,38 +28,29 @@ def _ignore_hangup() -> None:
     )
 
 
-def run_until_stopped(body: Callable[[threading.Event], object]) -> None:
-    """Run a body that ends when its event is set, by Ctrl-C or SIGTERM; raise typer.Exit with 130 after Ctrl-C."""
-    stop = threading.Event()
-
-    def run() -> bool:
-        body(stop)
-        return True
-
-    exit_code = run_until_signal(run, stop.set)
-    if exit_code is not None:
-        raise typer.Exit(exit_code)
-
-
-def run_until_signal(
-    run: Callable[[], bool],
-    stop: Callable[[], object],
+def run_until_stopped(
+    body: Callable[[threading.Event], object],
     *,
+    on_stop: Callable[[], object] = lambda: None,
     on_tick: Callable[[], object] = lambda: None,
     on_hangup: Callable[[], object] = _ignore_hangup,
-) -> int | None:
-    """Run something in a thread until it ends or a signal comes; return the exit code, None for success.
+) -> None:
+    """Run a body in a thread until it ends, or until Ctrl-C or SIGTERM sets its event.
 
-    `run` returns whether it succeeded, `stop` makes it end, `on_tick` is called ten times a second meanwhile, and
-    `on_hangup` after SIGHUP, both in the main thread.
-    The main thread only waits: a signal is then handled at once, even while Zenoh blocks.
+    `on_stop` is called when the event is set, in the handler of the signal; `on_tick` ten times a second meanwhile, and
+    `on_hangup` after SIGHUP, both in the main thread, which only waits: signals are handled at once, even while Zenoh
+    blocks.
+
+    Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
-    outcome: list[bool | BaseException] = []
+    stop = threading.Event()
+    outcome: list[object] = []
     signals: list[int] = []
+    hangups: list[int] = []
 
-    def body() -> None:
+    def run() -> None:
         try:
-            outcome.append(run())
+            outcome.append(body(stop))
         except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
             outcome.append(exc)
 
@@ -67,13 +58,13 @@ def run_until_signal(
         if signals:
             os._exit(130 if number == signal.SIGINT else 1)  # a second signal ends the process at once
         signals.append(number)
-        stop()
+        stop.set()
+        on_stop()
 
-    hangups: list[int] = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
     signal.signal(signal.SIGHUP, lambda number, _: hangups.append(number))
-    thread = threading.Thread(target=body, name="nedbus-run", daemon=True)
+    thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:
         if hangups:
@@ -83,7 +74,7 @@ def run_until_signal(
         thread.join(0.1)
     if signals:
         _log.info("ending: %s", signal.Signals(signals[0]).name, extra=about("ending"))
-    deadline = time.monotonic() + _LIMIT
+    deadline = time.monotonic() + _END_TIMEOUT
     while thread.is_alive() and time.monotonic() < deadline:
         thread.join(0.05)
     if thread.is_alive():
@@ -95,6 +86,7 @@ def run_until_signal(
         os._exit(1)
     if isinstance(outcome[0], BaseException):
         raise outcome[0]
-    if signals and signals[0] == signal.SIGINT:
-        return 130
-    return None if outcome[0] else 1
+    if signals[:1] == [signal.SIGINT]:
+        raise typer.Exit(130)
+    if outcome[0] is False:
+        raise typer.Exit(1)

@@ -71,7 +71,7 @@ class WebServer:
             )  # fmt: skip
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
-            hint = "choose another address with --listen"
+            hint = "choose another address with --http"
             raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
         # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
         parts = Resources(mode="server", root_url="/", path_versioner=StaticHandler.append_version, components=_PARTS)

@@ -1,4 +1,4 @@
-"""Show the state of `nedbus serve` while it runs: a live display on a terminal, plain log lines elsewhere."""
+"""Progress: a live display on a terminal, of `nedbus serve` and of commands that write files; elsewhere log lines."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import shutil
 import socket
 import sys
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
@@ -17,16 +17,17 @@ from nedbus.log_event import about
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 from nedbus_msgs import DEFAULT_TOPIC
 
-from .format import to_line, to_text
-from .logs import log_to, logs_for_programs
-from .options import write_stderr
+from .logs import log_to
+from .samples import to_line
+from .streams import logs_for_programs, to_text, write_stderr
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 _log = logging.getLogger("nedbus")
 _REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports in a plain log; then the last one
-_REPORTED: Final = 3  # messages in a report
+_MAX_REPORTED: Final = 3  # messages in a report
+_RATE_WINDOW: Final = 2.0  # s of which the display shows the rate
 
 _HINT: Final = """In a second terminal:
   {nedbus} list{where}  what is published
@@ -45,13 +46,13 @@ class Display:
 
     def __init__(self, daemon: Daemon) -> None:
         self._daemon = daemon
-        self._hinted = False
-        self._reports = 0
-        self._last = time.monotonic()
-        self._starts = sys.stderr.isatty() and not logs_for_programs()
+        self._is_terminal = sys.stderr.isatty() and not logs_for_programs()
         self._progress: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._rates: dict[str, tuple[float, int]] = {}
+        self._hinted = False
+        self._reports = 0
+        self._reported = time.monotonic()
+        self._counts: dict[str, int] = {}  # messages published of each source at the last report
 
     def __enter__(self) -> Self:
         return self
@@ -64,87 +65,86 @@ class Display:
     def update(self) -> None:
         """Show the current state; a terminal that is gone ends the display, not the service."""
         try:
-            if self._starts:
-                self._starts = False
-                self._start_progress()
-            if self._daemon.ready.is_set():
-                self._update()
+            self._update()
         except OSError:
-            self._progress = None
+            self._progress, self._is_terminal = None, False
 
     def _update(self) -> None:
+        if self._is_terminal and self._progress is None:
+            self._progress = _make_progress("{task.fields[state]}  {task.fields[numbers]}")
+            log_to(self._progress.console)
+            self._progress.start()
+        if not self._daemon.ready.is_set():
+            return
         if not self._hinted:
             self._hinted = True
-            for status in self._daemon.sources:
-                self._rate(status)  # measured from here on
             is_read = not logs_for_programs() and (self._daemon.role == "router" or sys.stderr.isatty())
             if is_read and not self._daemon.until_done:
-                self._print(what_to_type(self._daemon.endpoints))
+                write_stderr(what_to_type(self._daemon.endpoints))
+        elapsed = time.monotonic() - self._reported
         if self._progress is not None:
             for status in self._daemon.sources:
                 self._show(self._progress, status)
-        elif time.monotonic() - self._last >= _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
-            self._last = time.monotonic()
-            self._reports += 1
-            self._report()
+        elif elapsed >= _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
+            self._report(elapsed)
 
-    def _report(self) -> None:
+    def _report(self, elapsed: float) -> None:
         """Log the progress of each source, and the newest messages of some vehicles."""
+        self._reported += elapsed
+        self._reports += 1
         for status in self._daemon.sources:
+            count = status.published - self._counts.get(status.source, 0)
+            self._counts[status.source] = status.published
             if status.state == "running":
                 name = status.source.rstrip(":")
-                _log.info("%s: %s", name, self._numbers(status), extra=about("progress", source=name))
+                text = _numbers(status, count / elapsed)
+                _log.info("%s: %s", name, text, extra=about("progress", source=name))
         newest = [sample for sample in self._daemon.newest() if sample.topic == DEFAULT_TOPIC]
-        for sample in newest[:_REPORTED]:
+        for sample in newest[:_MAX_REPORTED]:
             _log.info("%s", to_line(sample), extra=about("progress", sample.address))
-
-    def _print(self, text: str) -> None:
-        if self._progress is not None:
-            self._progress.console.print(text, highlight=False)
-        else:
-            write_stderr(text)
-
-    def _start_progress(self) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
-
-        console = Console(stderr=True)
-        log_to(console)
-        columns = (
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
-            TextColumn("{task.fields[state]}  {task.fields[numbers]}", markup=False),
-        )
-        self._progress = Progress(*columns, console=console, refresh_per_second=4)
-        self._progress.start()
 
     def _show(self, progress: Progress, status: SourceStatus) -> None:
         if status.source not in self._tasks:
             self._tasks[status.source] = progress.add_task(status.source, total=None, state="", numbers="")
-        numbers = self._numbers(status)
+        task = self._tasks[status.source]
+        done, total = (status.done, status.total) if status.total else (status.published, None)
+        if status.ended:
+            total = total or max(1, done)
+        numbers = _numbers(status, progress.tasks[task].speed or 0.0)
         if status.error:
             numbers += f", {to_text(status.error)}"
-        total = status.total or (1 if status.ended else None)
-        done = status.done if status.total else int(status.ended)
-        progress.update(self._tasks[status.source], completed=done, total=total, state=status.state, numbers=numbers)
+        progress.update(task, completed=done, total=total, state=status.state, numbers=numbers)
 
-    def _numbers(self, status: SourceStatus) -> str:
-        count = f"{status.done} of {status.total}" if status.total else f"{status.published}"
-        rejected = f", {status.rejected} rejected" if status.rejected else ""
-        lost = f", {status.lost} lost" if status.lost else ""
-        gone = f", gone: {', '.join(status.stale)}" if status.stale else ""
-        return f"{count} messages, {self._rate(status):.0f}/s{rejected}{lost}{gone}"
 
-    def _rate(self, status: SourceStatus) -> float:
-        """Return messages a second, averaged over the last one to two seconds."""
-        now = time.monotonic()
-        then, published = self._rates.setdefault(status.source, (now, status.published))
-        if now - then > 2.0:
-            self._rates[status.source] = (
-                now - 1.0,
-                status.published - round((status.published - published) / (now - then)),
-            )
-        return (status.published - published) / (now - then) if now > then else 0.0
+def _numbers(status: SourceStatus, rate: float) -> str:
+    count = f"{status.done} of {status.total}" if status.total else f"{status.published}"
+    rejected = f", {status.rejected} rejected" if status.rejected else ""
+    lost = f", {status.lost} lost" if status.lost else ""
+    gone = f", gone: {', '.join(status.stale)}" if status.stale else ""
+    return f"{count} messages, {rate:.0f}/s{rejected}{lost}{gone}"
+
+
+@contextmanager
+def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
+    """Yield what shows a text, and a number done of a total; on a terminal, else nothing is shown."""
+    if not sys.stderr.isatty():
+        yield lambda text, done, total: None
+        return
+    with _make_progress(transient=True) as progress:
+        task = progress.add_task("", total=None)
+        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)
+
+
+def _make_progress(*fields: str, transient: bool = False) -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    texts = [TextColumn(each, markup=False) for each in ("{task.description}", *fields)]
+    columns = (texts[0], BarColumn(bar_width=24), *texts[1:])
+    return Progress(
+        *columns, console=Console(stderr=True), refresh_per_second=4, speed_estimate_period=_RATE_WINDOW,
+        transient=transient,
+    )  # fmt: skip
 
 
 def what_to_type(endpoints: Sequence[str]) -> str:

@@ -5,45 +5,35 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Annotated, Any
 
 import typer
 
-from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
-from nedbus.errors import ConfigError
-from nedbus_msgs import ANY, Address, Definition
-
-from .follow import Link, follow
-from .format import to_csv, to_csv_head, to_fields, to_json
-from .lines import Lines
-from .options import (
+from nedbus.cli.follow import follow
+from nedbus.cli.options import (
     CountOption,
     CsvOption,
     DurationOption,
     FieldOption,
-    InstanceOption,
     JsonOption,
-    PositionTopicOption,
-    TopicArgument,
-    VehicleOption,
-    choose,
-    lazily_on_bus,
+    on_bus,
     parse_fields,
     require_one,
-    write,
-    write_stderr,
+    selecting,
 )
+from nedbus.cli.output.samples import Lines, to_fields, to_json, to_row
+from nedbus.cli.output.streams import csv_line, write, write_stderr
+from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
+from nedbus.errors import ConfigError
+from nedbus_msgs import DEFAULT_TOPIC, Address, Selection
 
 
-@lazily_on_bus
+@on_bus
+@selecting(DEFAULT_TOPIC)
 def echo(
     open_bus: Callable[[], Bus],
-    topic: TopicArgument = None,
+    selection: Selection,
     *,
-    topic_option: PositionTopicOption = None,
-    vehicle: VehicleOption = ANY,
-    instance: InstanceOption = None,
     field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
     every: Annotated[
@@ -73,12 +63,10 @@ def echo(
     require_one({"--once": once, "--count": count is not None})
     if max_rate is not None:
         check_max_rate(max_rate)
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_csv if csv_output else to_fields if full else Lines(selection)
-    show: Callable[[Sample[Any]], str] = partial(form, fields=fields)
+    form = to_json if json_output else to_fields if full else Lines(selection)
     due: dict[Address, float] = {}
-    heads: dict[Definition[Any], str] = {}  # of CSV
+    csv_head: list[str] = []
 
     def print_one(sample: Sample[Any]) -> bool:
         if interval:
@@ -86,22 +74,23 @@ def echo(
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        definition = sample.message.DEFINITION
-        if csv_output and definition not in heads:
-            heads[definition] = to_csv_head(sample, fields)
-            if len(set(heads.values())) > 1:
-                raise ConfigError(
-                    "--csv", f"a table has one kind of message, and {sample.address} is another: name a topic"
-                )
-            if len(heads) == 1:
-                write(heads[definition])
-        write(show(sample))
+        if not csv_output:
+            write(form(sample, fields))
+            return True
+        head, cells = zip(*to_row(sample, fields), strict=True)
+        if not csv_head:
+            csv_head.extend(head)
+            write(csv_line(head))
+        elif csv_head != list(head):
+            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
+            raise ConfigError("--csv", text)
+        write(csv_line(cells))
         return True
 
     mode: Mode = "every" if every else "latest"
     with open_bus() as bus, bus.subscribe_to(selection, mode=mode, max_rate=max_rate) as subscription:
         try:
-            follow(subscription, print_one, link=Link(bus), count=1 if once else count, duration=duration)
+            follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
                 _write_counts(subscription)
@@ -111,7 +100,5 @@ def _write_counts(subscription: Subscription[Any]) -> None:
     counts = subscription.counts
     if counts.lost or counts.dropped or counts.invalid or counts.discarded:
         discarded = f", {counts.discarded} discarded" if counts.discarded else ""
-        write_stderr(
-            f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
-            f"{discarded}"
-        )
+        text = f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
+        write_stderr(f"{text}{discarded}")

@@ -8,10 +8,10 @@ from typing import Annotated, Final
 
 import typer
 
+from nedbus.cli.options import command
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.daemon import check_router_file, check_service, describe_mistakes
 from nedbus.errors import NedbusError
-
-from .options import command, write, write_stderr
 
 _USAGE: Final = 2
 

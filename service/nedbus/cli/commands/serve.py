@@ -12,6 +12,10 @@ from typing import Annotated
 import typer
 
 from nedbus import __version__
+from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
+from nedbus.cli.output.progress import Display
+from nedbus.cli.run import run_until_stopped
+from nedbus.cli.systemd import Notifier
 from nedbus.daemon import Daemon, check_service
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
@@ -20,12 +24,8 @@ from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
 
+from .bridges import serve_pages
 from .check import report_mistakes
-from .http import serve_pages
-from .options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
-from .progress import Display
-from .run import run_until_signal, run_until_stopped
-from .systemd import Notifier
 
 _log = logging.getLogger("nedbus")
 _SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
@@ -41,12 +41,7 @@ def serve(
     *,
     source: Annotated[
         list[str] | None,
-        typer.Option(
-            "--source",
-            "-s",
-            metavar="SOURCE",
-            help=f"{_SOURCES}, with ?OPTION=VALUE&...; repeatable",
-        ),
+        typer.Option("--source", "-s", metavar="SOURCE", help=f"{_SOURCES}, with ?OPTION=VALUE&...; repeatable"),
     ] = None,
     connect: Annotated[
         list[str] | None,
@@ -72,18 +67,10 @@ def serve(
     SIGHUP reads the settings again: new sources start, those that are gone end, all others go on.
     """
     given: dict[str, object] = {
-        "source": source and tuple(source),
-        "connect": connect and tuple(connect),
-        "listen": listen and tuple(listen),
-        "router_config": router_config,
-        "tls_ca": tls_ca,
-        "tls_certificate": tls_certificate,
-        "tls_key": tls_key,
-        "prefix": prefix,
-        "vehicle": vehicle,
-        "http": http,
-        "until_done": until_done,
-    }
+        "source": source, "connect": connect, "listen": listen,
+        "router_config": router_config, "tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key,
+        "prefix": prefix, "vehicle": vehicle, "http": http, "until_done": until_done,
+    }  # fmt: skip
     if check:
         report_mistakes(check_service(config, given))
         return
@@ -105,15 +92,16 @@ def serve(
             notifier.stopping()
             daemon.stop()
 
-        exit_code = run_until_signal(
-            daemon.run, stop, on_tick=tick, on_hangup=lambda: _reload(daemon, notifier, config, given)
+        run_until_stopped(
+            lambda _: daemon.run(),
+            on_stop=stop,
+            on_tick=tick,
+            on_hangup=lambda: _reload(daemon, notifier, config, given),
         )
-    if exit_code is not None:
-        raise typer.Exit(exit_code)
 
 
 def _log_refusals(endpoints: Sequence[str]) -> None:
-    """Log whom a router refuses that listens here, if any of these endpoints asks for certificates."""
+    """Log the clients that a router here refuses, if any of these endpoints asks for certificates."""
     if any(endpoint.startswith("tls/") for endpoint in endpoints):
         log_refusals()
 

@@ -10,6 +10,11 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus.cli.options import FieldOption, JsonOption, VehicleOption, on_bus, parse_fields, selecting
+from nedbus.cli.output.samples import to_fields, to_json
+from nedbus.cli.output.streams import to_text, write, write_stderr
+from nedbus.cli.output.table import terminal_width, to_table
+from nedbus.cli.status import list_of, refused_of, sources_of, streams_of
 from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
@@ -18,7 +23,6 @@ from nedbus_msgs import (
     DEFAULT_TOPIC,
     MESSAGES,
     TOPICS,
-    Address,
     Definition,
     Message,
     Selection,
@@ -27,24 +31,6 @@ from nedbus_msgs import (
     json_schema_of,
     layout_table_of,
 )
-
-from .format import to_fields, to_json, to_text
-from .options import (
-    FieldOption,
-    InstanceOption,
-    JsonOption,
-    PositionTopicOption,
-    TopicArgument,
-    VehicleOption,
-    choose,
-    lazily_on_bus,
-    on_bus,
-    parse_fields,
-    write,
-    write_stderr,
-)
-from .status import list_of, refused_of, sources_of, streams_of
-from .table import terminal_width, to_table
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
 _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED")
@@ -68,15 +54,14 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         health = health_of_last(sample) if sample else None
         state = stream_state(health, alive=address in published) if health else None
         age = health.age if health else None
+        is_stored = sample is not None and sample.stored
         if json_output:
-            told = {"state": state.name, "reason": state.reason} if state else {"state": None, "reason": "no answer"}
-            stored = sample is not None and sample.stored
-            write(json.dumps({**_chunks(address), "age": age, **told, "stored": stored}))
+            name, reason = (state.name, state.reason) if state else (None, "no answer")
+            chunks = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
+            write(json.dumps({**chunks, "age": age, "state": name, "reason": reason, "stored": is_stored}))
         text = describe_stream(health, state) if health and state else "no answer"
-        if sample is not None and sample.stored:
-            text = f"stored, {text}"
-        rows.append([str(address), "-" if age is None else to_age(age), text])
-    if not json_output and rows:
+        rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
+    if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows, width=terminal_width()))
     if not rows:
         hint = (
@@ -89,21 +74,12 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
 
 
 @on_bus
-def get(
-    bus: Bus,
-    topic: TopicArgument = None,
-    *,
-    topic_option: PositionTopicOption = None,
-    vehicle: VehicleOption = ANY,
-    instance: InstanceOption = None,
-    field: FieldOption = None,
-    json_output: JsonOption = False,
-) -> None:
+@selecting(DEFAULT_TOPIC)
+def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_output: JsonOption = False) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
     What only a storage kept is shown as such.
     """
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance)
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
@@ -132,21 +108,24 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         name, version, role = (to_text(service.get(key)) for key in ("service", "version", "role"))
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [_source_row(source) for source in sources_of(service)]
-        _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
+        if rows:
+            write(to_table(_SOURCE_HEAD, rows, width=width, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
             if absent := [str(each) for source in sources_of(service) for each in list_of(source, what)]:
                 write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
         if refused := refused_of(service):
             write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
         streams = [_stream_row(source, refused, *each) for source in sources_of(service) for each in streams_of(source)]
-        _write_rows("\n" + to_table(_STREAM_HEAD, streams[:_MAX_ROWS], width=width, optional=_STREAM_OPTIONAL), streams)
+        if streams:
+            table = to_table(_STREAM_HEAD, streams, width=width, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
+            write(f"\n{table}")
     if len(services) > _MAX_ROWS:
         write(f"{len(services) - _MAX_ROWS} services more")
     if not services:
         write_stderr("no nedbus service answers here")
 
 
-@lazily_on_bus
+@on_bus
 def schema(
     open_bus: Callable[[], Bus],
     message: Annotated[
@@ -177,21 +156,10 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     except AddressError:
         pass
     except ConnectError as exc:
-        reason = f"and nobody to ask: {exc}"
+        reason = f"and no publisher can be asked: {exc}"
     near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
     hint = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(MESSAGES)} are known"
     raise ConfigError("message", f"there is no file for {topic!r}, {reason}: {hint}")
-
-
-def _chunks(address: Address) -> dict[str, object]:
-    return {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-
-
-def _write_rows(table: str, rows: Sequence[object]) -> None:
-    if rows:
-        write(table)
-    if len(rows) > _MAX_ROWS:
-        write(f"{len(rows) - _MAX_ROWS} more")
 
 
 def _source_row(source: dict[str, object]) -> list[str]:

@@ -12,10 +12,10 @@ from typing import Annotated, Any
 import typer
 
 from nedbus import pki as certificates
+from nedbus.cli.options import JsonOption, command, require_one
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
-
-from .options import JsonOption, command, require_one, write, write_stderr
 
 pki = typer.Typer(help="Make keys and certificates for tls/ endpoints.", no_args_is_help=True)
 

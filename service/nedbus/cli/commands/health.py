@@ -9,14 +9,13 @@ from typing import Annotated, Final
 
 import typer
 
+from nedbus.cli.options import JsonOption, on_bus
+from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
+from nedbus.cli.status import refused_of, sources_of, streams_of
 from nedbus.client import Bus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, Expectation, faults_of
 from nedbus_msgs import ANY, DEFAULT_TOPIC, check_vehicle
-
-from .format import MAX_TEXT, to_text
-from .options import JsonOption, on_bus, write, write_stderr
-from .status import refused_of, sources_of, streams_of
 
 _DENIED: Final = (
     ", though its service reports that it is: does the router let that service write this vehicle, and this client"
@@ -63,7 +62,10 @@ def health(
         check_vehicle(vehicle)
     expected = _parse(vehicle, expect, vehicles, valid, within)
     report = _examine(bus, vehicle, services, max_age, expected)
-    report.faults = [*([report.reason] if report.reason else []), *_judge(bus, vehicle, services, expected, max_age)]
+    report.faults = [
+        *([report.reason] if report.reason else []),
+        *_vehicle_faults(bus, vehicle, services, expected, max_age),
+    ]
     report.reason = report.faults[0] if report.faults else None
     if json_output:
         write(json.dumps({"healthy": report.reason is None, **asdict(report)}))
@@ -93,8 +95,10 @@ def _parse(
     )
 
 
-def _judge(bus: Bus, vehicle: str | None, services: int | None, expected: Expectation, max_age: float) -> list[str]:
-    """Return what is wrong with the vehicles, as services remember them, and others answer."""
+def _vehicle_faults(
+    bus: Bus, vehicle: str | None, services: int | None, expected: Expectation, max_age: float
+) -> list[str]:
+    """Return the faults of vehicles, as services remember them, and others answer."""
     reports = bus.accounts(within=expected.within or 0.0)
     anywhere = bool(expected.expect) or expected.vehicles is not None or services is not None
     known = {name for report in reports for name in report.vehicles}
@@ -125,7 +129,7 @@ def _judge(bus: Bus, vehicle: str | None, services: int | None, expected: Expect
 
 @dataclass(slots=True)
 class _Report:
-    """What was found; `vehicles` has the age of the newest message of each [s], `faults` all that is not well."""
+    """The findings; `vehicles` has the age of the newest message of each [s], `faults` all that is not well."""
 
     reason: str | None
     services: int

@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.client import Bus, Monitor, to_age
+from nedbus.cli.follow import follow
+from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
+from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
+from nedbus.client import Bus, Monitor, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import SEVERITIES, WINDOW, Account, AccountReport, Event, Story, Times, by_vehicle, tell
 from nedbus.monitoring import Observer
 from nedbus.sources import read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
-
-from .follow import Link, follow
-from .format import csv_line, to_text
-from .options import (
-    CsvOption,
-    DurationOption,
-    JsonOption,
-    VehicleOption,
-    lazily_on_bus,
-    require_one,
-    write,
-    write_stderr,
-)
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
@@ -41,7 +31,7 @@ FileArgument = Annotated[
 ]
 
 
-@lazily_on_bus
+@on_bus
 def events(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
@@ -65,56 +55,51 @@ def events(
     require_one({"--json": json_output, "--csv": csv_output})
     if severity not in SEVERITIES:
         raise ConfigError("--severity", f"{severity!r}: expected {' or '.join(SEVERITIES)}")
-    worst = SEVERITIES[: SEVERITIES.index(severity) + 1]
+    severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
+    form = _to_json if json_output else _to_csv if csv_output else to_line
     times = Times(is_live=True)
-    if file is not None:
-        if within is not None or duration is not None:
-            raise ConfigError(
-                "--within" if within is not None else "--duration", "is for live vehicles, not for a file"
-            )
-        read = read_account(file)
-        times = read.times
-        told = [event for event in read.account.take(0)[0] if vehicle in (ANY, event.vehicle)]
-        for warning in read.warnings:
-            write_stderr(f"{file}: {warning}")
-        _check_vehicle(file, read.account.vehicles, vehicle)
-        _say_kept(file, read.account)
-    if csv_output:
-        write(csv_line(_HEAD))
 
     def show(new: Iterable[Event]) -> None:
         for event in new:
-            if event.severity in worst and (vehicle in (ANY, event.vehicle) or event.vehicle == ANY):
-                write(
-                    _to_json(event, times)
-                    if json_output
-                    else _to_csv(event, times)
-                    if csv_output
-                    else to_line(event, times)
-                )
+            if event.severity in severities and (ANY in (vehicle, event.vehicle) or event.vehicle == vehicle):
+                write(form(event, times))
 
-    if file is not None:
-        if not (json_output or csv_output):
-            _say_clock(told, times)
-        show(sorted(told, key=lambda event: event.time))
-        held = [
-            f"{name}: {condition.text}"
-            for name, each in sorted(read.account.vehicles.items())
-            for condition in each.conditions.values()
-            if condition.initial and vehicle in (ANY, name)
-        ]
-        if held:
-            write_stderr(f"from the first message to the end: {', '.join(dict.fromkeys(held))}")
-        elif not told:
-            write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
+    if file is None:
+        if csv_output:
+            write(csv_line(_HEAD))
+        with open_bus() as bus:
+            if within is not None:
+                show(_merge(bus.accounts(within=within)))
+            _follow(bus, Selection(ANY, vehicle), show, duration)
         return
-    with open_bus() as bus:
-        if within is not None:
-            show(_merge(bus.accounts(within=within)))
-        _follow(bus, Selection(ANY, vehicle), show, duration)
+    if within is not None or duration is not None:
+        raise ConfigError("--within" if within is not None else "--duration", "is for live vehicles, not for a file")
+    read = read_account(file)
+    times, vehicles = read.times, read.account.vehicles
+    found = [event for event in read.account.take(0)[0] if vehicle in (ANY, event.vehicle)]
+    for warning in read.warnings:
+        write_stderr(f"{file}: {warning}")
+    if vehicle != ANY:
+        _choose_vehicle(file, vehicles, vehicle)
+    _write_kept(file, read.account)
+    if csv_output:
+        write(csv_line(_HEAD))
+    elif not json_output:
+        _write_clock(found, times)
+    show(sorted(found, key=lambda event: event.time))
+    initial = [
+        f"{name}: {condition.text}"
+        for name, each in sorted(vehicles.items())
+        for condition in each.conditions.values()
+        if condition.initial and vehicle in (ANY, name)
+    ]
+    if initial:
+        write_stderr(f"from the first message to the end: {', '.join(dict.fromkeys(initial))}")
+    elif not found:
+        write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
 
 
-@lazily_on_bus
+@on_bus
 def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
@@ -136,64 +121,57 @@ def why(
         check_vehicle(vehicle)
     if file is not None:
         read = read_account(file)
-        name = _choose(file, list(read.account.vehicles), vehicle)
-        _say_kept(file, read.account)
+        name = _choose_vehicle(file, read.account.vehicles, vehicle)
+        _write_kept(file, read.account)
         followed = read.account.vehicles[name]
-        told = [event for event in read.account.take(0)[0] if event.vehicle == name]
+        found = [event for event in read.account.take(0)[0] if event.vehicle == name]
         conditions = [each for each in followed.conditions.values() if each.severity != "info"]
-        topics, times, end = list(followed.messages.values()), read.times, read.end
-        advice = _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
+        topics, times = list(followed.messages.values()), read.times
+        until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
+        initial = ", ".join(dict.fromkeys(each.text for each in followed.conditions.values() if each.initial))
+        others = f"; from the first message to the end: {initial}" if initial else ""
+        nothing = f"nothing was wrong in {read.end:.0f} s{others}"
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
-            known = by_vehicle(reports)
-            if not known:
-                at = " or ".join(bus.routers)
-                raise NedbusError(f"no nedbus service at {at} knows a vehicle: 'nedbus serve' remembers what happens")
-            name = _choose("the network", list(known), vehicle)
-        told = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
+            where = " or ".join(bus.routers)
+        known = by_vehicle(reports)
+        if not known:
+            raise NedbusError(f"no nedbus service at {where} knows a vehicle: 'nedbus serve' remembers what happens")
+        name = _choose_vehicle("the network", known, vehicle)
+        found = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
         state = known[name].vehicles[name]
-        conditions, topics, times, end = list(state.held), list(state.topics), Times(is_live=True), known[name].now
-        advice = _LIVE_ADVICE
+        conditions, topics, times = list(state.held), list(state.topics), Times(is_live=True)
+        until, advice, nothing = "until now", _LIVE_ADVICE, "nothing was wrong, as far as services remember"
     moment = None
     if at is not None:
         try:
-            moment = times.find(at, told[-1]) if told else None
+            moment = times.find(at, found[-1]) if found else None
         except ValueError as exc:
             raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
-    stories = tell(sorted(told, key=lambda event: event.time), conditions, topics=topics, at=moment)
+    stories = tell(sorted(found, key=lambda event: event.time), conditions, topics=topics, at=moment)
     if json_output:
         for story in stories:
             write(_story_json(story, times))
         return
-    until = "until now" if file is None else "until the end"
-    throughout = [] if file is None else [each.text for each in followed.conditions.values() if each.initial]
     if not stories:
-        others = f"; from the first message to the end: {', '.join(dict.fromkeys(throughout))}" if throughout else ""
-        write(
-            f"{name}: nothing was wrong"
-            + (f" in {end:.0f} s{others}" if file is not None else ", as far as services remember")
-        )
-    else:
-        _say_clock(told, times)
-    if moment is not None and stories and not any(each.since <= moment <= (each.until or moment) for each in stories):
+        write(f"{name}: {nothing}")
+        return
+    _write_clock(found, times)
+    if moment is not None and not any(each.since <= moment <= (each.until or moment) for each in stories):
         write(f"{name}: nothing was wrong at {at}; the nearest:")
-    for number, story in enumerate(stories):
-        write(("\n" if number else "") + "\n".join(describe(name, story, times, advice, until)))
+    write("\n\n".join("\n".join(_describe(name, story, times, advice, until)) for story in stories))
 
 
-def describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> list[str]:
-    """Return the lines that tell a story."""
+def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> list[str]:
     since = "from the first message on" if story.begin is None else f"from {times.text(story.begin)}"
     lasted = until if story.until is None else f"for {to_age(story.until - story.since)}"
     is_once = story.until == story.since
     when = f"at {times.text(story.begin)}" if is_once and story.begin is not None else f"{since}, {lasted}"
     lines = [f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"]
     if story.before:
-        lines += ["  before it"] + [
-            f"    {times.text(each)}  {_shown(each)} ({to_age(max(0.0, story.since - each.time))} before)"
-            for each in story.before
-        ]
+        lines.append("  before it")
+        lines += [f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before]
     if story.meanwhile:
         lines += ["  meanwhile"] + [f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile]
     if story.end is not None:
@@ -217,9 +195,7 @@ _ADVICE: Final = {
 
 def to_line(event: Event, times: Times) -> str:
     """Return an event for a person: time, vehicle, severity, what, and the evidence."""
-    evidence = ", ".join(
-        f"{_shown(each)} ({to_age(max(0.0, event.time - each.time))} before)" for each in event.evidence
-    )
+    evidence = ", ".join(_before(each, event.time) for each in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
     return f"{times.text(event):>10}  {to_text(event.vehicle):<8} {severity:<5}  {_shown(event)}{because}"
@@ -229,11 +205,15 @@ def _shown(event: Event) -> str:
     return to_text(event.text, _MAX_TEXT)
 
 
+def _before(event: Event, time: float) -> str:
+    return f"{_shown(event)} ({to_age(max(0.0, time - event.time))} before)"
+
+
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
     observer, monitor, seen = Observer(bus, selection), Monitor(), 0
     known: set[str] = set()
 
-    def look() -> None:
+    def show_new() -> None:
         nonlocal seen
         observer.look(monitor.snapshot(), dropped=subscription.counts.dropped, waiting=subscription.waiting)
         new, seen = observer.account.take(seen)
@@ -241,34 +221,32 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
-                held = dict.fromkeys(
-                    condition.text for condition in each.conditions.values()
-                    if condition.initial and condition.severity != "info"
-                )  # fmt: skip
-                if held:
-                    write_stderr(f"{name}: {', '.join(held)}, since before this began")
+                initial = [held for held in each.conditions.values() if held.initial and held.severity != "info"]
+                if initial:
+                    texts = ", ".join(dict.fromkeys(held.text for held in initial))
+                    write_stderr(f"{name}: {texts}, since before this began")
 
-    def handle(sample: object) -> bool:
-        monitor.add(sample)  # type: ignore[arg-type]
-        observer.add(sample)  # type: ignore[arg-type]
+    def handle(sample: Sample[Any]) -> bool:
+        monitor.add(sample)
+        observer.add(sample)
         return True
 
     with bus.subscribe_to(selection, mode="every") as subscription:
-        follow(subscription, handle, link=Link(bus), count=None, duration=duration, each_second=look)
+        follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
 
 
 def _merge(reports: Iterable[AccountReport]) -> list[Event]:
     return sorted((event for report in reports for event in report.events), key=lambda event: event.time)
 
 
-def _say_kept(file: Path, account: Account) -> None:
+def _write_kept(file: Path, account: Account) -> None:
     kept = len(account.events)
     if account.told > kept:
         write_stderr(f"{file}: of {account.told} events only the last {kept}")
 
 
-def _say_clock(told: Sequence[Event], times: Times) -> None:
-    clocks = {times.clock(event) for event in told}
+def _write_clock(found: Sequence[Event], times: Times) -> None:
+    clocks = {times.clock(event) for event in found}
     texts = {
         "boot": "seconds since boot, as no message tells UTC", "vehicle": "UTC, as the vehicle's messages tell it",
         "host": "UTC, by the clocks of these hosts",
@@ -279,25 +257,17 @@ def _say_clock(told: Sequence[Event], times: Times) -> None:
 
 def _to_fields(event: Event, times: Times) -> dict[str, object]:
     utc = times.utc(event)
-    fields = asdict(event)
-    fields["time"] = None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
-    fields["clock"] = times.clock(event)
-    fields["evidence"] = [
-        {
-            "kind": each.kind,
-            "change": each.change,
-            "text": each.text,
-            "topic": each.topic,
-            "before": round(event.time - each.time, 3),
-        }
+    time = None if utc is None else datetime.fromtimestamp(utc, UTC).isoformat(timespec="milliseconds")
+    evidence = [
+        {name: getattr(each, name) for name in ("kind", "change", "text", "topic")}
+        | {"before": round(event.time - each.time, 3)}
         for each in event.evidence
     ]
-    return fields
+    return {"time": time, "clock": times.clock(event)} | asdict(event) | {"time": time, "evidence": evidence}
 
 
 def _to_json(event: Event, times: Times) -> str:
-    fields = _to_fields(event, times)
-    return json.dumps({"time": fields.pop("time"), "clock": fields.pop("clock"), **fields})
+    return json.dumps(_to_fields(event, times))
 
 
 def _to_csv(event: Event, times: Times) -> str:
@@ -308,28 +278,20 @@ def _to_csv(event: Event, times: Times) -> str:
 
 
 def _story_json(story: Story, times: Times) -> str:
-    def told(each: Sequence[Event]) -> list[dict[str, object]]:
-        return [_to_fields(event, times) for event in each]
-
-    return json.dumps(
-        {
-            "what": story.what, "begin": None if story.begin is None else _to_fields(story.begin, times),
-            "lasted": None if story.until is None else story.until - story.since,
-            "before": told(story.before), "meanwhile": told(story.meanwhile), "after": told(story.after),
-            "lacking": story.lacking,
-        }
-    )  # fmt: skip
+    fields: dict[str, object] = {
+        "what": story.what,
+        "begin": None if story.begin is None else _to_fields(story.begin, times),
+        "lasted": None if story.until is None else story.until - story.since,
+    }
+    for name in ("before", "meanwhile", "after"):
+        fields[name] = [_to_fields(event, times) for event in getattr(story, name)]
+    return json.dumps({**fields, "lacking": story.lacking})
 
 
-def _choose(where: object, names: Sequence[str], vehicle: str | None) -> str:
+def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) -> str:
     if vehicle is None and len(names) == 1:
-        return names[0]
-    if vehicle in names:
-        return str(vehicle)
+        return next(iter(names))
+    if vehicle is not None and vehicle in names:
+        return vehicle
     shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
     raise ConfigError("--vehicle", f"name one of {where}: {shown}")
-
-
-def _check_vehicle(where: Path, names: Iterable[str], vehicle: str) -> None:
-    if vehicle != ANY and vehicle not in names:
-        _choose(where, list(names), vehicle)

@@ -12,12 +12,7 @@ from typing import Annotated, Final
 import typer
 
 from nedbus import __version__
-from nedbus.doctor import Finding, examine, worst_state
-from nedbus.settings import load_settings
-from nedbus_msgs import check_vehicle
-
-from .format import MAX_TEXT, to_text
-from .options import (
+from nedbus.cli.options import (
     ConfigOption,
     ConnectOption,
     JsonOption,
@@ -26,9 +21,12 @@ from .options import (
     TlsCertificateOption,
     TlsKeyOption,
     command,
-    write,
 )
-from .table import terminal_width
+from nedbus.cli.output.streams import MAX_TEXT, to_text, write
+from nedbus.cli.output.table import terminal_width
+from nedbus.doctor import Finding, examine, worst_state
+from nedbus.settings import load_settings
+from nedbus_msgs import check_vehicle
 
 _WIDTH: Final = 80  # columns, at most
 _INDENT: Final = " " * 9

@@ -3,66 +3,41 @@
 from __future__ import annotations
 
 import math
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
 from nedbus import recording
+from nedbus.cli.follow import SILENCE_TIMEOUT, write_notice
+from nedbus.cli.options import DurationOption, InstanceOption, VehicleOption, command, on_bus, selecting
+from nedbus.cli.output.progress import show_progress
+from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.events import Event
 from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
-from .follow import write_notice
-from .options import (
-    DurationOption,
-    InstanceOption,
-    TopicArgument,
-    TopicOption,
-    VehicleOption,
-    choose,
-    command,
-    on_bus,
-    write,
-    write_stderr,
-)
-from .run import run_until_signal
-
-_NOTICE: Final = 2.0  # s without a message after which stderr says so
-
 FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
-OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")]
 
 
 @on_bus
+@selecting(ANY)
 def record(
     bus: Bus,
-    topic: TopicArgument = None,
+    selection: Selection,
     *,
-    output: OutputOption,
-    topic_option: TopicOption = None,
-    vehicle: VehicleOption = ANY,
-    instance: InstanceOption = None,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")],
     duration: DurationOption = None,
 ) -> None:
     """Record every message to an MCAP file, until Ctrl-C; a power cut costs at most the last second."""
-    selection = choose(topic, topic=topic_option, vehicle=vehicle, instance=instance, default=ANY)
-    open_recorder = recording.Recorder
-    stop = threading.Event()
-    notice = time.monotonic() + _NOTICE
+    notice = time.monotonic() + SILENCE_TIMEOUT
     with bus.subscribe_to(selection, mode="every") as subscription:
-        recorder = open_recorder(subscription, output)
-
-        def run() -> bool:
-            recorder.run(stop, duration=duration)
-            return True
+        recorder = recording.Recorder(subscription, output)
 
         def tick() -> None:
             nonlocal notice
@@ -72,8 +47,8 @@ def record(
                 write_notice(subscription)
 
         try:
-            with _progress() as show:
-                run_until_signal(run, stop.set, on_tick=tick)
+            with show_progress() as show, suppress(typer.Exit):  # Ctrl-C ends a recording as it is meant to end
+                run_until_stopped(lambda stop: recorder.run(stop, duration=duration), on_tick=tick)
         except NoDataError:
             write_stderr(f"{output}: {recorder.status}: the empty file is removed")
             raise
@@ -99,7 +74,7 @@ def convert(
     run = replay.open()
     for warning in run.warnings:
         write_stderr(f"{source}: {warning}")
-    with _progress() as show:
+    with show_progress() as show:
         report = recording.convert(
             run.messages,
             output,
@@ -153,18 +128,3 @@ def _read_events(path: Path) -> list[Event]:
     account = read_account(path).account
     held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
     return [*dict.fromkeys(each.begin for each in held), *account.take(0)[0]]
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
-    """Show the progress of something, on a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda text, done, total: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=24), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=None)
-        yield lambda text, done, total: progress.update(task, description=text, completed=done or 0, total=total)

@@ -1,0 +1,185 @@
+"""Commands that pass data on to browsers, Prometheus, Foxglove and ROS 2: web, export, foxglove, ros2."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from functools import partial
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from nedbus import __version__, bridges
+from nedbus import web as page
+from nedbus.bridges import FOXGLOVE_PORT
+from nedbus.cli.options import InstanceOption, TopicOption, VehicleOption, on_bus, selecting
+from nedbus.cli.output.streams import write_stderr
+from nedbus.cli.run import run_until_stopped
+from nedbus.client import Bus
+from nedbus.errors import ConfigError, ConnectError, ListenError, NedbusError
+from nedbus.log_event import about
+from nedbus.settings import is_loopback, split_http
+from nedbus_msgs import ANY, RELEASES, Selection
+
+if TYPE_CHECKING:
+    from nedbus.monitoring import Page
+
+_log = logging.getLogger("nedbus")
+
+_ANSWER_TIMEOUT: Final = 1.0  # s
+HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
+
+
+@on_bus
+def web(
+    open_bus: Callable[[], Bus],
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording to look at, instead of live vehicles"),
+    ] = None,
+    *,
+    topic_option: TopicOption = ANY,
+    vehicle: VehicleOption = ANY,
+    instance: InstanceOption = None,
+    http: HttpOption = "127.0.0.1:8420",
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="HOST:PORT", help="Another name that browsers call this page by; repeatable"),
+    ] = None,
+    background: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            exists=True,
+            dir_okay=False,
+            metavar="FILE",
+            help="GeoJSON, or a picture with a world file, under the tracks",
+        ),
+    ] = None,
+) -> None:
+    """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
+    host, port = _split("--http", http)
+    for name in origin or ():
+        _split("--origin", name)
+    selection = Selection(topic_option, vehicle, instance)
+    where = page.Where(host, port, tuple(origin or ()), background)
+
+    def tell(url: str) -> None:
+        write_stderr(f"open {url} in a browser; Ctrl-C ends it")
+        if not is_loopback(host):
+            write_stderr(
+                f"whoever reaches {http} can see all vehicles, without a password; nothing can be changed there"
+            )
+
+    if file is not None:
+        run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
+        return
+    with open_bus() as bus:
+        run_until_stopped(
+            lambda stop: page.serve_live(bus, selection, where, version=__version__, stop=stop, tell=tell)
+        )
+
+
+@on_bus
+@selecting(ANY)
+def export(bus: Bus, selection: Selection, *, http: HttpOption = "127.0.0.1:9464") -> None:
+    """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
+    from nedbus.monitoring import Exporter
+
+    exporter = Exporter(bus, selection, version=__version__)
+    with serve_pages(http, exporter.pages):
+        run_until_stopped(exporter.run)
+
+
+@on_bus
+def foxglove(bus: Bus, *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}") -> None:
+    """Serve live vehicles to Foxglove, until Ctrl-C: plots of every field, poses in 3D, positions on the map."""
+    host, port = _split("--http", http)
+    with bridges.FoxgloveServer(bus, host=host, port=port) as server:
+        write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
+        run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
+
+
+@on_bus
+@selecting(ANY)
+def ros2(
+    bus: Bus,
+    selection: Selection,
+    *,
+    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
+    layout: Annotated[
+        str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
+    ] = RELEASES[-1],
+    domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
+    namespace: Annotated[
+        list[str] | None,
+        typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics of a vehicle, as /NAMESPACE/fmu/out/...; repeatable"),
+    ] = None,
+    to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
+) -> None:
+    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""
+    for each in namespace or ():
+        if ":" not in each:
+            raise ConfigError("--namespace", f"{each!r} is not VEHICLE:NAMESPACE")
+    namespaces = dict(each.partition(":")[::2] for each in namespace or ())
+    try:
+        session, observer = bus.open_session(to), bus.open_session(to)
+    except ConnectError as exc:
+        raise NedbusError(f"nothing answers at {to}: start the router of ROS 2 there, or correct --to") from exc
+    with closing(session), closing(observer):
+        bridge = bridges.Ros2Bridge(
+            bus,
+            session,
+            observer=observer,
+            selection=selection,
+            layout=layout,
+            domain=domain,
+            hashed=not humble,
+            namespaces=namespaces,
+        )
+        run_until_stopped(bridge.run)
+
+
+@contextmanager
+def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator[None]:
+    """Serve pages on HOST:PORT for as long as this is entered."""
+    from nedbus.monitoring import HttpServer
+
+    try:
+        server = HttpServer(where, pages)
+    except ListenError as exc:
+        if not _is_nedbus(where):
+            raise
+        hint = "end it, or choose another address with --http"
+        raise ListenError([f"http://{where}"], "a nedbus runs there already", hint=hint) from exc
+    _log.info(
+        "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
+    )
+    if not is_loopback(split_http(where)[0]):
+        _log.warning("whoever reaches %s can read them; nothing can be changed there", where, extra=about("http"))
+    try:
+        yield
+    finally:
+        server.close()
+
+
+def _is_nedbus(where: str) -> bool:
+    """Return whether a command of ours serves pages on HOST:PORT."""
+    connection = HTTPConnection(*split_http(where), timeout=_ANSWER_TIMEOUT)
+    try:
+        connection.request("HEAD", "/")
+        return connection.getresponse().getheader("Server", "").startswith("nedbus")
+    except (OSError, HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+def _split(option: str, where: str) -> tuple[str, int]:
+    try:
+        return split_http(where)
+    except ValueError as exc:
+        raise ConfigError(option, str(exc)) from exc

@@ -1,0 +1,101 @@
+"""The command that measures streams: hz."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any, Final
+
+from nedbus.cli.follow import follow
+from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
+from nedbus.cli.output.streams import csv_line, write
+from nedbus.cli.output.table import LiveTable
+from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
+from nedbus_msgs import ANY, DOUBT_FLAGS, Address, Selection
+
+_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
+_OPTIONAL: Final = ("JITTER", "MAX", "LATENCY", "LOST")
+_CSV_HEAD: Final = (
+    "time", "vehicle", "topic", "instance", "state", "reason", "rate", "usual_rate", "nominal", "jitter", "latency",
+    "latency_max", "age", "messages", "lost", "gaps", "out_of_order", "reboots", *DOUBT_FLAGS,
+)  # fmt: skip
+_FORGET_AFTER: Final = 60.0  # s after which a stream that is gone is not shown any more
+
+Stream = tuple[Address, Health, StreamState]
+
+
+@on_bus
+@selecting(ANY)
+def hz(
+    bus: Bus,
+    selection: Selection,
+    *,
+    json_output: JsonOption = False,
+    csv_output: CsvOption = False,
+    count: CountOption = None,
+    duration: DurationOption = None,
+) -> None:
+    """Measure rate, jitter, latency, loss and validity of each vehicle and topic, every second, the worst first.
+
+    With --json and --csv there is a line for each stream that had messages, or whose state changed.
+    """
+    require_one({"--json": json_output, "--csv": csv_output})
+    monitor = Monitor()
+    written: dict[Address, tuple[int, str]] = {}
+    with bus.subscribe_to(selection, mode="every") as subscription, LiveTable(_HEAD, _OPTIONAL) as table:
+        if csv_output:
+            write(csv_line(_CSV_HEAD))
+
+        def show() -> None:
+            streams = sorted(_states(bus, monitor), key=_severity)
+            if not (json_output or csv_output):
+                table.show([_to_row(*each) for each in streams])
+                return
+            for address, health, state in streams:
+                if written.get(address) != (health.messages, state.name):
+                    write((_to_csv if csv_output else json.dumps)(_to_fields(address, health, state)))
+            written.clear()
+            written.update({address: (health.messages, state.name) for address, health, state in streams})
+
+        follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
+
+
+def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
+    """Yield all streams with their states; forget what has been gone for a minute."""
+    alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
+    for address, health in monitor.snapshot().items():
+        state = stream_state(health, alive=address in alive, connected=bus.connected)
+        if state.name == "gone" and (health.age or 0.0) > _FORGET_AFTER:
+            monitor.forget(address)
+        else:
+            yield address, health, state
+
+
+def _severity(stream: Stream) -> tuple[int, bool]:
+    _, health, state = stream
+    return state.severity, describe_stream(health, state) == "ok"
+
+
+def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
+    is_live = health.rate is not None
+    return [
+        str(address),
+        "-" if health.rate is None else f"{health.rate:.1f}",
+        "-" if health.jitter is None else f"{health.jitter * 1e3:.1f} ms",
+        to_age(health.latency) if is_live and health.latency is not None else "-",
+        to_age(health.latency_max) if is_live and health.latency_max is not None else "-",
+        str(health.lost),
+        describe_stream(health, state),
+    ]
+
+
+def _to_fields(address: Address, health: Health, state: StreamState) -> dict[str, Any]:
+    head = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
+    return {"time": time.time(), **head, "state": state.name, "reason": state.reason, **asdict(health)}
+
+
+def _to_csv(fields: dict[str, Any]) -> str:
+    cells = {**fields, **(fields["flags"] or {}), "time": f"{fields['time']:.3f}"}
+    return csv_line(cells.get(name) for name in _CSV_HEAD)

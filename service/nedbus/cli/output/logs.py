@@ -1,0 +1,140 @@
+"""The log on stderr: text for people, priorities for the journal, JSON for programs, or above a live display."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import logging
+import os
+import sys
+import threading
+from datetime import UTC, datetime
+from types import TracebackType
+from typing import TYPE_CHECKING, Final, Literal
+
+from nedbus.errors import NedbusError
+from nedbus.log_event import about
+
+from .log_limit import RateLimit, about_of
+from .streams import FOR_PROGRAMS, MAX_TEXT, printable, to_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_log = logging.getLogger("nedbus")
+_DATE: Final = "%Y-%m-%d %H:%M:%S"
+_MAX_TRACEBACK: Final = 20_000  # characters, the last ones, in which the error is named
+_KEYS: Final = ("vehicle", "topic", "instance", "source", "reason", "count", "of")
+_PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
+
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tuple[None, None, None]
+
+
+class TextFormatter(logging.Formatter):
+    """Format a record as one line of printable characters; with a traceback as several."""
+
+    def __init__(self, style: str = "%(asctime)s %(levelname)-7s %(message)s") -> None:
+        super().__init__(style, _DATE)
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name is that of logging
+        """Return the line without a traceback."""
+        record.message = to_text(record.message, MAX_TEXT)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - the name is that of logging
+        """Return the end of a traceback."""
+        return super().formatException(ei)[-_MAX_TRACEBACK:]
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line, or the lines."""
+        return printable(super().format(record))
+
+
+class JsonFormatter(TextFormatter):
+    """Format a record as one JSON object on one line; what is not known has no key."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the object."""
+        about = about_of(record)
+        fields: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
+            "level": record.levelname.lower(),
+            "event": about.event if about else None,
+            "message": to_text(record.getMessage(), MAX_TEXT),
+            "logger": record.name,
+        }
+        for key in _KEYS:
+            value = getattr(about, key, None)
+            if value is not None:
+                fields[key] = to_text(value, MAX_TEXT) if isinstance(value, str) else value
+        if record.exc_info:
+            fields["exception"] = printable(self.formatException(record.exc_info))
+        return json.dumps(fields)
+
+
+class JournalFormatter(logging.Formatter):
+    """Put the priority of syslog before each line of another formatter, as sd-daemon(3) describes."""
+
+    def __init__(self, inner: logging.Formatter) -> None:
+        super().__init__()
+        self._inner = inner
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line, or the lines."""
+        priority = next(number for level, number in _PRIORITIES if record.levelno >= level)
+        return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
+
+
+def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
+    """Log to stderr, a line for each record; with priorities where that is the journal."""
+    is_journal, is_json = _is_journal(), log_format == "json"
+    formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
+    if is_journal or is_json:
+        handler.name = FOR_PROGRAMS
+        _log_uncaught_errors()
+    _install(handler)
+    number = logging.getLevelNamesMapping()[level.upper()]
+    logging.getLogger("nedbus").setLevel(number)
+    logging.getLogger().setLevel(max(number, logging.WARNING))
+
+
+def log_to(console: Console) -> None:
+    """Log to the terminal on which something is redrawn in place, above it."""
+    from rich.logging import RichHandler
+
+    handler = RichHandler(console=console, show_path=False, log_time_format=_DATE)
+    handler.setFormatter(TextFormatter("%(message)s"))
+    _install(handler)
+
+
+def _install(handler: logging.Handler) -> None:
+    limit = RateLimit(handler.handle)
+    handler.addFilter(limit)
+    atexit.register(limit.flush)
+    logging.basicConfig(handlers=[handler], force=True)
+
+
+def _is_journal() -> bool:
+    """Return whether stderr is connected to the journal, as sd_journal_print(3) describes JOURNAL_STREAM."""
+    try:
+        status = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):  # closed, or no file
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+def _log_uncaught_errors() -> None:
+    """Log uncaught errors, which Python itself would print as several lines."""
+
+    def log(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
+        if not issubclass(kind, SystemExit):
+            exc_info = None if error is None else (kind, error, traceback)
+            text = str(error) if issubclass(kind, NedbusError) else f"an unexpected {kind.__name__}: {error}"
+            _log.error("%s", text, exc_info=exc_info, extra=about("error"))
+
+    sys.excepthook = log
+    threading.excepthook = lambda caught: log(caught.exc_type, caught.exc_value, caught.exc_traceback)
