@@ -1,7 +1,7 @@
 """Sources of messages: `parse_source` reads a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
 from .account import KEPT_OF_FILE, FileAccount, follow, read_account, times_of
-from .mavlink_link import Link, check_link, open_link
+from .mavlink.link import Link, check_link, open_link
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
 from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 

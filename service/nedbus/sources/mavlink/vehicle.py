@@ -12,9 +12,9 @@ from typing import Any, Final, cast
 
 from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
 
-from .mavlink_fields import SAID, sensors_of
-from .options import MavlinkOptions
-from .source import Rejection, SourceMessage
+from .fields import SAID, sensors_of
+from ..options import MavlinkOptions
+from ..source import Rejection, SourceMessage
 
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot

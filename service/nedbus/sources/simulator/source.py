@@ -11,11 +11,11 @@ from typing import NamedTuple
 from nedbus.errors import SourceError
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .options import SimulatorOptions
-from .simulated_estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
-from .simulated_trajectory import Trajectory, Truth
-from .simulated_vehicle import SimulatedVehicle
-from .source import ReplayRun, SourceContext, SourceMessage
+from ..options import SimulatorOptions
+from .estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
+from .trajectory import Trajectory, Truth
+from .vehicle import SimulatedVehicle
+from ..source import ReplayRun, SourceContext, SourceMessage
 
 
 class _Stream(NamedTuple):

@@ -16,7 +16,7 @@ from typing import Final
 
 from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
 
-from .simulated_trajectory import Truth
+from .trajectory import Truth
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 LAP: Final = 120.0  # s

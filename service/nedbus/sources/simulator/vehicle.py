@@ -8,8 +8,8 @@ from typing import Final
 
 from nedbus_msgs import MESSAGES
 
-from .simulated_estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
-from .simulated_trajectory import CLIMB, Truth
+from .estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
+from .trajectory import CLIMB, Truth
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
