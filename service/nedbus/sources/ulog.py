@@ -46,18 +46,17 @@ class UlogSource:
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path = Path(path).expanduser()
-        self._vehicle = options.vehicle
-        self._default_vehicle = context.vehicle
         self._options = options
-        self.finite = not options.loop
-        self.loop = options.loop
-        self.speed = None if options.speed == "max" else options.speed
-        self.wait = options.wait
+        self._default_vehicle = context.vehicle
+        self.finite, self.loop = not options.loop, options.loop
+        self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
         """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
-        chosen = self._options.chosen_topics
-        log = read_ulog(self._path, topics=chosen, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        options = self._options
+        log = read_ulog(
+            self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
+        )
         topics, warnings = log.topics, list(log.warnings)
         clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
         for topic, clock in zip(topics, clocks, strict=True):
@@ -67,7 +66,7 @@ class UlogSource:
             unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
             if unknown and _is_newer(topic):
                 warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than this version")
-        warnings += self._options.absent_from({topic.address.topic for topic in topics}, "this log")
+        warnings += options.absent_from({topic.address.topic for topic in topics}, "this log")
         dues, gaps = _pace(clocks)
         if gaps:
             warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")

@@ -6,9 +6,9 @@ import os
 import re
 import select
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from nedbus.errors import ConfigError, SourceError
 
@@ -21,27 +21,66 @@ _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:
 Peer = Any  # the address of the other side, in the form that its socket uses
 
 
-class Link(Protocol):
-    """An open connection to one or several vehicles; what fails raises OSError."""
+class _UdpLink:
+    """A UDP socket; `peer` is None where the other side must send first."""
 
-    stream: bool  # messages may arrive in pieces
+    stream = False
+
+    def __init__(self, host: str, port: int, *, listens: bool) -> None:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self.close = self._socket.close
+        self.peer: Peer = None if listens else address
+        if listens:
+            try:
+                self._socket.bind(address)
+            except OSError:
+                self.close()
+                raise
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield what has arrived and its sender; wait up to `timeout` seconds for the first."""
-        ...
+        """Yield the datagrams that have arrived and their senders; wait up to `timeout` seconds for the first."""
+        if not _is_ready(self._socket, timeout):
+            return
+        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen, yet
+            for _ in range(_MAX_DATAGRAMS):
+                yield self._socket.recvfrom(_MAX_READ)
 
     def send(self, data: bytes, peer: Peer) -> None:
         """Send now, or drop it if that is not possible."""
-        ...
+        with suppress(OSError):  # a missing route comes back, or the vehicle times out
+            self._socket.sendto(data, peer)
 
-    @property
-    def peer(self) -> Peer:
-        """The other side where it is known from the start; None where it must send first."""
-        ...
 
-    def close(self) -> None:
-        """Close it."""
-        ...
+class _StreamLink:
+    """A TCP connection or a serial port: messages may arrive in pieces."""
+
+    stream = True
+
+    def __init__(self, file: Any, peer: Peer) -> None:
+        self.peer = peer
+        self.close = file.close
+        self._file = file
+        self._is_socket = isinstance(file, socket.socket)
+        self._receive: Callable[[int], bytes] = file.recv if self._is_socket else file.read
+        self._send: Callable[[bytes], object] = file.sendall if self._is_socket else file.write
+
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        """Yield what has arrived and its sender; wait up to `timeout` seconds for it."""
+        if _is_ready(self._file, timeout):
+            data = self._receive(_MAX_READ)
+            if not data and self._is_socket:
+                raise ConnectionResetError(None, "the other side closed the connection")
+            yield data, self.peer
+
+    def send(self, data: bytes, _: Peer) -> None:
+        """Send now, or raise OSError."""
+        self._send(data)
+
+
+Link = _UdpLink | _StreamLink
+"""An open connection to one or several vehicles; what fails raises OSError."""
 
 
 def check_link(text: str) -> None:
@@ -54,10 +93,12 @@ def open_link(text: str, *, baud: int) -> Link:
     kind, host, port = _parse(text)
     try:
         if kind == "serial":
-            return _Serial(host, baud)
+            from serial import Serial
+
+            return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
         if kind == "tcp":
-            return _Tcp(host, port)
-        return _Udp(host, port, listens=kind != "udpout")
+            return _StreamLink(socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT), (host, port))
+        return _UdpLink(host, port, listens=kind != "udpout")
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
         reason = os.strerror(number).lower() if number and number > 0 else str(exc)
@@ -72,77 +113,6 @@ def _parse(text: str) -> tuple[str, str, int]:
     if found[1]:
         return found[1], found[2].strip("[]"), int(found[3])
     return "serial", found[4] or found[5], 0
-
-
-class _Udp:
-    stream = False
-
-    def __init__(self, host: str, port: int, *, listens: bool) -> None:
-        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
-        self.peer: Peer = None if listens else address
-        if listens:
-            try:
-                self._socket.bind(address)
-            except OSError:
-                self.close()
-                raise
-
-    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        if not _is_ready(self._socket, timeout):
-            return
-        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen, yet
-            for _ in range(_MAX_DATAGRAMS):
-                yield self._socket.recvfrom(_MAX_READ)
-
-    def send(self, data: bytes, peer: Peer) -> None:
-        with suppress(OSError):  # a missing route comes back, or the vehicle times out
-            self._socket.sendto(data, peer)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class _Tcp:
-    stream = True
-
-    def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT)
-        self.peer: Peer = (host, port)
-
-    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        if _is_ready(self._socket, timeout):
-            data = self._socket.recv(_MAX_READ)
-            if not data:
-                raise ConnectionResetError(None, "the other side closed the connection")
-            yield data, self.peer
-
-    def send(self, data: bytes, peer: Peer) -> None:
-        self._socket.sendall(data)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class _Serial:
-    stream = True
-
-    def __init__(self, device: str, baud: int) -> None:
-        from serial import Serial
-
-        self._port = Serial(device, baud, timeout=0, write_timeout=1.0)
-        self.peer: Peer = device
-
-    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        if _is_ready(self._port, timeout):
-            yield self._port.read(_MAX_READ), self.peer
-
-    def send(self, data: bytes, peer: Peer) -> None:
-        self._port.write(data)
-
-    def close(self) -> None:
-        self._port.close()
 
 
 def _is_ready(file: Any, timeout: float) -> bool:

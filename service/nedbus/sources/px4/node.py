@@ -8,7 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 
@@ -118,6 +118,6 @@ class Px4ZenohNode:
                     self.pending.put(sample)
 
 
-def _undeclare(declared: zenoh.LivelinessToken | zenoh.Subscriber[object]) -> None:
+def _undeclare(declared: Any) -> None:
     with suppress(zenoh.ZError):  # its session may be closed already
         declared.undeclare()

@@ -38,8 +38,7 @@ class SimulatorSource:
         self._topics = options.chosen_topics
         self._ticks = None if options.duration is None else round(options.duration / TICK)
         self.finite = options.duration is not None
-        self.speed = None if options.speed == "max" else options.speed
-        self.wait = options.wait
+        self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
         """Start a new flight."""
