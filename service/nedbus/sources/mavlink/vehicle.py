@@ -10,11 +10,11 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
+from nedbus.sources.options import MavlinkOptions
+from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
 
 from .fields import SAID, sensors_of
-from ..options import MavlinkOptions
-from ..source import Rejection, SourceMessage
 
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot

@@ -1,4 +1,4 @@
-"""The node as which a source appears in ROS 2: what arrives at it, and a subscription to each topic with a publisher."""
+"""The node as which a source appears in ROS 2: what arrives there, and a subscription to each published topic."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any, Final
 import zenoh
 
 from nedbus.errors import SourceError
+from nedbus.sources.source import Rejection
 from nedbus.transport import (
     LONGEST_TOKEN,
     PX4_TYPES,
@@ -23,8 +24,6 @@ from nedbus.transport import (
     subscription_token,
     while_open,
 )
-
-from ..source import Rejection
 
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # of the payload of each

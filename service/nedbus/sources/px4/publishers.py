@@ -9,10 +9,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
+from nedbus.sources.source import Absence
 from nedbus.transport import PublisherToken, TopicKey
 from nedbus_msgs import Address, get_topic
-
-from ..source import Absence
 
 _MAX_KEYS: Final = 5000  # that are followed; a vehicle has some dozens
 _MAX_PUBLISHERS: Final = 8  # of a key

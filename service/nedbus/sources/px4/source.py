@@ -13,6 +13,8 @@ import zenoh
 
 from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
 from nedbus.log_event import about
+from nedbus.sources.options import Px4ZenohOptions
+from nedbus.sources.source import Absence, Rejection, SourceContext, SourceMessage
 from nedbus.transport import (
     BRIDGED_ENCODING,
     Attachment,
@@ -24,8 +26,6 @@ from nedbus.transport import (
 )
 from nedbus_msgs import decode_with
 
-from ..options import Px4ZenohOptions
-from ..source import Absence, Rejection, SourceContext, SourceMessage
 from .definitions import read_definitions
 from .node import Px4ZenohNode
 from .streams import NotAcceptedError, NotCarriedError, StreamRegistry, track_sequence

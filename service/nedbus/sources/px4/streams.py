@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
+from nedbus.sources.options import Px4ZenohOptions
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
 from nedbus_msgs import (
     BY_TOPIC,
@@ -23,7 +24,6 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-from ..options import Px4ZenohOptions
 from .definitions import Definitions
 from .publishers import PublisherTable
 
