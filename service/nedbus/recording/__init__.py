@@ -12,9 +12,8 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .alignment import align
     from .arrays import Flight, addresses_of, missing_of, read, utc_of
-    from .choice import matching
     from .conversion import convert
-    from .formats import SUFFIXES, format_of
+    from .flight_files import SUFFIXES, format_of, matching
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
@@ -28,7 +27,7 @@ else:
         {
             "Flight": ("", "arrays"),
             "MAX_STREAMS": ("plot", "plot"),
-            "SUFFIXES": ("", "formats"),
+            "SUFFIXES": ("", "flight_files"),
             "RecordedMessage": ("mcap", "reader"),
             "RecordedStream": ("mcap", "reader"),
             "Recorder": ("mcap", "recorder"),
@@ -42,8 +41,8 @@ else:
             "align": ("", "alignment"),
             "convert": ("mcap", "conversion"),
             "draw": ("plot", "plot"),
-            "format_of": ("", "formats"),
-            "matching": ("", "choice"),
+            "format_of": ("", "flight_files"),
+            "matching": ("", "flight_files"),
             "missing_of": ("", "arrays"),
             "read": ("", "arrays"),
             "read_ulog": ("", "ulog"),

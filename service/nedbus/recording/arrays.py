@@ -32,8 +32,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import MessageArray, arrays_of, to_array
 
-from .choice import matching, the_one
-from .formats import SUFFIXES
+from .flight_files import SUFFIXES, matching, the_one
 from .ulog import UlogTopics, read_ulog
 from .utc import TELLING, UtcOffset, tell_utc
 

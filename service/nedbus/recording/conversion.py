@@ -16,7 +16,7 @@ from nedbus.whole_file import whole_file
 from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Provenance, describe, upgrade_with
 from nedbus_msgs.arrays import arrays_of
 
-from .formats import check_recording
+from .flight_files import check_recording
 from .writer import Encoded, RecordingWriter
 
 _log = logging.getLogger(__name__)

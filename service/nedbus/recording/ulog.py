@@ -20,7 +20,7 @@ from pyulog import ULogException
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, Definition, FieldType, define, field_type
 
-from .formats import open_flight
+from .flight_files import open_flight
 
 _MESSAGE_HEADER: Final = 3  # bytes
 _FILE_HEADER: Final = 16  # bytes
