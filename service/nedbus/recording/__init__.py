@@ -22,55 +22,22 @@ if TYPE_CHECKING:
     from .writer import RecordingWriter
 else:
     # No submodule has the name of an export: importing it would replace the export.
-    __getattr__ = lazy_exports(
-        __name__,
-        {
-            "Flight": ("", "arrays"),
-            "MAX_STREAMS": ("plot", "plot"),
-            "SUFFIXES": ("", "flight_files"),
-            "RecordedMessage": ("mcap", "reader"),
-            "RecordedStream": ("mcap", "reader"),
-            "Recorder": ("mcap", "recorder"),
-            "RecordingReader": ("mcap", "reader"),
-            "RecordingWriter": ("mcap", "writer"),
-            "UlogColumns": ("", "ulog"),
-            "UlogTopic": ("", "ulog"),
-            "UlogTopics": ("", "ulog"),
-            "UtcOffset": ("", "utc"),
-            "addresses_of": ("", "arrays"),
-            "align": ("", "alignment"),
-            "convert": ("mcap", "conversion"),
-            "draw": ("plot", "plot"),
-            "format_of": ("", "flight_files"),
-            "matching": ("", "flight_files"),
-            "missing_of": ("", "arrays"),
-            "read": ("", "arrays"),
-            "read_ulog": ("", "ulog"),
-            "utc_of": ("", "arrays"),
-        },
-    )
+    _NAMES = {
+        ("", "alignment"): "align",
+        ("", "arrays"): "Flight addresses_of missing_of read utc_of",
+        ("", "flight_files"): "SUFFIXES format_of matching",
+        ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
+        ("", "utc"): "UtcOffset",
+        ("mcap", "conversion"): "convert",
+        ("mcap", "reader"): "RecordedMessage RecordedStream RecordingReader",
+        ("mcap", "recorder"): "Recorder",
+        ("mcap", "writer"): "RecordingWriter",
+        ("plot", "plot"): "MAX_STREAMS draw",
+    }
+    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
 
 __all__ = [
-    "MAX_STREAMS",
-    "SUFFIXES",
-    "Flight",
-    "RecordedMessage",
-    "RecordedStream",
-    "Recorder",
-    "RecordingReader",
-    "RecordingWriter",
-    "UlogColumns",
-    "UlogTopic",
-    "UlogTopics",
-    "UtcOffset",
-    "addresses_of",
-    "align",
-    "convert",
-    "draw",
-    "format_of",
-    "matching",
-    "missing_of",
-    "read",
-    "read_ulog",
-    "utc_of",
-]
+    "MAX_STREAMS", "SUFFIXES", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader",
+    "RecordingWriter", "UlogColumns", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align", "convert",
+    "draw", "format_of", "matching", "missing_of", "read", "read_ulog", "utc_of",
+]  # fmt: skip

@@ -6,25 +6,7 @@ from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Sou
 from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 
 __all__ = [
-    "KEPT_OF_FILE",
-    "SOURCE_KINDS",
-    "Absence",
-    "FileAccount",
-    "Link",
-    "LiveSource",
-    "Rejection",
-    "ReplayRun",
-    "ReplaySource",
-    "Source",
-    "SourceContext",
-    "SourceKind",
-    "SourceMessage",
-    "SourceSpec",
-    "check_link",
-    "follow",
-    "open_link",
-    "parse_source",
-    "read_account",
-    "source_text_of_file",
-    "times_of",
-]
+    "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Link", "LiveSource", "Rejection", "ReplayRun",
+    "ReplaySource", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "check_link", "follow",
+    "open_link", "parse_source", "read_account", "source_text_of_file", "times_of",
+]  # fmt: skip
