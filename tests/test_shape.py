@@ -47,7 +47,7 @@ ONLY_BY_FOLDER = {
     "pydantic": {
         "nedbus_msgs": "message px4_types validation other", "nedbus_msgs/codecs": "msgpack",
         "nedbus_msgs/messages": " ".join(MESSAGE_FILES), "nedbus/settings": "model load",
-        "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
+        "nedbus/sources": "options spec conversion", "nedbus/recording": "arrays", "nedbus/cli": "status",
         "nedbus/events": "report",
     },
     "pydantic_core": {

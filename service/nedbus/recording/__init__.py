@@ -12,8 +12,7 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .alignment import align
     from .arrays import Flight, addresses_of, missing_of, read, utc_of
-    from .conversion import convert
-    from .flight_files import SUFFIXES, format_of, matching
+    from .flight_files import SUFFIXES, check_recording, format_of, matching
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
@@ -25,10 +24,9 @@ else:
     _NAMES = {
         ("", "alignment"): "align",
         ("", "arrays"): "Flight addresses_of missing_of read utc_of",
-        ("", "flight_files"): "SUFFIXES format_of matching",
+        ("", "flight_files"): "SUFFIXES check_recording format_of matching",
         ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
         ("", "utc"): "UtcOffset",
-        ("mcap", "conversion"): "convert",
         ("mcap", "reader"): "RecordedMessage RecordedStream RecordingReader",
         ("mcap", "recorder"): "Recorder",
         ("mcap", "writer"): "RecordingWriter",
@@ -38,6 +36,6 @@ else:
 
 __all__ = [
     "MAX_STREAMS", "SUFFIXES", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader",
-    "RecordingWriter", "UlogColumns", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align", "convert",
-    "draw", "format_of", "matching", "missing_of", "read", "read_ulog", "utc_of",
+    "RecordingWriter", "UlogColumns", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align",
+    "check_recording", "draw", "format_of", "matching", "missing_of", "read", "read_ulog", "utc_of",
 ]  # fmt: skip

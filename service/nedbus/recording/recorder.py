@@ -36,7 +36,7 @@ class Recorder:
 
     @property
     def status(self) -> str:
-        """What was recorded so far, in one line."""
+        """The counts so far, in one line."""
         counts = self._subscription.counts
         names = ("lost", "dropped", "invalid", "discarded")
         trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))
