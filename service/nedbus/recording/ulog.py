@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -45,11 +44,6 @@ class UlogTopic:
     address: Address
     definition: Definition[Any]
     columns: UlogColumns
-
-    @property
-    def is_described(self) -> bool:
-        """Whether only the log says what its message is."""
-        return self.address.topic not in BY_TOPIC
 
 
 @dataclass(slots=True)
@@ -171,47 +165,30 @@ class _BoundedFile:
         return data
 
 
-class _Printed(threading.local):
-    """What pyulog printed in this thread: it prints its warnings, and a library must leave stdout alone."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-
-_printed = _Printed()
-
-
-def _capture(*values: object) -> None:
-    _printed.lines.append(" ".join(map(str, values)))
-
-
-def _load_pyulog() -> ModuleType:
-    """Return a copy of pyulog that only this module uses: with a `print` of its own."""
+def _load_pyulog(printed: list[str]) -> ModuleType:
+    """Return a copy of pyulog that adds its warnings to `printed`: a library must leave stdout alone."""
     spec = find_spec("pyulog.core")
     if spec is None or spec.loader is None:
         raise ModuleNotFoundError(name="pyulog")
     module = module_from_spec(spec)
-    vars(module)["print"] = _capture
+    vars(module)["print"] = lambda *values: printed.append(" ".join(map(str, values)))
     spec.loader.exec_module(module)
     return module
 
 
-_pyulog = _load_pyulog()
-
-
 def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
-    """Return pyulog's ULog, and what is damaged."""
-    _printed.lines = []
+    """Return pyulog's ULog, and a list of damages."""
+    printed: list[str] = []
     try:
         with open_flight(path) as file:
             bounded = _BoundedFile(file, path.stat().st_size)
-            log = _pyulog.ULog(bounded, None if topics is None else list(topics))
+            log = _load_pyulog(printed).ULog(bounded, None if topics is None else list(topics))
         end = None if log.has_data_appended else _find_damage(path)
     except OSError as exc:
         raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
     except _READ_ERRORS as exc:
         raise SourceError(str(path), f"not a readable ULog file ({exc})") from exc
-    damage = [f"damaged: {line}" for line in _printed.lines[:5]]
+    damage = [f"damaged: {line}" for line in printed[:5]]
     if log.file_corruption and not damage:
         damage.append("damaged: parts of it were skipped")
     elif bounded.cut:

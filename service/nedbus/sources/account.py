@@ -68,11 +68,9 @@ def follow(
 
 
 def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | None]:
-    definition = message.definition or BY_TOPIC.get(message.address.topic)
     reason = message.error
-    if reason is None and definition is None:
-        return None, None
-    if reason is None and definition is not None:
+    if reason is None:
+        definition = message.definition or BY_TOPIC[message.address.topic]
         try:
             fields = upgrade_fields(definition, message.fields)
             payload = codec_of(definition).encode_fields(fields)
@@ -81,5 +79,5 @@ def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | 
         else:
             account.add(message.address, fields, message.due)
             return None, payload
-    account.reject(message.address, reason or "", message.due)
+    account.reject(message.address, reason, message.due)
     return reason, None

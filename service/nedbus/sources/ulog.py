@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.recording import UlogTopic, read_ulog
-from nedbus_msgs import ALL, DEFAULT, Definition
+from nedbus_msgs import ALL, BY_TOPIC, DEFAULT, Definition
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -82,7 +82,9 @@ class UlogSource:
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
-            definitions={topic.address.topic: topic.definition for topic in topics if topic.is_described},
+            definitions={
+                topic.address.topic: topic.definition for topic in topics if topic.address.topic not in BY_TOPIC
+            },
         )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from nedbus.sources.options import MavlinkOptions
@@ -55,17 +54,6 @@ _USABLE: Final = 0.9  # of a link; the rest is for heartbeats and answers
 _BITS: Final = 10  # of a byte on a serial line, with start and stop
 
 
-@dataclass(slots=True, eq=False)
-class _Expiring:
-    """Fields from one message, and until when they are valid."""
-
-    until: float = 0.0
-    fields: dict[str, object] | None = None
-
-    def at(self, now: float) -> dict[str, object]:
-        return self.fields if self.fields and now <= self.until else {}
-
-
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
     """Return the rates to request [Hz] for these topics: positions at `rate`, and each other message as often.
 
@@ -102,10 +90,8 @@ class Vehicle:
 
     def _reset(self, now: float) -> None:
         """Discard what was received, and request everything again: it was silent, or rebooted."""
-        self._heading, self._yaw, self._status, self._bottom, self._velocity = (_Expiring() for _ in range(5))
-        self._global_status, self._sensors, self._utc = (_Expiring() for _ in range(3))
+        self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and until when
         self._quaternion_until = now + _VALUE_TIMEOUT
-        self._origin = _Expiring()
         self._is_global = False
         self._last: dict[Address, int] = {}  # timestamps
         self._pending = [*self._rates, ORIGIN] if _POSITION in self._rates else [*self._rates]
@@ -138,7 +124,7 @@ class Vehicle:
             self._tries += 1
             self._next_request = now + _ACK_TIMEOUT
             yield self._pending[0], self._rates.get(self._pending[0], 0.0)
-        elif not self._origin.fields and _POSITION in self._rates:
+        elif "origin" not in self._kept and _POSITION in self._rates:
             self._pending, self._next_request = [ORIGIN], now + _RETRY_INTERVAL
 
     def acknowledge(self, now: float) -> int | None:
@@ -180,61 +166,62 @@ class Vehicle:
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
-        """Keep what belongs to later messages."""
+        """Keep the fields that belong to later messages."""
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
-                self._heading = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(heading, math.tau)})
+                self._keep("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
             case "ATTITUDE" if math.isfinite(message.yaw):
-                self._yaw = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(message.yaw, math.tau)})
+                self._keep("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
             case "ATTITUDE_QUATERNION":
                 self._quaternion_until = now + _VALUE_TIMEOUT
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
-                origin = {
-                    "xy_global": True,
-                    "z_global": True,
-                    "ref_lat": message.latitude / 1e7,
-                    "ref_lon": message.longitude / 1e7,
-                    "ref_alt": message.altitude / 1e3,
-                    **({"ref_timestamp": message.time_usec} if message.time_usec else {}),
-                }
-                self._origin = _Expiring(math.inf, origin)
+                known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
+                latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
+                self._keep("origin", math.inf, xy_global=True, z_global=True, **known)
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance)
-                bottom: dict[str, object] = {"dist_bottom": message.bottom_clearance} if is_known else {}
-                self._bottom = _Expiring(now + _VALUE_TIMEOUT, {"dist_bottom_valid": is_known, **bottom})
+                bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
+                self._keep("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
-                fields = _velocity_deviations(message.velocity_covariance)
-                self._velocity = _Expiring(now + _VALUE_TIMEOUT, fields)
+                self._keep("velocity", now + _VALUE_TIMEOUT, **_velocity_deviations(message.velocity_covariance))
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
                 self._is_global = bool(message.flags & _POS_HORIZ_ABS)
                 valid = _validity(message.flags)
-                self._status = _Expiring(now + _STATUS_TIMEOUT, valid | known)
+                self._keep("status", now + _STATUS_TIMEOUT, **valid, **known)
                 on_globe = {"lat_lon_valid": valid["xy_valid"] and self._is_global, "alt_valid": valid["z_valid"]}
-                self._global_status = _Expiring(now + _STATUS_TIMEOUT, on_globe | known)
+                self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
-                self._sensors = _Expiring(now + _STATUS_TIMEOUT, sensors_of(message))
+                self._keep("sensors", now + _STATUS_TIMEOUT, **sensors_of(message))
             case "SYSTEM_TIME" if timestamp is not None and message.time_unix_usec > _LONG_AGO:
-                self._utc = _Expiring(now + _STATUS_TIMEOUT, {"boot": message.time_unix_usec - timestamp})
+                self._keep("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
+
+    def _keep(self, name: str, until: float, **fields: object) -> None:
+        self._kept[name] = fields, until
+
+    def _recall(self, name: str, now: float) -> dict[str, object]:
+        fields, until = self._kept.get(name, ({}, 0.0))
+        return fields if now <= until else {}
 
     def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
-        """Add what earlier messages said."""
+        """Add the fields of earlier messages."""
         match topic:
             case "vehicle_local_position":
-                for each in (self._yaw, self._heading, self._status, self._bottom, self._velocity, self._origin):
-                    fields |= each.at(now)
+                for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
+                    fields |= self._recall(name, now)
                 # The flags are from an earlier message: these fields may have become NaN since.
                 for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
                     values = cast("Iterator[float]", (fields[name] for name in FLAGS[flag].fields))
                     if fields.get(flag) and not all(map(math.isfinite, values)):
                         fields[flag] = False
             case "vehicle_global_position":
-                fields |= self._global_status.at(now)
+                fields |= self._recall("global status", now)
             case "vehicle_status":
-                fields |= self._sensors.at(now)
-            case "sensor_gps" if utc := self._utc.at(now):
+                fields |= self._recall("sensors", now)
+            case "sensor_gps" if utc := self._recall("utc", now):
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
     def _track_time(self, message: Any, now: float) -> int | None:
