@@ -62,28 +62,30 @@ Polars = Literal["polars"]
 Library = Literal["pandas", "polars"] | None
 
 
-class _Which(TypedDict, total=False):
+class _StreamFilter(TypedDict, total=False):
     vehicle: str | int
     instance: int | None
 
 
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: None = None, **which: Unpack[_Which]) -> MessageArray: ...
+def read(
+    path: str | Path, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_StreamFilter]
+) -> MessageArray: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **which: Unpack[_Which]) -> pd.DataFrame: ...
+def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_StreamFilter]) -> pd.DataFrame: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **which: Unpack[_Which]) -> pl.DataFrame: ...
+def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_StreamFilter]) -> pl.DataFrame: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **stream: Unpack[_StreamFilter]
 ) -> dict[str, MessageArray]: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **stream: Unpack[_StreamFilter]
 ) -> dict[str, pd.DataFrame]: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **stream: Unpack[_StreamFilter]
 ) -> dict[str, pl.DataFrame]: ...
 def read(
     path: str | Path,
@@ -145,7 +147,7 @@ def read_streams(
 def utc_of(
     flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
 ) -> UtcOffset | None:
-    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and who tells it; None if nobody does.
+    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and its source; None without one.
 
     Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
     `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
@@ -228,7 +230,7 @@ class Flight:
 
     @property
     def damaged(self) -> bool:
-        """Whether damage cost messages of what was read so far."""
+        """True if damage cost messages of what was read so far."""
         return any(part is not None and part.damaged for part in (self._reader, self._log))
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:

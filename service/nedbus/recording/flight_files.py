@@ -24,9 +24,9 @@ def format_of(path: str | PurePath) -> str:
 
 
 def check_recording(path: Path, *, flight: str) -> None:
-    """Raise ConfigError for a recording that is to be written under a name of something else.
+    """Raise ConfigError for a recording whose name is that of another format.
 
-    `flight` is the file to read instead, for who wants a table or a picture.
+    `flight` is the file that the hint for a table or a picture names.
     """
     if SUFFIXES.get(path.suffix) == "mcap":
         return
@@ -38,7 +38,7 @@ def check_recording(path: Path, *, flight: str) -> None:
 
 
 def open_flight(path: Path) -> BinaryIO:
-    """Open a file for reading; raise SourceError when that fails, and for what is no file: a flight is read twice."""
+    """Open a file for reading; raise SourceError when that fails, and for a pipe or folder: a flight is read twice."""
     try:
         if path.exists() and not path.is_file():
             raise SourceError(str(path), "not a regular file: save it as one first")

@@ -84,7 +84,7 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """What happened to a vehicle, from begin to end [s]; something that happens once ends as it begins."""
+    """An event of a vehicle, from begin to end [s]; one that happens once ends as it begins."""
 
     vehicle: str
     row: str

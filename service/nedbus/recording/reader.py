@@ -77,7 +77,7 @@ class RecordingReader:
 
     @property
     def damaged(self) -> bool:
-        """Whether damage cost messages."""
+        """True if damage cost messages."""
         return self._file.damaged
 
     def check(self) -> None:

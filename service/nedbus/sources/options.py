@@ -63,7 +63,7 @@ Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
 
 class Options(BaseModel):
-    """What the options of all kinds have in common."""
+    """Options of every kind."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

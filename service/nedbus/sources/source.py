@@ -36,7 +36,7 @@ class Rejection:
     """Input that a live source could not turn into a message.
 
     `where`: the key, the link or the address that it came from; the log names each one once.
-    `count`: for how many messages it stands.
+    `count`: the number of messages that it stands for.
     """
 
     where: str
@@ -80,7 +80,7 @@ class ReplayRun:
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """What a source may need of the service that runs it.
+    """Settings of the service that runs a source.
 
     `vehicle`: the default for a source that has no vehicle name of its own.
     `routers`: endpoints of the service's router, and `tls` to connect to them.

@@ -123,7 +123,7 @@ def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
 
 
 def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.float64]], int]:
-    """Return when each row of each track is due, in seconds since the first row, and how many gaps were removed."""
+    """Return when each row of each track is due, in seconds since the first row, and the number of gaps removed."""
     times = np.unique(np.concatenate(clocks))
     steps = np.diff(times)
     gaps = steps > _MAX_GAP

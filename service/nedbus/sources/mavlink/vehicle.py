@@ -18,8 +18,8 @@ from .fields import SAID, sensors_of
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
 _VALUE_TIMEOUT: Final = 2.0  # s after which a value is no longer part of the estimate
-_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second if nobody requests it
-_SILENCE: Final = 3.0  # s after which all state is reset
+_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second without a request
+_SILENCE_TIMEOUT: Final = 3.0  # s after which all state is reset
 _ACK_TIMEOUT: Final = 1.0  # s until a request is repeated
 _MAX_TRIES: Final = 5
 _RETRY_INTERVAL: Final = 5.0  # s until an unknown origin, or positions that do not arrive, are requested again
@@ -47,11 +47,11 @@ STREAMS: Final = {
     242: (72, 1.0, "home_position"),
     245: (14, 1.0, "vehicle_land_detected"),
 }
-"""What to request, in that order: its bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), the topics in need."""
+"""The messages to request, in order: bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), topics that need it."""
 
-_LEAST: Final = 2.0  # Hz, on a link that is full
-_USABLE: Final = 0.9  # of a link; the rest is for heartbeats and answers
-_BITS: Final = 10  # of a byte on a serial line, with start and stop
+_MIN_RATE: Final = 2.0  # Hz, on a link that is full
+_USABLE_PART: Final = 0.9  # of a link; the rest is for heartbeats and answers
+_BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop
 
 
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
@@ -60,15 +60,15 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
     That is, up to the rate that it wants; on a link that does not carry it all, up to one that is the same for all.
     """
     wanted = {
-        number: max(_LEAST, rate) if number == _STATUS else hertz or rate
+        number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
         for number, (_, hertz, needed) in STREAMS.items()
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE * baud / _BITS - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    free = _USABLE_PART * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
-        wanted[number] = min(wanted[number], max(_LEAST, level))
+        wanted[number] = min(wanted[number], max(_MIN_RATE, level))
         free -= STREAMS[number][0] * wanted[number]
     return wanted
 
@@ -101,7 +101,7 @@ class Vehicle:
 
     def track_sequence(self, component: int, sequence: int, now: float) -> None:
         """Count the messages that were lost before this one, whatever its type."""
-        if now - self._last_message > _SILENCE:
+        if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
         last = self._sequences.get(component)
@@ -114,9 +114,9 @@ class Vehicle:
 
     def requests(self, now: float) -> Iterator[tuple[int, float]]:
         """Yield what to request now: the number of a message, and its rate [Hz], 0 for once."""
-        if now < self._next_request or now - self._last_message > _SILENCE:
+        if now < self._next_request or now - self._last_message > _SILENCE_TIMEOUT:
             return
-        if not self._pending and now - self._last_position > _SILENCE:
+        if not self._pending and now - self._last_position > _SILENCE_TIMEOUT:
             self._pending, self._tries = [*self._rates], 0  # it sends messages, but no positions
         if self._tries >= _MAX_TRIES:
             self._pending, self._tries = self._pending[1:], 0
@@ -141,7 +141,7 @@ class Vehicle:
         return number != ORIGIN or self._is_global
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Return what a message says of a topic that is wanted: of one at most; late ones are rejected."""
+        """Return the message of a chosen topic that this one holds, if any; late ones are rejected."""
         kind = message.get_type()
         topic, fields_of = SAID.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
@@ -246,7 +246,7 @@ class Vehicle:
 
 
 def _validity(bits: int) -> dict[str, object]:
-    """Return what ESTIMATOR_STATUS.flags say about position and velocity.
+    """Return the validity of position and velocity by ESTIMATOR_STATUS.flags.
 
     The constant position mode was the opposite of a horizontal velocity up to PX4 1.15; since PX4's commit 48f1687d3a
     it is set for every vehicle at rest too, whose velocity and position are valid.

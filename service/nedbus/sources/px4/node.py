@@ -73,7 +73,7 @@ class Px4ZenohNode:
         raise SourceError(self._name, "publishers come and go faster than they can be followed")
 
     def dropped(self) -> Iterator[Rejection]:
-        """Yield how many messages were dropped since the last call."""
+        """Yield a rejection for the messages of each reason that were dropped since the last call."""
         new = self._dropped - self._reported
         for (where, reason), count in new.items():
             yield Rejection(where, reason, count=count)

@@ -34,11 +34,11 @@ _HINT: Final = "give each a namespace or a domain of its own"
 
 
 class NotAcceptedError(Exception):
-    """Raised for a message that may be valid, but not whose it is is certain, or not in which layout it is."""
+    """Raised for a message that may be valid, but whose vehicle or layout is uncertain."""
 
 
 class NotCarriedError(Exception):
-    """Raised for a key whose message nobody asked for; its text is the message, empty for what `topics=` leaves out."""
+    """Raised for a key that no option asks for; its text is the message, empty for what `topics=` leaves out."""
 
 
 @dataclass(slots=True, eq=False)
@@ -47,7 +47,7 @@ class Px4Stream:
 
     `unknown`: fields of a layout newer than this version, whose names or types it does not know.
     `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
-    `reboots`: how many reboots of its vehicle it took part in.
+    `reboots`: the number of reboots of its vehicle that it took part in.
     """
 
     key: TopicKey
@@ -95,7 +95,7 @@ class StreamRegistry:
         """Return a new stream for a key.
 
         Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one whose
-        layout is unknown, and for one key too many, NotCarriedError for one that nobody asked for.
+        layout is unknown, and for one key too many, NotCarriedError for one that no option asks for.
         """
         parsed = TopicKey.parse(key)
         address = self._address_of(parsed)
@@ -131,7 +131,7 @@ class StreamRegistry:
             stream.publisher = self.publishers.only(stream.key)
 
     def is_reboot(self, stream: Px4Stream) -> bool:
-        """Take note that a stream restarted; return whether it is the first one of its vehicle to do so."""
+        """Count the restart of a stream; return whether it is the first one of its vehicle to restart."""
         vehicle = stream.address.vehicle
         known = self._reboots.get(vehicle, 0)
         is_first = stream.reboots == known
@@ -201,7 +201,7 @@ def _by_dds_type() -> Mapping[str, Definition[Any]]:
 
 
 def track_sequence(stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
-    """Take note of a message; return how many were lost just before it, and whether its publisher restarted.
+    """Account for a message; return the number lost just before it, and whether its publisher restarted.
 
     Raises NotAcceptedError for a duplicate, and for a sequence that goes back repeatedly: two vehicles with one gid.
     """

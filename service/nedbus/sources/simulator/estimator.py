@@ -125,7 +125,7 @@ class Estimator:
 
     @property
     def xy_valid(self) -> bool:
-        """Whether its horizontal position and velocity are valid."""
+        """Validity of its horizontal position and velocity."""
         return self._dead_reckoning < _MAX_DEAD_RECKONING
 
     @property

@@ -19,7 +19,7 @@ from .vehicle import SimulatedVehicle
 
 
 class _Stream(NamedTuple):
-    """What is sent at some ticks, and the estimator that it needs, if any."""
+    """Messages that are sent at some ticks, and the estimator that they need, if any."""
 
     address: Address
     ticks: range
