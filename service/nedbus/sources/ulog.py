@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,23 +21,6 @@ _MAX_GAP: Final = 60_000_000  # us: a longer gap in a log is a damaged timestamp
 _CHUNK: Final = 1000  # rows that are converted to Python values at a time
 
 _BOOLS: Final = {0: False, 1: True}  # valid bytes of a bool; the model rejects any other
-
-
-@dataclass(frozen=True, slots=True)
-class _Track:
-    """One topic of a log, and when each row is due."""
-
-    topic: UlogTopic
-    due: npt.NDArray[np.float64]
-
-    def messages(self) -> Iterator[SourceMessage]:
-        """Yield the rows."""
-        address, definition, names = self.topic.address, self.topic.definition, tuple(self.topic.columns)
-        for start in range(0, len(self.due), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            columns = [python_values(definition, name, column[rows]) for name, column in self.topic.columns.items()]
-            for due, row in zip(self.due[rows].tolist(), zip(*columns, strict=True), strict=True):
-                yield SourceMessage(due, address, dict(zip(names, row, strict=True)), definition=definition)
 
 
 class UlogSource:
@@ -70,15 +52,14 @@ class UlogSource:
         dues, gaps = _pace(clocks)
         if gaps:
             warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")
-        tracks = [_Track(topic, due) for topic, due in zip(topics, dues, strict=True)]
         total = sum(map(len, clocks))
         layouts = " and ".join(sorted({_layout_name(topic) for topic in topics if topic.definition is DEFAULT}))
         layout = f", layout {layouts}" if layouts else ""
         return ReplayRun(
-            messages=heapq.merge(*(track.messages() for track in tracks), key=lambda message: message.due),
+            messages=heapq.merge(*map(_messages, topics, dues), key=lambda message: message.due),
             addresses=tuple(topic.address for topic in topics),
             total=total,
-            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(tracks)} streams{layout},"
+            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
@@ -88,7 +69,17 @@ class UlogSource:
         )
 
 
-def python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
+def _messages(topic: UlogTopic, dues: npt.NDArray[np.float64]) -> Iterator[SourceMessage]:
+    """Yield the rows of a topic, each when it is due."""
+    definition, names = topic.definition, tuple(topic.columns)
+    for start in range(0, len(dues), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        columns = [_python_values(definition, name, column[rows]) for name, column in topic.columns.items()]
+        for due, row in zip(dues[rows].tolist(), zip(*columns, strict=True), strict=True):
+            yield SourceMessage(due, topic.address, dict(zip(names, row, strict=True)), definition=definition)
+
+
+def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
     """Return a column as values that the model accepts: int, float, bool, or tuples of them."""
     values: list[object] = column.tolist()
     if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
