@@ -322,7 +322,8 @@ def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tu
         stream = chunk[rows[0]].stream
         if stream.layout.types.items() <= definition.types.items():
             array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], stream.layout)
-        for name in stream.lacking:
+        lacking = definition.all_fields - definition.plan(stream.layout.fields).provided | stream.missing
+        for name in lacking:
             absent.setdefault(name, np.zeros(len(chunk), bool))[rows] = True
     decoded: dict[int, Message] = {}
     for index in np.flatnonzero(~valid).tolist():

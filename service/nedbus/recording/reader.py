@@ -25,11 +25,6 @@ class RecordedStream:
     layout: Layout
     missing: frozenset[str]
 
-    @property
-    def lacking(self) -> frozenset[str]:
-        """The fields of a message that its source or its layout lacks."""
-        return self.definition.all_fields - self.definition.plan(self.layout.fields).provided | self.missing
-
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
