@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from nedbus.recording import convert
-from nedbus.sources import LiveSource, ReplayRun, parse_source
+from nedbus.sources import LiveSource, ReplayRun, convert, parse_source
 
 
 def open_replay(text: str) -> ReplayRun:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nedbus.sources import Absence
-from nedbus.sources.px4_absences import Absences
+from nedbus.sources.px4.publishers import PublisherTable
 from nedbus.transport import PublisherToken, TopicKey, publisher_token
 from nedbus_msgs import Address
 
@@ -17,53 +17,53 @@ def token(topic: str, *, session: str = "a") -> PublisherToken:
 
 
 @pytest.fixture
-def absences() -> Absences:
+def absences() -> PublisherTable:
     """Return what knows of two topics, announced at 100 s by one node."""
-    absences = Absences()
+    absences = PublisherTable()
     for topic in ("vehicle_attitude", "vehicle_odometry"):
-        absences.announce(token(topic), Address("1", topic), 100.0)
+        absences.add(token(topic), Address("1", topic), 100.0)
     return absences
 
 
-def hear(absences: Absences, topic: str, now: float) -> Absence:
+def hear(absences: PublisherTable, topic: str, now: float) -> Absence:
     """Return what is absent just after a message."""
-    assert not absences.hear(str(token(topic).key), now)
+    assert not absences.hear(token(topic).key, now)
     return absences.report(now)
 
 
-def test_topic_is_silent_after_5_s_while_others_arrive(absences: Absences) -> None:
+def test_topic_is_silent_after_5_s_while_others_arrive(absences: PublisherTable) -> None:
     """It is silent from 5 s on, whether something came before or not, until something comes, or it is withdrawn."""
     assert hear(absences, "vehicle_attitude", 104.9) == Absence()
     assert hear(absences, "vehicle_attitude", 105.0) == Absence((), ("1/vehicle_odometry",))
     assert hear(absences, "vehicle_odometry", 105.1) == Absence()
     assert hear(absences, "vehicle_attitude", 110.2) == Absence((), ("1/vehicle_odometry",))
-    absences.withdraw(token("vehicle_odometry"))
+    absences.remove(token("vehicle_odometry"), 110.2)
     assert absences.report(110.2) == Absence()
 
 
-def test_nothing_is_silent_while_nothing_arrives(absences: Absences) -> None:
+def test_nothing_is_silent_while_nothing_arrives(absences: PublisherTable) -> None:
     """A vehicle whose link is down loses all its topics, and another one does not make up for it."""
-    absences.announce(token("vehicle_status", session="b"), Address("2", "vehicle_status"), 100.0)
+    absences.add(token("vehicle_status", session="b"), Address("2", "vehicle_status"), 100.0)
     assert absences.report(200.0) == Absence()
     assert hear(absences, "vehicle_status", 200.0) == Absence()
 
 
-def test_topic_on_events_is_never_silent(absences: Absences) -> None:
+def test_topic_on_events_is_never_silent(absences: PublisherTable) -> None:
     """home_position, and topics of which nobody knows the rate, may not come for as long as they like."""
     for topic in ("home_position", "wheel_encoders"):
-        absences.announce(token(topic), Address("1", topic), 100.0)
+        absences.add(token(topic), Address("1", topic), 100.0)
     assert absences.report(200.0) == Absence()
     assert hear(absences, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
 
 
-def test_messages_that_are_not_carried_are_listed(absences: Absences) -> None:
+def test_messages_that_are_not_carried_are_listed(absences: PublisherTable) -> None:
     """They are sorted, each once, without those that nobody wants, for as long as they are announced; and bounded."""
     for number, name in enumerate(("Rpm", "Airspeed", "Rpm", "")):
-        absences.announce(token(f"topic_{number}"), name, 100.0)
-    assert absences.hear(str(token("topic_0").key), 100.0)
+        absences.add(token(f"topic_{number}"), name, 100.0)
+    assert absences.hear(token("topic_0").key, 100.0)
     assert absences.report(100.0) == Absence(("Airspeed", "Rpm"))
-    absences.withdraw(token("topic_1"))
+    absences.remove(token("topic_1"), 100.0)
     assert absences.report(100.0) == Absence(("Rpm",))
     for number in range(2000):
-        absences.announce(token(f"any_{number}"), f"Any{number}", 100.0)
+        absences.add(token(f"any_{number}"), f"Any{number}", 100.0)
     assert len(absences.report(100.0).not_carried) == 100

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from nedbus.sources import px4_publishers as module
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.px4_publishers import AlivePublishers
-from nedbus.sources.px4_streams import NotAcceptedError, Stream, StreamRegistry, track_sequence
+from nedbus.sources.px4.publishers import PublisherTable
+from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
 from nedbus_msgs import DecodeError, dds_type
 from tests.first_message import ROS2_TYPE, type_hash
@@ -36,7 +35,7 @@ def node(session: str, name: str = "talker") -> PublisherToken:
     return PublisherToken.parse(publisher_token(key(), session, name, 1))
 
 
-def send(streams: StreamRegistry, stream: Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
+def send(streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
     """Pass one message on; return what was lost before it, and whether its vehicle rebooted."""
     attachment = Attachment(sequence, 0, gid)
     streams.claim(stream, attachment, now)
@@ -76,7 +75,7 @@ def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) 
     for number in range(100):
         with pytest.raises(NotAcceptedError, match="two vehicles are alike, with one key and one gid: give each"):
             send(streams, stream, number, 100.2 + number)
-    streams.remove_publisher(px4("a"), 201.0)
+    streams.publishers.remove(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="alike"):
         send(streams, stream, 900, 201.9)  # what it sent last comes after its token
     assert send(streams, stream, 30, 202.1) == (0, False)
@@ -98,7 +97,7 @@ def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistr
     send(streams, stream, 500, 100.0)
     streams.add_publisher(px4("b"), 103.0)
     assert send(streams, stream, 1, 103.1) == (0, True)
-    streams.remove_publisher(px4("a"), 109.0)
+    streams.publishers.remove(px4("a"), 109.0)
     assert send(streams, stream, 2, 109.1) == (0, False)
 
 
@@ -118,7 +117,7 @@ def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegist
     stream = streams.register(str(key()))
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
-    streams.remove_publisher(node("a"), 100.1)
+    streams.publishers.remove(node("a"), 100.1)
     streams.add_publisher(node("b"), 100.2)
     assert send(streams, stream, 1, 100.3, b"b" * 16) == (0, True)
     assert send(streams, stream, 2, 100.4, b"b" * 16) == (0, False)
@@ -139,13 +138,22 @@ def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
 
 def test_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A peer that declares tokens without end is followed up to a limit, and costs nothing once they are gone."""
-    monkeypatch.setattr(module, "_MAX_TOKENS", 10)
-    alive = AlivePublishers()
+    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_PUBLISHERS", 10)
+    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_KEYS", 2)
+    alive = PublisherTable()
     tokens = [node(str(number)) for number in range(15)]
     for token in tokens:
-        alive.add(token)
+        alive.add(token, "", 0.0)
     assert [alive.is_alive(token) for token in tokens] == 10 * [True] + 5 * [False]
     for token in tokens[:-6]:
         alive.remove(token, 0.0)
-    alive.add(tokens[-1])
+    alive.add(tokens[-1], "", 0.0)
     assert alive.is_alive(tokens[-1])
+    others = [px4("a", f"topic_{number}") for number in range(3)]
+    for token in others:
+        alive.add(token, "", 0.0)
+    assert [alive.is_alive(token) for token in others] == [True, False, False]
+    for token in (tokens[9], tokens[-1]):
+        alive.remove(token, 0.0)
+    alive.add(others[1], "", 0.0)
+    assert alive.is_alive(others[1])

@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import common as dialect
 import nedbus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import parse_source
-from nedbus.sources.mavlink_vehicle import ORIGIN
+from nedbus.sources.mavlink.vehicle import ORIGIN
 from tests.first_message import upgrade
 from tests.listening import Listener, status_of_source
 from tests.messages import VLP
@@ -249,8 +249,8 @@ def test_denied_origin_is_told_once_and_not_before_there_can_be_one(
     """PX4 denies GPS_GLOBAL_ORIGIN until it has a global position: that is no news; a denial afterwards is, once."""
     caplog.set_level("INFO")
     now = 1000.0
-    monkeypatch.setattr("nedbus.sources.mavlink.time", SimpleNamespace(monotonic=lambda: now))
-    monkeypatch.setattr("nedbus.sources.mavlink._TICK", 0.01)
+    monkeypatch.setattr("nedbus.sources.mavlink.source.time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr("nedbus.sources.mavlink.source._TICK", 0.01)
     with Listener(f"mavlink:udpin:127.0.0.1:{port}?topics={VLP}") as listener, Autopilot(port) as vehicle:
 
         def deny(flags: int, *, times: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink_vehicle import STREAMS, Vehicle
+from nedbus.sources.mavlink.vehicle import STREAMS, Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import BY_TOPIC, upgrade_with
 from tests.messages import VLP

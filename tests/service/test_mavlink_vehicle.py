@@ -9,8 +9,8 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources import Rejection, SourceMessage
-from nedbus.sources.mavlink_fields import SAID
-from nedbus.sources.mavlink_vehicle import ORIGIN, STREAMS, Vehicle, request_rates
+from nedbus.sources.mavlink.fields import SAID
+from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, quaternion_to_euler
 from tests.messages import VLP

@@ -24,7 +24,7 @@ import nedbus
 from nedbus.doctor import examine
 from nedbus.settings import load_settings
 from nedbus.sources import SourceMessage
-from nedbus.sources.mavlink_vehicle import Vehicle, request_rates
+from nedbus.sources.mavlink.vehicle import Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus.transport import Attachment, Session
 from nedbus_msgs import ANY, TOPICS, Address, VehicleLocalPosition, get_topic, split_ros2_topic

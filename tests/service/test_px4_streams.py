@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.px4_streams import NotAcceptedError, StreamRegistry, track_sequence
+from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, TopicKey
 from nedbus_msgs import DecodeError, dds_type
 from tests.first_message import ROS2_TYPE, type_hash

@@ -23,8 +23,8 @@ import nedbus
 from nedbus.cli.follow import write_notice
 from nedbus.client import Subscription
 from nedbus.errors import OutputError, SourceError
-from nedbus.recording import Recorder, RecordingReader, RecordingWriter, convert
-from nedbus.sources import SourceMessage
+from nedbus.recording import Recorder, RecordingReader, RecordingWriter
+from nedbus.sources import SourceMessage, convert
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import to_array

@@ -194,7 +194,7 @@ def test_no_watchdog_while_a_source_is_stuck(
 ) -> None:
     """While the loop of a source does not go round there is no ping, though all other threads work; then there is."""
     limit = 0.1  # s
-    monkeypatch.setattr("nedbus.sources.mavlink._TICK", limit / 2)  # how often that one goes round
+    monkeypatch.setattr("nedbus.sources.mavlink.source._TICK", limit / 2)  # how often that one goes round
     entered, opened = block(monkeypatch, method)
     with notified(systemd, source, watchdog=str(round(2e6 * limit))) as (daemon, notifier), repeating(notifier.tick):
         systemd.receive_until(is_ready)

@@ -12,9 +12,7 @@ from nedbus.extras import lazy_exports
 if TYPE_CHECKING:
     from .alignment import align
     from .arrays import Flight, addresses_of, missing_of, read, utc_of
-    from .choice import matching
-    from .conversion import convert
-    from .formats import SUFFIXES, format_of
+    from .flight_files import SUFFIXES, check_recording, format_of, matching
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
@@ -23,55 +21,21 @@ if TYPE_CHECKING:
     from .writer import RecordingWriter
 else:
     # No submodule has the name of an export: importing it would replace the export.
-    __getattr__ = lazy_exports(
-        __name__,
-        {
-            "Flight": ("", "arrays"),
-            "MAX_STREAMS": ("plot", "plot"),
-            "SUFFIXES": ("", "formats"),
-            "RecordedMessage": ("mcap", "reader"),
-            "RecordedStream": ("mcap", "reader"),
-            "Recorder": ("mcap", "recorder"),
-            "RecordingReader": ("mcap", "reader"),
-            "RecordingWriter": ("mcap", "writer"),
-            "UlogColumns": ("", "ulog"),
-            "UlogTopic": ("", "ulog"),
-            "UlogTopics": ("", "ulog"),
-            "UtcOffset": ("", "utc"),
-            "addresses_of": ("", "arrays"),
-            "align": ("", "alignment"),
-            "convert": ("mcap", "conversion"),
-            "draw": ("plot", "plot"),
-            "format_of": ("", "formats"),
-            "matching": ("", "choice"),
-            "missing_of": ("", "arrays"),
-            "read": ("", "arrays"),
-            "read_ulog": ("", "ulog"),
-            "utc_of": ("", "arrays"),
-        },
-    )
+    _NAMES = {
+        ("", "alignment"): "align",
+        ("", "arrays"): "Flight addresses_of missing_of read utc_of",
+        ("", "flight_files"): "SUFFIXES check_recording format_of matching",
+        ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
+        ("", "utc"): "UtcOffset",
+        ("mcap", "reader"): "RecordedMessage RecordedStream RecordingReader",
+        ("mcap", "recorder"): "Recorder",
+        ("mcap", "writer"): "RecordingWriter",
+        ("plot", "plot"): "MAX_STREAMS draw",
+    }
+    __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
 
 __all__ = [
-    "MAX_STREAMS",
-    "SUFFIXES",
-    "Flight",
-    "RecordedMessage",
-    "RecordedStream",
-    "Recorder",
-    "RecordingReader",
-    "RecordingWriter",
-    "UlogColumns",
-    "UlogTopic",
-    "UlogTopics",
-    "UtcOffset",
-    "addresses_of",
-    "align",
-    "convert",
-    "draw",
-    "format_of",
-    "matching",
-    "missing_of",
-    "read",
-    "read_ulog",
-    "utc_of",
-]
+    "MAX_STREAMS", "SUFFIXES", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader",
+    "RecordingWriter", "UlogColumns", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align",
+    "check_recording", "draw", "format_of", "matching", "missing_of", "read", "read_ulog", "utc_of",
+]  # fmt: skip

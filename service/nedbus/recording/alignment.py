@@ -32,7 +32,7 @@ _Floats = npt.NDArray[np.float64]
 _Ints = npt.NDArray[np.int64]
 
 
-class _How(TypedDict, total=False):
+class _AlignOptions(TypedDict, total=False):
     topics: Sequence[str] | None
     on: str | float | Sequence[int] | npt.NDArray[np.int64]
     method: Literal["last", "nearest", "linear"]
@@ -42,15 +42,15 @@ class _How(TypedDict, total=False):
 
 @overload
 def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: None = None, **how: Unpack[_How]
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: None = None, **options: Unpack[_AlignOptions]
 ) -> MessageArray: ...
 @overload
 def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Pandas, **how: Unpack[_How]
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Pandas, **options: Unpack[_AlignOptions]
 ) -> pd.DataFrame: ...
 @overload
 def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Polars, **how: Unpack[_How]
+    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Polars, **options: Unpack[_AlignOptions]
 ) -> pl.DataFrame: ...
 def align(
     flight: str | Path | Mapping[str, MessageArray],

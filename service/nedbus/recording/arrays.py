@@ -6,6 +6,7 @@ import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, overload
 
@@ -23,7 +24,6 @@ from nedbus_msgs import (
     TOPICS,
     Address,
     Definition,
-    Layout,
     Message,
     Selection,
     decode_with,
@@ -32,8 +32,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import MessageArray, arrays_of, to_array
 
-from .choice import matching, the_one
-from .formats import SUFFIXES
+from .flight_files import SUFFIXES, matching, the_one
 from .ulog import UlogTopics, read_ulog
 from .utc import TELLING, UtcOffset, tell_utc
 
@@ -41,11 +40,11 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from .reader import RecordedMessage, RecordedStream, RecordingReader
+    from .reader import RecordedMessage, RecordingReader
 
 _log = logging.getLogger(__name__)
 
-_CHUNK: Final = 8192  # messages of a recording that are converted together
+_CHUNK: Final = 65536  # messages of a recording that are decoded together
 _NULLABLE: Final = {  # of pandas; its floats are NaN
     "bool": "boolean",
     **{f"{sign}int{bits}": f"{sign.upper()}Int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
@@ -63,28 +62,30 @@ Polars = Literal["polars"]
 Library = Literal["pandas", "polars"] | None
 
 
-class _Which(TypedDict, total=False):
+class _StreamFilter(TypedDict, total=False):
     vehicle: str | int
     instance: int | None
 
 
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: None = None, **which: Unpack[_Which]) -> MessageArray: ...
+def read(
+    path: str | Path, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_StreamFilter]
+) -> MessageArray: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **which: Unpack[_Which]) -> pd.DataFrame: ...
+def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_StreamFilter]) -> pd.DataFrame: ...
 @overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **which: Unpack[_Which]) -> pl.DataFrame: ...
+def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_StreamFilter]) -> pl.DataFrame: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **stream: Unpack[_StreamFilter]
 ) -> dict[str, MessageArray]: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **stream: Unpack[_StreamFilter]
 ) -> dict[str, pd.DataFrame]: ...
 @overload
 def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **which: Unpack[_Which]
+    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **stream: Unpack[_StreamFilter]
 ) -> dict[str, pl.DataFrame]: ...
 def read(
     path: str | Path,
@@ -146,7 +147,7 @@ def read_streams(
 def utc_of(
     flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
 ) -> UtcOffset | None:
-    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and who tells it; None if nobody does.
+    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and its source; None without one.
 
     Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
     `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
@@ -229,7 +230,7 @@ class Flight:
 
     @property
     def damaged(self) -> bool:
-        """Whether damage cost messages of what was read so far."""
+        """True if damage cost messages of what was read so far."""
         return any(part is not None and part.damaged for part in (self._reader, self._log))
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
@@ -280,58 +281,50 @@ class Flight:
     def _read_mcap(
         self, reader: RecordingReader, addresses: Collection[Address]
     ) -> dict[Address, tuple[MessageArray, _Mask, Absent]]:
-        """Read the file once, for all of these."""
-        found = {address: _Columns(self.definitions[address]) for address in addresses}
-        for recorded in reader.messages(found.keys()):
-            found[recorded.stream.address].add(recorded)
-        return {address: columns.end() for address, columns in found.items()}
+        """Read the file once, for all of these, some thousand messages at a time."""
+        parts = {address: [_decode(self.definitions[address], [])] for address in addresses}
+        recorded = reader.messages(parts.keys())
+        while chunk := list(islice(recorded, _CHUNK)):
+            by_address: dict[Address, list[RecordedMessage]] = {}
+            for each in chunk:
+                by_address.setdefault(each.stream.address, []).append(each)
+            for address, own in by_address.items():
+                parts[address].append(_decode(self.definitions[address], own))
+        return {address: _join(self.definitions[address], own) for address, own in parts.items()}
 
 
-class _Columns:
-    """Messages of one address of a recording, converted some thousand at a time."""
-
-    def __init__(self, definition: Definition[Any]) -> None:
-        self._definition = definition
-        self._parts = [(arrays_of(definition).absent(0), np.empty(0, bool))]
-        self._waiting: list[RecordedMessage] = []
-        self._lacking: list[frozenset[str]] = []  # of each message
-        self._by_stream: dict[RecordedStream, frozenset[str]] = {}
-
-    def add(self, recorded: RecordedMessage) -> None:
-        self._waiting.append(recorded)
-        if len(self._waiting) == _CHUNK:
-            self._convert()
-
-    def end(self) -> tuple[MessageArray, _Mask, Absent]:
-        if self._waiting:
-            self._convert()
-        arrays, masks = zip(*self._parts, strict=True)
-        fields = frozenset[str]().union(*self._by_stream.values())
-        absent = {
-            name: np.array([name in each for each in self._lacking], bool)
-            for name in self._definition.types
-            if name in fields
-        }
-        return np.concatenate(arrays), np.concatenate(masks), absent
-
-    def _convert(self) -> None:
-        self._parts.append(_decode(self._definition, self._waiting))
-        for stream in {each.stream for each in self._waiting} - self._by_stream.keys():
-            self._by_stream[stream] = stream.lacking
-        self._lacking += [self._by_stream[each.stream] for each in self._waiting]
-        self._waiting = []
+def _join(
+    definition: Definition[Any], parts: Sequence[tuple[MessageArray, _Mask, Absent]]
+) -> tuple[MessageArray, _Mask, Absent]:
+    """Return the parts as one, with masks of the fields that some of them lack."""
+    lacking = {name for _, _, absent in parts for name in absent}
+    absent = {
+        name: np.concatenate([part.get(name, np.zeros(len(array), bool)) for array, _, part in parts])
+        for name in definition.types
+        if name in lacking
+    }
+    arrays, valid, _ = zip(*parts, strict=True)
+    return np.concatenate(arrays), np.concatenate(valid), absent
 
 
-def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask]:
-    """Return the messages, and a mask of those that are valid: all at once, and one by one what that cannot decide."""
+def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask, Absent]:
+    """Return messages, which of them are valid, and which lack a field.
+
+    They are decoded all at once, and one by one what that cannot decide.
+    """
     arrays = arrays_of(definition)
     array, valid = arrays.absent(len(chunk)), np.zeros(len(chunk), bool)
-    layouts: dict[Layout, list[int]] = {}
+    by_stream: dict[int, list[int]] = {}  # a stream is one object of its reader
     for index, recorded in enumerate(chunk):
-        layouts.setdefault(recorded.stream.layout, []).append(index)
-    for layout, rows in layouts.items():
-        if layout.types.items() <= definition.types.items():
-            array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], layout)
+        by_stream.setdefault(id(recorded.stream), []).append(index)
+    absent: dict[str, _Mask] = {}
+    for rows in by_stream.values():
+        stream = chunk[rows[0]].stream
+        if stream.layout.types.items() <= definition.types.items():
+            array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], stream.layout)
+        lacking = definition.all_fields - definition.plan(stream.layout.fields).provided | stream.missing
+        for name in lacking:
+            absent.setdefault(name, np.zeros(len(chunk), bool))[rows] = True
     decoded: dict[int, Message] = {}
     for index in np.flatnonzero(~valid).tolist():
         with suppress(DecodeError, ValidationError):
@@ -340,7 +333,7 @@ def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tu
     if decoded:
         array[list(decoded)] = arrays.of(list(decoded.values()))
         valid[list(decoded)] = True
-    return array, valid
+    return array, valid, absent
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library, utc: UtcOffset | None = None) -> Any:

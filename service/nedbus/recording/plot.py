@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -59,6 +59,19 @@ _COUNTERS: Final = {
 }  # fmt: skip
 
 
+class _Stream(NamedTuple):
+    """A stream that is drawn, with the times of its messages [s] since the first one of all, and its colour."""
+
+    address: Address
+    messages: MessageArray
+    seconds: Any
+    color: str
+
+    def resets(self, counter: str) -> Any:
+        """Return the times at which a reset counter changed [s]."""
+        return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
+
+
 @dataclass(frozen=True, slots=True)
 class _Row:
     """One row of the lower part: the intervals in which a flag is set, or the times of resets."""
@@ -71,7 +84,7 @@ class _Row:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """What happened to a vehicle, from begin to end [s]; something that happens once ends as it begins."""
+    """An event of a vehicle, from begin to end [s]; one that happens once ends as it begins."""
 
     vehicle: str
     row: str
@@ -106,10 +119,12 @@ def draw(
 def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = ()) -> Figure:
     """Return the plot that `draw` writes."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
-    rows = [
-        row for stream, color in zip(streams, _COLORS, strict=False) for row in _rows(stream, start, color, streams)
+    drawn = [
+        _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
+        for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
-    marks = _marks(streams, start, events)
+    rows = [row for stream in drawn for row in _rows(stream, f" {stream.address}" if len(drawn) > 1 else "")]
+    marks = _marks(drawn, start / 1e6, events)
     by_row = _by_row(marks)
     heights = [max(_FLAGS_HEIGHT, _ROW * len(rows)), _EVENTS_FRAME + _EVENT_ROW * len(by_row)][: 2 if by_row else 1]
     figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
@@ -117,103 +132,91 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
     mosaic: list[HashableList[str]] = [
         ["track", "altitude"], ["track", "speed"], ["flags", "flags"], ["events", "events"]
     ]  # fmt: skip
-    axes = figure.subplot_mosaic(
-        mosaic[: 2 + len(heights)],
-        height_ratios=[0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights],
-        width_ratios=[1, 1.2],
-    )
-    _draw_track(axes["track"], streams)
-    _draw_altitude(axes["altitude"], streams, start)
-    _draw_speed(axes["speed"], streams, start)
+    ratios = [0.6 * _HEIGHT, 0.4 * _HEIGHT, *heights]
+    axes = figure.subplot_mosaic(mosaic[: len(ratios)], height_ratios=ratios, width_ratios=[1, 1.2])
+    _draw_track(axes["track"], drawn)
+    _draw_altitude(axes["altitude"], drawn)
+    _draw_speed(axes["speed"], drawn)
     _draw_rows(axes["flags"], rows)
-    _mark_events(axes, streams, start, marks)
+    _mark_events(axes, drawn, marks)
     for name in ("track", "altitude", "speed"):
         axes[name].grid(alpha=0.3)
     axes["track"].legend(fontsize="small", loc="best")
-    times = np.concatenate([_seconds(messages, start) for _, messages in streams])
-    low, high = min([times.min(), *(mark.begin for mark in marks)]), max([times.max(), *(mark.end for mark in marks)])
+    low = min(*(stream.seconds.min() for stream in drawn), *(mark.begin for mark in marks), math.inf)
+    high = max(*(stream.seconds.max() for stream in drawn), *(mark.end for mark in marks), -math.inf)
     margin = 0.02 * (high - low or 1.0)
     for name in axes.keys() - {"track"}:
         axes[name].set_xlim(low - margin, high + 3 * margin)  # with room for the text of what happened last
     figure.suptitle(_legible(title), parse_math=False)
-    figure.supxlabel(_explain_missing(streams), fontsize="small")
+    figure.supxlabel(_explain_missing(drawn), fontsize="small")
     axes["events" if by_row else "flags"].set_xlabel("time [s]")
     if by_row:
         _draw_events(figure, axes["events"], by_row)
     return figure
 
 
-def _seconds(messages: MessageArray, start: int) -> Any:
-    return (messages["timestamp"].astype(np.int64) - start) / 1e6
-
-
-def _draw_track(axes: Any, streams: Sequence[tuple[Address, MessageArray]]) -> None:
+def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
     """Draw the tracks, each with a circle at its start and a square at its end."""
-    _draw_lines(axes, [(messages["y"], messages["x"], messages["xy_valid"]) for _, messages in streams], width=1.2)
-    for (address, messages), color, line in zip(streams, _COLORS, axes.lines[-len(streams) :], strict=False):
-        line.set_label(str(address))
-        valid = np.flatnonzero(messages["xy_valid"] & np.isfinite(messages["x"]))
-        east, north = messages["y"][valid], messages["x"][valid]
-        if len(valid):
-            axes.plot(east[0], north[0], "o", color=color, markersize=7, fillstyle="none")
-            axes.plot(east[-1], north[-1], "s", color=color, markersize=4)
+    _draw_lines(axes, streams, "xy_valid", lambda each: (each.messages["y"], each.messages["x"]), width=1.2)
+    for stream, line in zip(streams, axes.lines[-len(streams) :], strict=True):
+        line.set_label(str(stream.address))
+        track = stream.messages[stream.messages["xy_valid"] & np.isfinite(stream.messages["x"])]
+        if len(track):
+            axes.plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
+            axes.plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
     axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
     axes.locator_params(axis="x", nbins=6)  # more labels than these may touch each other
-    ends = "circle: start, square: end, " if any(messages["xy_valid"].any() for _, messages in streams) else ""
+    ends = "circle: start, square: end, " if any(stream.messages["xy_valid"].any() for stream in streams) else ""
     axes.set_title(f"track; {ends}{_thin('xy_valid', streams)}")
 
 
-def _draw_altitude(axes: Any, streams: Sequence[tuple[Address, MessageArray]], start: int) -> None:
-    lines = [(_seconds(messages, start), -messages["z"], messages["z_valid"]) for _, messages in streams]
-    _draw_lines(axes, lines, width=1.0)
-    for (_, messages), (seconds, _, _), color in zip(streams, lines, _COLORS, strict=False):
-        for time in np.unique(np.concatenate([seconds[1:][_is_reset(messages, each)] for each in _HEIGHT_COUNTERS])):
-            axes.axvline(time, color=color, linewidth=0.5, alpha=0.4, linestyle="--")
-    axes.set(
-        ylabel="altitude above origin, -z [m]",
-        title=f"altitude; {_thin('z_valid', streams)}, dashed: a reset of z or vz",
-    )
+def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
+    _draw_lines(axes, streams, "z_valid", lambda each: (each.seconds, -each.messages["z"]), width=1.0)
+    for stream in streams:
+        for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
+            axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
+    title = f"altitude; {_thin('z_valid', streams)}, dashed: a reset of z or vz"
+    axes.set(ylabel="altitude above origin, -z [m]", title=title)
 
 
-def _draw_speed(axes: Any, streams: Sequence[tuple[Address, MessageArray]], start: int) -> None:
-    lines = [
-        (_seconds(messages, start), np.hypot(messages["vx"], messages["vy"]), messages["v_xy_valid"])
-        for _, messages in streams
-    ]
-    _draw_lines(axes, lines, width=0.9)
+def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
+    def line_of(stream: _Stream) -> tuple[Any, Any]:
+        return stream.seconds, np.hypot(stream.messages["vx"], stream.messages["vy"])
+
+    _draw_lines(axes, streams, "v_xy_valid", line_of, width=0.9)
     axes.set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title=f"speed; {_thin('v_xy_valid', streams)}")
 
 
-def _thin(flag: str, streams: Sequence[tuple[Address, MessageArray]]) -> str:
-    is_set = any(messages[flag].any() for _, messages in streams)
+def _thin(flag: str, streams: Sequence[_Stream]) -> str:
+    is_set = any(stream.messages[flag].any() for stream in streams)
     return f"thin: {flag.removesuffix('_valid')} invalid" if is_set else f"thin: {flag} is never set"
 
 
-def _draw_lines(axes: Any, lines: Sequence[tuple[Any, Any, Any]], *, width: float) -> None:
-    """Draw lines, each of x, y and where they are valid: thin elsewhere, and out of the scale if any is valid."""
-    in_scale = not any(np.any(valid & np.isfinite(y)) for _, y, valid in lines)
-    for (x, y, _), color in zip(lines, _COLORS, strict=False):
-        thin = Line2D(x, y, color=color, linewidth=0.5, alpha=0.6)
+def _draw_lines(
+    axes: Any, streams: Sequence[_Stream], flag: str, line_of: Callable[[_Stream], tuple[Any, Any]], *, width: float
+) -> None:
+    """Draw a line of each stream: thin where its flag is not set, and out of the scale there if any is valid."""
+    lines = [(stream, *line_of(stream)) for stream in streams]
+    in_scale = not any(np.any(stream.messages[flag] & np.isfinite(y)) for stream, _, y in lines)
+    for stream, x, y in lines:
+        thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6)
         (axes.add_line if in_scale else axes.add_artist)(thin)  # an artist does not take part in the limits
-    for (x, y, valid), color in zip(lines, _COLORS, strict=False):
-        axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=color, linewidth=width)
+    for stream, x, y in lines:
+        valid = stream.messages[flag]
+        axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=stream.color, linewidth=width)
 
 
-def _rows(
-    stream: tuple[Address, MessageArray], start: int, color: str, streams: Sequence[tuple[Address, MessageArray]]
-) -> Iterator[_Row]:
+def _rows(stream: _Stream, suffix: str) -> Iterator[_Row]:
     """Yield a row for each flag of a stream, for each kind of reset that occurred, and for resets of heading."""
-    address, messages = stream
-    seconds, missing = _seconds(messages, start), missing_of(messages)
-    suffix = f" {address}" if len(streams) > 1 else ""
+    missing = missing_of(stream.messages)
     for flag in _FLAGS:
         if flag.name not in missing:
-            shown = _WARNING_COLOR if flag.inverted else color
-            yield _Row(flag.name + suffix, shown, _intervals(seconds, messages[flag.name]), ())
+            shown = _WARNING_COLOR if flag.inverted else stream.color
+            yield _Row(flag.name + suffix, shown, _intervals(stream.seconds, stream.messages[flag.name]), ())
     for counter, name in _COUNTERS.items():
-        times = seconds[1:][_is_reset(messages, counter)]
+        times = stream.resets(counter)
         if counter not in missing and (name == "heading" or len(times)):
-            yield _Row(f"{name} resets{suffix}", color, (), times)
+            yield _Row(f"{name} resets{suffix}", stream.color, (), times)
 
 
 def _draw_rows(axes: Any, rows: Sequence[_Row]) -> None:
@@ -225,23 +228,23 @@ def _draw_rows(axes: Any, rows: Sequence[_Row]) -> None:
     axes.grid(axis="x", alpha=0.3)
 
 
-def _marks(streams: Sequence[tuple[Address, MessageArray]], start: int, events: Iterable[Event]) -> list[_Mark]:
+def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> list[_Mark]:
     """Return what is marked of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
     told = [event for event in events if event.boot is not None]
     marks: list[_Mark] = []
-    for vehicle in sorted({address.vehicle for address, _ in streams}):
-        seconds = np.concatenate([_seconds(each, start) for address, each in streams if address.vehicle == vehicle])
+    for vehicle in sorted({stream.address.vehicle for stream in streams}):
+        seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
         first, last = float(seconds.min()), float(seconds.max())
         found: dict[Event, _Mark] = {}
         for span in spans_of([event for event in told if event.vehicle == vehicle]):
             event = span.begin
             if event is None or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
                 continue
-            offset = event.boot - start / 1e6 - event.time
+            offset = event.boot - start - event.time
             begin = span.since + offset
             end = last if span.until is None else begin
             if span.end is not None and span.end.boot is not None:
-                end = span.end.numbers.get("before", span.end.boot) - start / 1e6  # before a reboot that ends it
+                end = span.end.numbers.get("before", span.end.boot) - start  # before a reboot that ends it
             known = found.get(event)
             if max(first - begin, begin - last) <= last - first + _NEAR:
                 row = _QUIET.get(event.kind, event.kind.replace("_", " "))
@@ -265,11 +268,10 @@ def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
     return {label: rows[label] for label in sorted(rows, key=rank)}
 
 
-def _mark_events(
-    axes: Mapping[str, Any], streams: Sequence[tuple[Address, MessageArray]], start: int, marks: Iterable[_Mark]
-) -> None:
+def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
     """Mark what is bad or to be watched where it began: on the track, and on the time axes of altitude and speed."""
-    main = {address.vehicle: each for address, each in sorted(streams, key=lambda each: each[0].topic == DEFAULT_TOPIC)}
+    by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
+    main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
         marker, color, size = _MARKERS[severity]
         own = [mark for mark in marks if mark.severity == severity]
@@ -278,13 +280,13 @@ def _mark_events(
         style: dict[str, Any] = {"marker": marker, "color": color, "fillstyle": "none", "linestyle": "none"}
         places = []
         for mark in own:
-            messages = main[mark.vehicle]
-            away = np.abs(_seconds(messages, start) - mark.begin)
-            if away.min() <= _NEAR:
-                places.append((messages["y"][away.argmin()], messages["x"][away.argmin()]))
+            stream = main[mark.vehicle]
+            nearest = np.abs(stream.seconds - mark.begin).argmin()
+            if abs(stream.seconds[nearest] - mark.begin) <= _NEAR:
+                places.append((stream.messages["y"][nearest], stream.messages["x"][nearest]))
         if places:
-            east, north = zip(*places, strict=True)
-            found = Line2D(east, north, label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3, **style)
+            found = Line2D(*zip(*places, strict=True), label=label, markersize=size + 1, markeredgewidth=1.5, zorder=3)
+            found.set(**style)
             axes["track"].add_artist(found)
         for name in ("altitude", "speed"):
             bottom = axes[name].get_xaxis_transform()
@@ -310,35 +312,23 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
 
 
 def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
-    """Write the text of each mark beside it, right or left, shortened or not at all: nothing lies on anything else."""
+    """Write the text of each mark beside it, shortened to the room before the next one, or not at all."""
     point = _DPI / 72
-    left, right = (float(edge) / point for edge in axes.get_window_extent().intervalx)
     places = [float(axes.transData.transform((mark.begin, number))[0]) / point for mark in marks]
-    taken = left
-    for index, (mark, place) in enumerate(zip(marks, places, strict=True)):
-        until = places[index + 1] - _GAP if index + 1 < len(marks) else right
+    edge = float(axes.get_window_extent().x1) / point + _GAP
+    for mark, place, after in zip(marks, places, [*places[1:], edge], strict=True):
+        shown, room = _legible(mark.text), after - place - 2 * _GAP
         text = axes.annotate(
-            _legible(mark.text), (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
+            shown, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
             fontsize="x-small", parse_math=False,
         )  # fmt: skip
         text.set_in_layout(False)
-        width = _width(text)
-        room = until - place - _GAP
-        if width <= room:
-            taken = place + _GAP + width
-        elif width <= place - _GAP - taken:
-            text.set(x=-_GAP, ha="right")
-            taken = place + _GAP
-        elif room >= _SHORTEST:
-            shown = _legible(mark.text)
-            while _width(text) > room:
-                shown = shown[: min(len(shown) - 1, int(len(shown) * room / width))]
-                text.set_text(shown.rstrip(" ,") + "\N{HORIZONTAL ELLIPSIS}")
-                width = _width(text)
-            taken = until
-        else:
+        if _width(text) > room and room < _SHORTEST:
             text.remove()
-            taken = place + _GAP
+            continue
+        while (width := _width(text)) > room:
+            shown = shown[: min(len(shown) - 1, int(len(shown) * room / width))]
+            text.set_text(shown.rstrip(" ,") + "\N{HORIZONTAL ELLIPSIS}")
 
 
 def _width(text: Any) -> float:
@@ -346,15 +336,11 @@ def _width(text: Any) -> float:
     return 1.05 * float(text.get_window_extent().width) * 72 / _DPI
 
 
-def _explain_missing(streams: Sequence[tuple[Address, MessageArray]]) -> str:
-    """Return which of the rows are not drawn, as the flight does not have them."""
+def _explain_missing(streams: Sequence[_Stream]) -> str:
+    """Return the rows that are not drawn, as the flight does not have them."""
     drawn = [flag.name for flag in _FLAGS] + list(_COUNTERS)
-    lines = []
-    for address, messages in streams:
-        names = [name for name in drawn if name in missing_of(messages)]
-        if names:
-            lines.append(f"{address} does not have {', '.join(names)}")
-    return "\n".join(lines)
+    missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
+    return "\n".join(f"{address} does not have {', '.join(names)}" for address, names in missing.items() if names)
 
 
 def _legible(text: str) -> str:
@@ -362,10 +348,6 @@ def _legible(text: str) -> str:
     font = get_font(findfont(FontProperties()))
     shown = "".join(character if font.get_char_index(ord(character)) else "?" for character in text)
     return shown if shown == text else f"{shown} (?: a character that this font lacks)"
-
-
-def _is_reset(messages: MessageArray, counter: str) -> Any:
-    return np.diff(messages[counter].astype(np.int16)) != 0
 
 
 def _intervals(seconds: Any, flag: Any) -> list[tuple[float, float]]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from mcap.records import Channel, Message, Schema
@@ -13,8 +13,7 @@ from mcap.records import Channel, Message, Schema
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
 
-from .chunks import ChunkFile
-from .records import READ_ERRORS, records_of
+from .chunks import READ_ERRORS, ChunkFile, records_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +24,6 @@ class RecordedStream:
     definition: Definition[Any]
     layout: Layout
     missing: frozenset[str]
-
-    @property
-    def lacking(self) -> frozenset[str]:
-        """The fields of a message that its source or its layout lacks."""
-        return self.definition.all_fields - self.definition.plan(self.layout.fields).provided | self.missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +39,7 @@ class RecordedMessage:
 class RecordingReader:
     """An MCAP file that is open for reading; a context manager. Messages are read one chunk at a time.
 
-    `vehicle` is that of channels that name none.
+    `vehicle` is that of channels that name none; `counts` has the number of messages of each stream.
     What is damaged is left out; `warnings` say so, and are complete when `messages` or `check` has ended.
 
     Raises SourceError for a file that is not MCAP or cannot be opened.
@@ -55,6 +49,8 @@ class RecordingReader:
         self.path = Path(path).expanduser()
         self._vehicle = vehicle
         self._file = ChunkFile(self.path)
+        self.close = self._file.close
+        self.warnings = self._file.warnings
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
@@ -67,26 +63,16 @@ class RecordingReader:
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
         try:
             if self._all_known:
-                self._counts = self._sum((self._streams[number], total) for number, total in totals.items())
+                self.counts = _sum((self._streams[number], total) for number, total in totals.items())
             else:
-                self._counts = self._count()
+                self.counts = self._count()
         except SourceError:
             self.close()
             raise
 
     @property
-    def counts(self) -> dict[RecordedStream, int]:
-        """The number of messages of each stream."""
-        return self._counts
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is damaged or left out."""
-        return self._file.warnings
-
-    @property
     def damaged(self) -> bool:
-        """Whether damage cost messages."""
+        """True if damage cost messages."""
         return self._file.damaged
 
     def check(self) -> None:
@@ -94,7 +80,7 @@ class RecordingReader:
         for _ in self._file.parts(self._channels()):
             pass
         if self.damaged:
-            self._counts = self._count()
+            self.counts = self._count()
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
         """Yield all messages, or those of some addresses, in the order of the file."""
@@ -115,16 +101,10 @@ class RecordingReader:
                 if stream is not None and (only is None or stream.address in only):
                     yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
@@ -139,16 +119,9 @@ class RecordingReader:
 
     def _count(self) -> dict[RecordedStream, int]:
         """Count the messages that can be read."""
-        counts = self._sum((recorded.stream, 1) for recorded in self.messages())
+        counts = _sum((recorded.stream, 1) for recorded in self.messages())
         if not counts and self.damaged:
             raise SourceError(str(self.path), f"no message can be read: {'; '.join(self.warnings[:3])}")
-        return counts
-
-    def _sum(self, parts: Iterable[tuple[RecordedStream | None, int]]) -> dict[RecordedStream, int]:
-        counts: dict[RecordedStream, int] = {}
-        for stream, count in parts:
-            if stream is not None:
-                counts[stream] = counts.get(stream, 0) + count
         return counts
 
     def _add(self, channel: Channel) -> None:
@@ -198,3 +171,12 @@ class RecordingReader:
             return Address(metadata["vehicle"], metadata["topic"], None if instance is None else int(instance))
         namespace, topic, instance_number = split_ros2_topic(channel.topic)
         return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
+
+
+def _sum(parts: Iterable[tuple[RecordedStream | None, int]]) -> dict[RecordedStream, int]:
+    """Return the number of messages by stream, without what is left out."""
+    counts = Counter[RecordedStream]()
+    for stream, count in parts:
+        if stream is not None:
+            counts[stream] += count
+    return dict(counts)

@@ -11,7 +11,7 @@ from typing import Final
 from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
 
-from .formats import check_recording
+from .flight_files import check_recording
 from .writer import RecordingWriter
 
 _FLUSH_INTERVAL: Final = 1.0  # s: what a power cut costs at most
@@ -36,7 +36,7 @@ class Recorder:
 
     @property
     def status(self) -> str:
-        """What was recorded so far, in one line."""
+        """The counts so far, in one line."""
         counts = self._subscription.counts
         names = ("lost", "dropped", "invalid", "discarded")
         trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,15 +19,15 @@ from pyulog import ULogException
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BASES, BY_TOPIC, TOPICS, Address, Definition, FieldType, define, field_type
 
-from .formats import open_flight
+from .flight_files import open_flight
 
 _MESSAGE_HEADER: Final = 3  # bytes
 _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
-_READ_COST: Final = 4096  # of any read, in bytes, however short it is
+_MIN_READ_COST: Final = 4096  # bytes of the budget that any read costs
 _BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside what its size makes plausible
-_MOST_FIELDS: Final = 1000  # that are read of a format; a message has fewer
-_NESTED: Final = 3  # levels of messages within messages; PX4 has one
+_MAX_FIELDS: Final = 1000  # that are read of a format; a message has fewer
+_MAX_NESTING: Final = 3  # levels of messages within messages; PX4 has one
 _INDEX = re.compile(r"\[(\d+)\]")
 _OLDEST: Final = 0x010D  # PX4 1.13, whose layouts are the oldest known
 _FLOATS: Final = {"float": "float32", "double": "float64"}  # of C, as a log has them; its integers end with _t
@@ -45,11 +44,6 @@ class UlogTopic:
     address: Address
     definition: Definition[Any]
     columns: UlogColumns
-
-    @property
-    def is_described(self) -> bool:
-        """Whether only the log says what its message is."""
-        return self.address.topic not in BY_TOPIC
 
 
 @dataclass(slots=True)
@@ -128,7 +122,7 @@ def _equal(one: UlogColumns, other: UlogColumns) -> bool:
 def _describe(log: Any, topic: str) -> Definition[Any]:
     """Return what the formats of a log say of a message; those within it are made fields; ValueError if that fails."""
     name = "".join(part.capitalize() for part in topic.split("_"))
-    return _define(name, tuple(islice(_fields(log.message_formats, topic), _MOST_FIELDS)))
+    return _define(name, tuple(islice(_fields(log.message_formats, topic), _MAX_FIELDS)))
 
 
 @lru_cache(1024)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
@@ -143,14 +137,14 @@ def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int 
         if kind not in formats or not formats[kind].fields:
             base = _FLOATS.get(kind, kind.removesuffix("_t"))
             yield f"{prefix}{field}", field_type(f"{base}[{length}]" if length > 0 else base)
-        elif level < _NESTED:
+        elif level < _MAX_NESTING:
             for index in range(length) if length > 0 else [None]:
                 inner = f"{prefix}{field}_" if index is None else f"{prefix}{field}_{index}_"
                 yield from _fields(formats, kind, inner, level + 1)
 
 
 class _BoundedFile:
-    """A file of which only so much can be read, as pyulog can loop in a damaged one; `cut` if it ends too early."""
+    """A file with a budget of bytes to read, as pyulog can loop in a damaged one; `cut` if it ends too early."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self.cut = False
@@ -162,7 +156,7 @@ class _BoundedFile:
 
     def read(self, size: int = -1) -> bytes:
         data = self._file.read(size)
-        self._budget -= _READ_COST + len(data)
+        self._budget -= _MIN_READ_COST + len(data)
         # Only the read of a message's header may find the end of the file.
         if len(data) < size and (data or size != _MESSAGE_HEADER):
             self.cut = True
@@ -171,47 +165,30 @@ class _BoundedFile:
         return data
 
 
-class _Printed(threading.local):
-    """What pyulog printed in this thread: it prints its warnings, and a library must leave stdout alone."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-
-_printed = _Printed()
-
-
-def _capture(*values: object) -> None:
-    _printed.lines.append(" ".join(map(str, values)))
-
-
-def _load_pyulog() -> ModuleType:
-    """Return a copy of pyulog that only this module uses: with a `print` of its own."""
+def _load_pyulog(printed: list[str]) -> ModuleType:
+    """Return a copy of pyulog that adds its warnings to `printed`: a library must leave stdout alone."""
     spec = find_spec("pyulog.core")
     if spec is None or spec.loader is None:
         raise ModuleNotFoundError(name="pyulog")
     module = module_from_spec(spec)
-    vars(module)["print"] = _capture
+    vars(module)["print"] = lambda *values: printed.append(" ".join(map(str, values)))
     spec.loader.exec_module(module)
     return module
 
 
-_pyulog = _load_pyulog()
-
-
 def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
-    """Return pyulog's ULog, and what is damaged."""
-    _printed.lines = []
+    """Return pyulog's ULog, and a list of damages."""
+    printed: list[str] = []
     try:
         with open_flight(path) as file:
             bounded = _BoundedFile(file, path.stat().st_size)
-            log = _pyulog.ULog(bounded, None if topics is None else list(topics))
+            log = _load_pyulog(printed).ULog(bounded, None if topics is None else list(topics))
         end = None if log.has_data_appended else _find_damage(path)
     except OSError as exc:
         raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
     except _READ_ERRORS as exc:
         raise SourceError(str(path), f"not a readable ULog file ({exc})") from exc
-    damage = [f"damaged: {line}" for line in _printed.lines[:5]]
+    damage = [f"damaged: {line}" for line in printed[:5]]
     if log.file_corruption and not damage:
         damage.append("damaged: parts of it were skipped")
     elif bounded.cut:

@@ -1,4 +1,4 @@
-"""UTC of a flight: what its own messages say of it, by whom; absent where none says it."""
+"""UTC of a flight, as its own messages tell it."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock t
 
 @dataclass(frozen=True, slots=True)
 class UtcOffset:
-    """Unix time minus the vehicle's `timestamp` [us], and who says so.
+    """Unix time minus the vehicle's `timestamp` [us], and its source.
 
-    `source`: the stream that says it. With timesync_status it is the clock of a companion, as good as that one is.
+    `source`: the stream that tells it. With timesync_status it is the clock of a companion, as good as that one is.
     `offset_us`: the median of its messages. A GNSS fix is some tenths of a second older than its message.
     `count`: the messages that agree to a second; `spread_us`: from the least to the greatest of these.
     """

@@ -11,25 +11,25 @@ import os
 import struct
 from collections.abc import Iterable, Iterator
 from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Final, Self, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from nedbus.errors import OutputError
-from nedbus_msgs import Address, Definition, Layout, Provenance, definition_text, ros2_type
+from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 _CHUNK: Final = 2**23  # bytes; a flush every second makes smaller ones
-_MAX_PENDING: Final = 2**24  # bytes that wait for a flush
+_MAX_PENDING_BYTES: Final = 2**24  # that wait for a flush
+_MAX_TIME: Final = 2**64 - 1  # ns: a damaged log may have any timestamp
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
 )
 
-Encoded = tuple[int, int, bytes, int, int]
-"""A message in a file: when it was recorded [ns], its channel, payload, when it was published [ns], its number."""
+_Encoded = tuple[int, int, bytes, int, int]  # time of recording [ns], channel, payload, time of publication, number
 
 
 class RecordingWriter:
@@ -73,35 +73,44 @@ class RecordingWriter:
         sequence: Iterable[int] = repeat(0),
     ) -> None:
         """Write messages of one kind, each with its address and provenance, when it was recorded and published [ns]."""
-        self.add(self.encode(messages, definition, streams, logged=logged, published=published, sequence=sequence))
+        self._add(self._encode(messages, definition, streams, zip(logged, published, sequence, strict=False)))
 
-    def encode(
+    def write_messages(self, messages: Iterable[tuple[Message, Address, Provenance, int]]) -> None:
+        """Write messages of any kinds, each with address, provenance and when it was recorded [ns], in that order.
+
+        A message was published at its own timestamp.
+        """
+        by_kind: dict[Definition[Any], list[tuple[Message, Address, Provenance, int]]] = {}
+        for each in messages:
+            by_kind.setdefault(each[0].DEFINITION, []).append(each)
+        encoded: list[_Encoded] = []
+        for definition, own in by_kind.items():
+            array = arrays_of(definition).of([message for message, *_ in own])
+            streams = ((address, provenance) for _, address, provenance, _ in own)
+            times = ((logged, min(message.timestamp * 1000, _MAX_TIME), 0) for message, *_, logged in own)
+            encoded += self._encode(array, definition, streams, times)
+        self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file from begin to end
+
+    def _encode(
         self,
         messages: MessageArray,
         definition: Definition[Any],
         streams: Iterable[tuple[Address, Provenance]],
-        *,
-        logged: Iterable[int],
-        published: Iterable[int],
-        sequence: Iterable[int] = repeat(0),
-    ) -> Iterator[Encoded]:
-        """Yield messages of one kind as `add` takes them: those of several kinds can be sorted by their time."""
+        times: Iterable[tuple[int, int, int]],
+    ) -> Iterator[_Encoded]:
         encoded: dict[Layout, tuple[int, bytes]] = {}  # size of a payload, and all payloads
-        for index, stream, log_time, time, number in zip(
-            range(len(messages)), streams, logged, published, sequence, strict=False
-        ):
+        for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
             channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
             if layout not in encoded:
                 payloads = arrays_of(definition).encode_cdr(messages, layout)
                 encoded[layout] = payloads.itemsize, payloads.tobytes()
             size, data = encoded[layout]
-            yield log_time, channel, data[index * size : (index + 1) * size], time, max(0, number) % 2**32
+            yield logged, channel, data[index * size : (index + 1) * size], published, max(0, number) % 2**32
 
-    def add(self, encoded: Iterable[Encoded]) -> None:
-        """Write encoded messages, in this order."""
+    def _add(self, encoded: Iterable[_Encoded]) -> None:
         try:
-            for log_time, channel, data, time, number in encoded:
-                self._writer.add_message(channel, log_time, data, time, number)
+            for logged, channel, data, published, number in encoded:
+                self._writer.add_message(channel, logged, data, published, number)
                 self.messages += 1
         except OSError as exc:
             raise OutputError(self.path, exc) from exc
@@ -129,10 +138,8 @@ class RecordingWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if isinstance(error, OutputError):
+    def __exit__(self, *exc: object) -> None:
+        if isinstance(exc[1], OutputError):
             self._file.close()  # finishing it would fail again
         else:
             self.close()
@@ -154,8 +161,7 @@ class RecordingWriter:
             metadata["source"] = provenance.source
         if provenance.missing:
             metadata["missing"] = " ".join(sorted(provenance.missing))
-        topic = f"/{address}"
-        channel = self._writer.register_channel(topic, "cdr", schema, metadata)
+        channel = self._writer.register_channel(f"/{address}", "cdr", schema, metadata)
         self._channels[address, provenance] = channel, layout
         return channel, layout
 
@@ -172,7 +178,7 @@ class _AppendFile:
 
     def write(self, data: bytes) -> int:
         self._pending += data
-        if len(self._pending) > _MAX_PENDING:
+        if len(self._pending) > _MAX_PENDING_BYTES:
             self.sync()
         return len(data)
 

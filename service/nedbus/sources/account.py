@@ -1,4 +1,4 @@
-"""What happened in a file: the events of all its vehicles, as the messages of a replay tell them."""
+"""The events of all vehicles of a file, as the messages of its replay tell them."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from .spec import parse_source, source_text_of_file
 KEPT_OF_FILE: Final = 100_000
 """Events that are kept of a file, the last ones."""
 
-_LOOK: Final = 0.5  # s of the flight between two looks for what is silent, or has settled
-_END: Final = 10.0  # s after the last message at which what had not settled is told
+_CHECK_INTERVAL: Final = 0.5  # s of the flight between two checks for silent streams, and for events that settled
+_SETTLE_TIME: Final = 10.0  # s after the last message at which events that had not settled are told
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,7 @@ class FileAccount:
 
 
 def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
-    """Return what happened in a .ulg or .mcap file; `vehicle` is that of a log of one vehicle.
+    """Return the events of a .ulg or .mcap file; `vehicle` is that of a log of one vehicle.
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -59,20 +59,18 @@ def follow(
     looked = due = 0.0
     for message in messages:
         due = message.due
-        while due - looked >= _LOOK:
-            looked += _LOOK
+        while due - looked >= _CHECK_INTERVAL:
+            looked += _CHECK_INTERVAL
             account.look(looked)
         yield message, *_add(account, message)
     account.look(due)
-    account.settle(due + _END)
+    account.settle(due + _SETTLE_TIME)
 
 
 def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | None]:
-    definition = message.definition or BY_TOPIC.get(message.address.topic)
     reason = message.error
-    if reason is None and definition is None:
-        return None, None
-    if reason is None and definition is not None:
+    if reason is None:
+        definition = message.definition or BY_TOPIC[message.address.topic]
         try:
             fields = upgrade_fields(definition, message.fields)
             payload = codec_of(definition).encode_fields(fields)
@@ -81,5 +79,5 @@ def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | 
         else:
             account.add(message.address, fields, message.due)
             return None, payload
-    account.reject(message.address, reason or "", message.due)
+    account.reject(message.address, reason, message.due)
     return reason, None

@@ -22,14 +22,10 @@ class McapSource:
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path = path
-        self._vehicle = options.vehicle
         self._default_vehicle = context.vehicle
-        self._topics = options.chosen_topics
-        self._absent_from = options.absent_from
-        self.finite = not options.loop
-        self.loop = options.loop
-        self.speed = None if options.speed == "max" else options.speed
-        self.wait = options.wait
+        self._options, self._vehicle, self._topics = options, options.vehicle, options.chosen_topics
+        self.finite, self.loop = not options.loop, options.loop
+        self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
         """Check the file; raise SourceError when it is not an MCAP file, or has none of the topics."""
@@ -49,7 +45,10 @@ class McapSource:
             addresses=tuple(sorted({self._rename(address) for address in addresses})),
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
-            warnings=(*reader.warnings, *self._absent_from({each.topic for each in addresses}, "this recording")),
+            warnings=(
+                *reader.warnings,
+                *self._options.absent_from({each.topic for each in addresses}, "this recording"),
+            ),
             definitions={
                 stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
             },

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Set
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -63,7 +63,7 @@ Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
 
 class Options(BaseModel):
-    """What the options of all kinds have in common."""
+    """Options of every kind."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -88,9 +88,9 @@ class ReplayOptions(Options):
     """Options of every replay."""
 
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
-    speed: Annotated[float, Field(ge=0.001, le=1000)] | Literal["max"] = Field(
-        1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive it"
-    )
+    speed: Annotated[
+        Annotated[float, Field(ge=0.001, le=1000)] | None, BeforeValidator(lambda text: None if text == "max" else text)
+    ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive it")
     wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
 
 

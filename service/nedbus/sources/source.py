@@ -36,7 +36,7 @@ class Rejection:
     """Input that a live source could not turn into a message.
 
     `where`: the key, the link or the address that it came from; the log names each one once.
-    `count`: for how many messages it stands.
+    `count`: the number of messages that it stands for.
     """
 
     where: str
@@ -73,14 +73,14 @@ class ReplayRun:
     addresses: tuple[Address, ...]
     total: int | None
     summary: str
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
     damage: str | None = None
     definitions: Mapping[str, Definition[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class SourceContext:
-    """What a source may need of the service that runs it.
+    """Settings of the service that runs a source.
 
     `vehicle`: the default for a source that has no vehicle name of its own.
     `routers`: endpoints of the service's router, and `tls` to connect to them.
@@ -92,27 +92,16 @@ class SourceContext:
 
 
 class ReplaySource(Protocol):
-    """A source that can be replayed, once or repeatedly."""
+    """A source that can be replayed, once or repeatedly.
 
-    @property
-    def finite(self) -> bool:
-        """Whether it ends by itself."""
-        ...
+    `finite`: it ends by itself; `loop`: it starts again at its end; `wait`: it starts when there is a subscriber.
+    `speed`: the factor of real time; None for as fast as readers receive it, without loss.
+    """
 
-    @property
-    def loop(self) -> bool:
-        """Whether it starts again at its end."""
-        ...
-
-    @property
-    def speed(self) -> float | None:
-        """The factor of real time; None for as fast as readers receive it, without loss."""
-        ...
-
-    @property
-    def wait(self) -> bool:
-        """Whether to start only when there is a subscriber."""
-        ...
+    finite: bool
+    loop: bool
+    wait: bool
+    speed: float | None
 
     def open(self) -> ReplayRun:
         """Open it for one run; raise SourceError when it cannot be opened or has no messages."""

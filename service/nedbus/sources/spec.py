@@ -40,11 +40,11 @@ class SourceKind:
 
 
 SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
-    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator", "SimulatorSource"),
+    "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "SimulatorSource"),
     "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
     "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "McapSource", "mcap"),
-    "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4_zenoh", "Px4ZenohSource"),
-    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink", "MavlinkSource", "mavlink"),
+    "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
+    "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
 """The one table of sources."""
 
@@ -64,9 +64,10 @@ class SourceSpec:
         Raises ConfigError for an invalid target, for a file that cannot be read twice, and when the extra of this kind
         is not installed.
         """
-        kind = SOURCE_KINDS[self.kind]
-        if kind.target == "FILE":
-            _check_file(self.text, Path(self.target).expanduser())
+        kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
+        # The reader of a pipe, a socket or a device would wait for ever, or find nothing again.
+        if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
+            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one, then give that")
         make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.class_name))
         return make(self.target, self.options, SourceContext(vehicle, routers, tls))
 
@@ -79,12 +80,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
     Raises ConfigError for an unknown kind, a missing target, or an unknown or invalid option.
     """
-    if isinstance(source, str):
-        return _parse_text(source)
-    return _parse_text(_text_of_table(source))
-
-
-def _parse_text(text: str) -> SourceSpec:
+    text = source if isinstance(source, str) else _text_of_table(source)
     kind_name, _, rest = text.partition(":")
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
@@ -117,15 +113,8 @@ def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
 
     Raises ConfigError for a file suffix that belongs to no kind.
     """
-    text = f"{format_of(path)}:{escape_path(str(path))}"
-    given = {name: value for name, value in options.items() if value}
-    return f"{text}?{urlencode(given)}" if given else text
-
-
-def _check_file(text: str, path: Path) -> None:
-    """Raise ConfigError for a pipe, a socket or a device: its reader would wait for ever, or find nothing again."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise ConfigError(f"source {text!r}", f"{path} is not a regular file: save it as one, then give that")
+    name = format_of(path)
+    return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:
@@ -134,21 +123,13 @@ def _text_of_table(table: Mapping[str, object]) -> str:
     name = options.pop("kind", None)
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        problem = "kind is missing" if name is None else f"there is no kind {name!r}"
-        raise ConfigError(
-            "source", f"{problem}: choose from {', '.join(SOURCE_KINDS)}", key="" if name is None else "kind"
-        )
+        problem, key = ("kind is missing", "") if name is None else (f"there is no kind {name!r}", "kind")
+        raise ConfigError("source", f"{problem}: choose from {', '.join(SOURCE_KINDS)}", key=key)
     target_name = (kind.target or "").strip("[]").lower()
-    target = options.pop(target_name, "") if target_name else ""
+    target = options.pop(target_name, "")
     if not isinstance(target, str) or not kind.accepts(target):
-        form = f'{target_name} = "..."'
-        raise ConfigError(
-            f"source {name!r}", f"it needs {form}" if target_name else "it has no target", key=target_name
-        )
-    if kind.target == "FILE":
-        target = escape_path(target)
-    query = urlencode({key: _text_of_value(value) for key, value in options.items()}, safe=":,/")
-    return f"{name}:{target}?{query}" if query else f"{name}:{target}"
+        raise ConfigError(f"source {name!r}", f'it needs {target_name} = "..."', key=target_name)
+    return _join(str(name), kind, target, {key: _text_of_value(value) for key, value in options.items()})
 
 
 def _text_of_value(value: object) -> str:
@@ -160,9 +141,11 @@ def _text_of_value(value: object) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
-def escape_path(path: str) -> str:
-    """Return a path as the text of a source has it."""
-    return path.replace("%", "%25").replace("?", "%3F")
+def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) -> str:
+    """Return the text of a source; a path has its percent and question marks escaped."""
+    path = target.replace("%", "%25").replace("?", "%3F") if kind.target == "FILE" else target
+    query = urlencode(options, safe=":,/")
+    return f"{name}:{path}?{query}" if query else f"{name}:{path}"
 
 
 def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:

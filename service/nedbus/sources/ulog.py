@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from bisect import bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.recording import UlogTopic, read_ulog
-from nedbus_msgs import ALL, DEFAULT, Definition
+from nedbus_msgs import ALL, BY_TOPIC, DEFAULT, Definition
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -24,40 +23,22 @@ _CHUNK: Final = 1000  # rows that are converted to Python values at a time
 _BOOLS: Final = {0: False, 1: True}  # valid bytes of a bool; the model rejects any other
 
 
-@dataclass(frozen=True, slots=True)
-class _Track:
-    """One topic of a log, and when each row is due."""
-
-    topic: UlogTopic
-    due: npt.NDArray[np.float64]
-
-    def messages(self) -> Iterator[SourceMessage]:
-        """Yield the rows."""
-        address, definition, names = self.topic.address, self.topic.definition, tuple(self.topic.columns)
-        for start in range(0, len(self.due), _CHUNK):
-            rows = slice(start, start + _CHUNK)
-            columns = [python_values(definition, name, column[rows]) for name, column in self.topic.columns.items()]
-            for due, row in zip(self.due[rows].tolist(), zip(*columns, strict=True), strict=True):
-                yield SourceMessage(due, address, dict(zip(names, row, strict=True)), definition=definition)
-
-
 class UlogSource:
     """A .ulg file; `open` reads its topics into memory."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path = Path(path).expanduser()
-        self._vehicle = options.vehicle
-        self._default_vehicle = context.vehicle
         self._options = options
-        self.finite = not options.loop
-        self.loop = options.loop
-        self.speed = None if options.speed == "max" else options.speed
-        self.wait = options.wait
+        self._default_vehicle = context.vehicle
+        self.finite, self.loop = not options.loop, options.loop
+        self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
         """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
-        chosen = self._options.chosen_topics
-        log = read_ulog(self._path, topics=chosen, vehicle=self._vehicle, default_vehicle=self._default_vehicle)
+        options = self._options
+        log = read_ulog(
+            self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
+        )
         topics, warnings = log.topics, list(log.warnings)
         clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
         for topic, clock in zip(topics, clocks, strict=True):
@@ -67,27 +48,38 @@ class UlogSource:
             unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
             if unknown and _is_newer(topic):
                 warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than this version")
-        warnings += self._options.absent_from({topic.address.topic for topic in topics}, "this log")
+        warnings += options.absent_from({topic.address.topic for topic in topics}, "this log")
         dues, gaps = _pace(clocks)
         if gaps:
             warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")
-        tracks = [_Track(topic, due) for topic, due in zip(topics, dues, strict=True)]
         total = sum(map(len, clocks))
         layouts = " and ".join(sorted({_layout_name(topic) for topic in topics if topic.definition is DEFAULT}))
         layout = f", layout {layouts}" if layouts else ""
         return ReplayRun(
-            messages=heapq.merge(*(track.messages() for track in tracks), key=lambda message: message.due),
+            messages=heapq.merge(*map(_messages, topics, dues), key=lambda message: message.due),
             addresses=tuple(topic.address for topic in topics),
             total=total,
-            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(tracks)} streams{layout},"
+            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
-            definitions={topic.address.topic: topic.definition for topic in topics if topic.is_described},
+            definitions={
+                topic.address.topic: topic.definition for topic in topics if topic.address.topic not in BY_TOPIC
+            },
         )
 
 
-def python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
+def _messages(topic: UlogTopic, dues: npt.NDArray[np.float64]) -> Iterator[SourceMessage]:
+    """Yield the rows of a topic, each when it is due."""
+    definition, names = topic.definition, tuple(topic.columns)
+    for start in range(0, len(dues), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        columns = [_python_values(definition, name, column[rows]) for name, column in topic.columns.items()]
+        for due, row in zip(dues[rows].tolist(), zip(*columns, strict=True), strict=True):
+            yield SourceMessage(due, topic.address, dict(zip(names, row, strict=True)), definition=definition)
+
+
+def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
     """Return a column as values that the model accepts: int, float, bool, or tuples of them."""
     values: list[object] = column.tolist()
     if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
@@ -122,7 +114,7 @@ def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
 
 
 def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.float64]], int]:
-    """Return when each row of each track is due, in seconds since the first row, and how many gaps were removed."""
+    """Return when each row of each track is due, in seconds since the first row, and the number of gaps removed."""
     times = np.unique(np.concatenate(clocks))
     steps = np.diff(times)
     gaps = steps > _MAX_GAP

@@ -20,6 +20,7 @@ from nedbus.client import Bus
 from nedbus.errors import ConfigError, NoDataError, SourceError
 from nedbus.events import Event
 from nedbus.sources import LiveSource, parse_source, read_account, source_text_of_file
+from nedbus.sources import convert as convert_messages
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
 FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
@@ -75,7 +76,7 @@ def convert(
     for warning in run.warnings:
         write_stderr(f"{source}: {warning}")
     with show_progress() as show:
-        report = recording.convert(
+        report = convert_messages(
             run.messages,
             output,
             source=spec.kind,

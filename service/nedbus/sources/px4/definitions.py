@@ -14,7 +14,7 @@ from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_
 _log = logging.getLogger(__name__)
 
 Definitions = Mapping[str, Mapping[str, Definition[Any]]]
-"""By the DDS type of the message, and the hash of its ROS 2 type."""
+"""Definitions by the DDS type of the message, and the hash of its ROS 2 type."""
 
 
 def read_definitions(paths: str) -> Definitions:

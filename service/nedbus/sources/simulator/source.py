@@ -9,17 +9,17 @@ from itertools import count
 from typing import NamedTuple
 
 from nedbus.errors import SourceError
+from nedbus.sources.options import SimulatorOptions
+from nedbus.sources.source import ReplayRun, SourceContext, SourceMessage
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .options import SimulatorOptions
-from .simulated_estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
-from .simulated_trajectory import Trajectory, Truth
-from .simulated_vehicle import SimulatedVehicle
-from .source import ReplayRun, SourceContext, SourceMessage
+from .estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
+from .trajectory import Trajectory, Truth
+from .vehicle import SimulatedVehicle
 
 
 class _Stream(NamedTuple):
-    """What is sent at some ticks, and the estimator that it needs, if any."""
+    """Messages that are sent at some ticks, and the estimator that they need, if any."""
 
     address: Address
     ticks: range
@@ -38,8 +38,7 @@ class SimulatorSource:
         self._topics = options.chosen_topics
         self._ticks = None if options.duration is None else round(options.duration / TICK)
         self.finite = options.duration is not None
-        self.speed = None if options.speed == "max" else options.speed
-        self.wait = options.wait
+        self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
         """Start a new flight."""
@@ -84,22 +83,20 @@ class SimulatorSource:
     def _messages(self, streams: tuple[_Stream, ...], chosen: list[_Stream]) -> Iterator[SourceMessage]:
         trajectory = Trajectory(self._seed)
         estimators = list(dict.fromkeys(each.estimator for each in chosen if each.estimator))
+        # `Estimator.fields` draws noise: it is called for what is not chosen too, so that the flight is the same.
         noisy = [estimator.fields for estimator in estimators]
-        wanted = {each.address: _absent(each.address.topic) for each in chosen}
-        rows = [(each, wanted.get(each.address)) for each in streams if each in chosen or each.fields in noisy]
+        made = [each for each in streams if each in chosen or each.fields in noisy]
+        absent = {each.address: _absent(each.address.topic) for each in chosen}
         for tick in count() if self._ticks is None else range(self._ticks):
             time = tick * TICK
             now = trajectory.at(time)
             for estimator in estimators:
                 estimator.step(time % LAP, now)
-            for each, absent in rows:
-                if tick not in each.ticks:
-                    continue
-                if absent is not None:
+            for each in made:
+                if tick in each.ticks:
                     fields = each.fields(time, now)
-                    yield SourceMessage(time, each.address, fields if len(fields) == len(absent) else absent | fields)
-                elif each.estimator:
-                    each.estimator.skip_fields()
+                    if each.address in absent:
+                        yield SourceMessage(time, each.address, absent[each.address] | fields)
 
 
 def _absent(topic: str) -> dict[str, object]:

@@ -12,14 +12,14 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
+from nedbus.sources.options import MavlinkOptions
+from nedbus.sources.source import Rejection, SourceContext, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .mavlink_fields import SAID
-from .mavlink_link import Link, Peer, check_link, open_link
-from .mavlink_vehicle import Vehicle
-from .options import MavlinkOptions
-from .source import Rejection, SourceContext, SourceMessage
+from .fields import SAID
+from .link import Link, Peer, check_link, open_link
+from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 

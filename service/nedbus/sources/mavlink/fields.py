@@ -1,4 +1,4 @@
-"""What single MAVLink messages say, as fields of PX4's messages: what is unknown, or not MAVLink's, is left out."""
+"""The fields of PX4's messages that single MAVLink messages hold, without those that are unknown."""
 
 from __future__ import annotations
 

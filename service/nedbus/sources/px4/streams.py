@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
+from nedbus.sources.options import Px4ZenohOptions
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
 from nedbus_msgs import (
     BY_TOPIC,
@@ -23,9 +24,8 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-from .options import Px4ZenohOptions
-from .px4_definitions import Definitions
-from .px4_publishers import AlivePublishers
+from .definitions import Definitions
+from .publishers import PublisherTable
 
 _MAX_STREAMS: Final = 1000  # keys; a vehicle has a handful
 _MAX_LOSS: Final = 1_000_000  # messages that can be lost at once; a larger step is not a gap
@@ -34,20 +34,20 @@ _HINT: Final = "give each a namespace or a domain of its own"
 
 
 class NotAcceptedError(Exception):
-    """Raised for a message that may be valid, but not whose it is is certain, or not in which layout it is."""
+    """Raised for a message that may be valid, but whose vehicle or layout is uncertain."""
 
 
 class NotCarriedError(Exception):
-    """Raised for a key whose message nobody asked for; its text is the message, empty for what `topics=` leaves out."""
+    """Raised for a key that no option asks for; its text is the message, empty for what `topics=` leaves out."""
 
 
 @dataclass(slots=True, eq=False)
-class Stream:
+class Px4Stream:
     """One key: the address and layout of its messages, its publisher, and the last sequence number.
 
     `unknown`: fields of a layout newer than this version, whose names or types it does not know.
     `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
-    `reboots`: how many reboots of its vehicle it took part in.
+    `reboots`: the number of reboots of its vehicle that it took part in.
     """
 
     key: TopicKey
@@ -68,54 +68,53 @@ class StreamRegistry:
     """All keys that messages arrived on, and the one stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
+        self.publishers = PublisherTable()
         self._options = options
         self._given = given or {}
         self._vehicle = vehicle
-        self._streams: dict[str, Stream] = {}
-        self._owners: dict[Address, Stream] = {}
+        self._streams: dict[str, Px4Stream] = {}
+        self._owners: dict[Address, Px4Stream] = {}
         self._reboots: dict[str, int] = {}  # by vehicle
-        self._alive = AlivePublishers()
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
-        """Take note of a publisher's liveliness token that appeared."""
+        """Add the publisher of a liveliness token that appeared; AddressError for a key without an address."""
         stream = self._streams.get(str(token.key))
         if stream is not None and _TIMEOUT <= now - stream.last_received < math.inf:
-            # Who published before is silent: it lost its connection, and a router takes longer to notice.
-            self._alive.forget(token.key)
-        self._alive.add(token)
+            # The publisher before is silent: it lost its connection, and a router takes longer to notice.
+            self.publishers.forget(token.key)
+        try:
+            self.publishers.add(token, self._address_of(token.key), now)
+        except NotCarriedError as exc:
+            self.publishers.add(token, str(exc), now)
 
-    def remove_publisher(self, token: PublisherToken, now: float) -> None:
-        """Take note of a publisher's liveliness token that is gone."""
-        self._alive.remove(token, now)
-
-    def find(self, key: str) -> Stream | None:
+    def find(self, key: str) -> Px4Stream | None:
         """Return the stream of a key that was registered."""
         return self._streams.get(key)
 
-    def register(self, key: str) -> Stream:
+    def register(self, key: str) -> Px4Stream:
         """Return a new stream for a key.
 
         Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one whose
-        layout is unknown, and for one key too many, NotCarriedError for one that nobody asked for.
+        layout is unknown, and for one key too many, NotCarriedError for one that no option asks for.
         """
         parsed = TopicKey.parse(key)
-        address = self.address_of(parsed)
+        address = self._address_of(parsed)
         definition, layout = self._layout_of(parsed, address.topic)
         known = definition.known_types
         unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
-        stream = Stream(parsed, address, definition, layout, unknown, self._reboots.get(address.vehicle, 0))
+        stream = Px4Stream(parsed, address, definition, layout, unknown, self._reboots.get(address.vehicle, 0))
         if len(self._streams) >= _MAX_STREAMS:
             raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
         self._streams[key] = stream
         return stream
 
-    def claim(self, stream: Stream, attachment: Attachment | None, now: float) -> None:
+    def claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:
         """Make a stream and a publisher the owner of their address.
 
         Raises NotAcceptedError while another key, or another publisher on the same key, owns it, and while two
         publishers are alike.
         """
-        if self._alive.are_alike(stream.key, now):
+        if self.publishers.are_alike(stream.key, now):
             stream.publisher = stream.gid = stream.sequence = None
             stream.last_received = now
             raise NotAcceptedError(f"two vehicles are alike, with one key and one gid: {_HINT}")
@@ -125,21 +124,21 @@ class StreamRegistry:
                 raise NotAcceptedError(f"{owner.key} is {stream.address} already: name one of them with vehicles=")
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
-            stream.restarted = stream.publisher is not None and not self._alive.is_alive(stream.publisher)
+            stream.restarted = stream.publisher is not None and not self.publishers.is_alive(stream.publisher)
             if stream.gid is not None and not stream.restarted and now - stream.last_received < _TIMEOUT:
                 raise NotAcceptedError(f"two publishers share this key: {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
-            stream.publisher = self._alive.only(stream.key)
+            stream.publisher = self.publishers.only(stream.key)
 
-    def is_reboot(self, stream: Stream) -> bool:
-        """Take note that a stream restarted; return whether it is the first one of its vehicle to do so."""
+    def is_reboot(self, stream: Px4Stream) -> bool:
+        """Count the restart of a stream; return whether it is the first one of its vehicle to restart."""
         vehicle = stream.address.vehicle
         known = self._reboots.get(vehicle, 0)
         is_first = stream.reboots == known
         self._reboots[vehicle] = stream.reboots = known + is_first
         return is_first
 
-    def address_of(self, key: TopicKey) -> Address:
+    def _address_of(self, key: TopicKey) -> Address:
         """Return the address of a key's messages; AddressError or NotCarriedError for one that has none here."""
         namespace, topic, instance = split_ros2_topic(key.topic)
         options, name = self._options, _message_name(key)
@@ -201,8 +200,8 @@ def _by_dds_type() -> Mapping[str, Definition[Any]]:
     return {dds_type(name): definition for name, definition in ros2_types().items()}
 
 
-def track_sequence(stream: Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
-    """Take note of a message; return how many were lost just before it, and whether its publisher restarted.
+def track_sequence(stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
+    """Account for a message; return the number lost just before it, and whether its publisher restarted.
 
     Raises NotAcceptedError for a duplicate, and for a sequence that goes back repeatedly: two vehicles with one gid.
     """

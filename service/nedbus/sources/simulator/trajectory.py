@@ -14,7 +14,7 @@ CLIMB: Final = 10.0  # s until it is there
 _SIZE: Final = 40.0  # m
 _STEP: Final = 1e-3  # s, of the derivatives
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]  # north, east, down
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +35,13 @@ class Trajectory:
 
     def at(self, time: float) -> Truth:
         """Return the truth at a time [s] since the start."""
-        before, now, after = (self._position(time + offset) for offset in (-_STEP, 0.0, _STEP))
-        north, east, down = zip(before, now, after, strict=True)
-        velocity = (_first_derivative(north), _first_derivative(east), _first_derivative(down))
-        acceleration = (_second_derivative(north), _second_derivative(east), _second_derivative(down))
+        positions = [self._position(time + offset) for offset in (-_STEP, 0.0, _STEP)]
+        axes = list(zip(*positions, strict=True))
+        velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
+        acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
         moving = math.hypot(velocity[0], velocity[1]) > 0.5
         heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(self._direction + math.pi / 4)
-        return Truth(now, velocity, acceleration, heading)
+        return Truth(positions[1], velocity, acceleration, heading)
 
     def _position(self, time: float) -> Vector:
         climb = _smoothstep(time / CLIMB)
@@ -61,11 +61,3 @@ def _smoothstep(part: float) -> float:
     """Rise from 0 to 1 with continuous acceleration."""
     part = min(1.0, max(0.0, part))
     return part**3 * (10 - 15 * part + 6 * part**2)
-
-
-def _first_derivative(points: tuple[float, ...]) -> float:
-    return (points[2] - points[0]) / (2 * _STEP)
-
-
-def _second_derivative(points: tuple[float, ...]) -> float:
-    return (points[2] - 2 * points[1] + points[0]) / _STEP**2

@@ -10,13 +10,12 @@ Every lap of 120 s has what estimates have in real flights:
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from random import Random
-from typing import Final
+from typing import Any, Final
 
 from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
 
-from .simulated_trajectory import Truth
+from .trajectory import Truth
 
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 LAP: Final = 120.0  # s
@@ -35,63 +34,41 @@ _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
 _GRAVITY: Final = 9.80665  # m/s^2
 
 
-@dataclass(slots=True)
-class _Resets:
-    """The reset counters and the last deltas of an estimate."""
-
-    delta_xy: tuple[float, float] = (0.0, 0.0)
-    xy: int = 0
-    delta_z: float = 0.0
-    z: int = 0
-    delta_vxy: tuple[float, float] = (0.0, 0.0)
-    vxy: int = 0
-    delta_heading: float = 0.0
-    heading: int = 0
-
-
-@dataclass(slots=True, eq=False)
 class Estimator:
     """An estimate of the truth with errors that wander, drift without GPS, and are reset.
 
     `noise`: standard deviation of its position error [m]; `aided`: it has position aiding in the outage too.
     """
 
-    name: str
-    seed: int
-    noise: float
-    aided: bool = False
-    _resets: _Resets = field(default_factory=_Resets)
-    _random: Random = field(init=False)
-    _error: list[float] = field(init=False)
-    _drift: list[float] = field(init=False)
-    _heading_error: float = field(init=False)
-    _gyro: float = 0.0
-    _last_heading: float | None = None
-    _dead_reckoning: float = 0.0  # s since the last position aiding
-
-    def __post_init__(self) -> None:
-        self._random = Random(f"{self.seed}/{self.name}")
-        self._error = [self._random.gauss(0.0, self.noise) for _ in range(3)]
+    def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
+        self._noise = noise
+        self._aided = aided
+        self._random = Random(f"{seed}/{name}")
+        self._error = [self._random.gauss(0.0, noise) for _ in range(3)]
         self._drift = [0.0, 0.0]
-        self._heading_error = 0.0 if self.aided else self._random.choice((-1, 1)) * self._random.uniform(0.1, 0.3)
+        self._heading_error = 0.0 if aided else self._random.choice((-1, 1)) * self._random.uniform(0.1, 0.3)
+        self._gyro = 0.0
+        self._last_heading: float | None = None
+        self._dead_reckoning = 0.0  # s since the last position aiding
+        self._counters = dict.fromkeys(("xy", "z", "vxy", "vz", "heading"), 0)
+        self._deltas: dict[str, Any] = {"xy": (0.0, 0.0), "z": 0.0, "vxy": (0.0, 0.0), "vz": 0.0, "heading": 0.0}
 
     def step(self, lap_time: float, truth: Truth) -> None:
         """Advance by one tick."""
-        if not self.aided and OUTAGE[0] <= lap_time < OUTAGE[1]:
+        if not self._aided and OUTAGE[0] <= lap_time < OUTAGE[1]:
             self._drift_away()
         elif self._dead_reckoning:
             self._reset_position()
         else:
             self._wander()
-        if not self.aided and _is_at(lap_time, _HEADING_RESET):
-            self._resets.delta_heading, self._heading_error = -self._heading_error, 0.0
-            self._resets.heading = (self._resets.heading + 1) % 256
-        if not self.aided and _is_at(lap_time, _Z_RESET):
+        if not self._aided and _is_at(lap_time, _HEADING_RESET):
+            self._reset("heading", -self._heading_error)
+            self._heading_error = 0.0
+        if not self._aided and _is_at(lap_time, _Z_RESET):
             delta = self._random.gauss(0.0, 1.0) - self._error[2]
             self._error[2] += delta
-            self._resets.delta_z = delta
-            self._resets.z = (self._resets.z + 1) % 256
-        if not self.aided and _is_at(lap_time, _HEADING_DISTURBED):
+            self._reset("z", delta)
+        if not self._aided and _is_at(lap_time, _HEADING_DISTURBED):
             self._heading_error = self._random.gauss(0.0, 0.15)
         turned = wrap(truth.heading - self._last_heading) if self._last_heading is not None else 0.0
         self._gyro = wrap(self._gyro + turned + self._random.gauss(0.0, 2e-5))
@@ -103,71 +80,61 @@ class Estimator:
         vx, vy = truth.velocity[0] + self._drift[0], truth.velocity[1] + self._drift[1]
         vz = truth.velocity[2]
         xy_valid, spread = self.xy_valid, self._spread
-        resets = self._resets
-        unlimited = math.inf
         return {
             **_timestamps(time),
             "xy_valid": xy_valid, "z_valid": True, "v_xy_valid": xy_valid, "v_z_valid": True,
             "x": x, "y": y, "z": z,
-            "delta_xy": resets.delta_xy, "xy_reset_counter": resets.xy,
-            "delta_z": resets.delta_z, "z_reset_counter": resets.z,
+            **{f"delta_{name}": delta for name, delta in self._deltas.items()},
+            **{f"{name}_reset_counter": count for name, count in self._counters.items()},
             "vx": vx, "vy": vy, "vz": vz, "z_deriv": vz + self._random.gauss(0.0, 0.02),
-            "delta_vxy": resets.delta_vxy, "vxy_reset_counter": resets.vxy,
-            "delta_vz": 0.0, "vz_reset_counter": 0,
             **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
             "heading": wrap(truth.heading + self._heading_error), "heading_var": 0.001 + self._heading_error**2,
             "unaided_heading": self._gyro,
-            "delta_heading": resets.delta_heading, "heading_reset_counter": resets.heading,
-            "heading_good_for_control": resets.heading > 0 or self.aided, "tilt_var": 1e-4,
+            "heading_good_for_control": self._counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
             **_origin(known=time >= ORIGIN_SET),
             **_terrain(z),
-            "eph": spread, "epv": self.noise * 3,
-            "evh": self.noise / 2 + 0.05 * self._dead_reckoning, "evv": self.noise / 2,
+            "eph": spread, "epv": self._noise * 3,
+            "evh": self._noise / 2 + 0.05 * self._dead_reckoning, "evv": self._noise / 2,
             "dead_reckoning": self._dead_reckoning > 0,
-            "vxy_max": unlimited, "vz_max": unlimited,
-            "hagl_min": unlimited, "hagl_max_z": unlimited, "hagl_max_xy": unlimited,
+            **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
         }  # fmt: skip
-
-    def skip_fields(self) -> None:
-        """Go on as if `fields` had been called: the flight is the same, whatever is chosen of it."""
-        self._random.gauss(0.0, 0.02)
 
     def attitude(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the attitude: the tilt is that of a multicopter's thrust, which makes the acceleration; no wind."""
-        (ax, ay, az), resets = truth.acceleration, self._resets
+        ax, ay, az = truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
         forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
         roll = math.atan2(right, math.hypot(forward, up))
         q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + self._heading_error)
-        delta = euler_to_quaternion(0.0, 0.0, resets.delta_heading)
-        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": resets.heading}
+        delta = euler_to_quaternion(0.0, 0.0, self._deltas["heading"])
+        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": self._counters["heading"]}
 
     def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the global position; there is one once the origin is known."""
         x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
-        (latitude, longitude), altitude, resets = PROJECTION.reproject(x, y), REFERENCE[2], self._resets
+        (latitude, longitude), altitude = PROJECTION.reproject(x, y), REFERENCE[2]
         return {
             **_timestamps(time),
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
-            "lat_lon_valid": self.xy_valid, "alt_valid": True, "delta_alt": -resets.delta_z, "delta_terrain": 0.0,
-            "lat_lon_reset_counter": resets.xy, "alt_reset_counter": resets.z,
-            "eph": self._spread, "epv": self.noise * 3,
+            "lat_lon_valid": self.xy_valid, "alt_valid": True, "delta_alt": -self._deltas["z"], "delta_terrain": 0.0,
+            "lat_lon_reset_counter": self._counters["xy"], "alt_reset_counter": self._counters["z"],
+            "eph": self._spread, "epv": self._noise * 3,
             "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
             "dead_reckoning": self._dead_reckoning > 0,
         }  # fmt: skip
 
     @property
     def xy_valid(self) -> bool:
-        """Whether its horizontal position and velocity are valid."""
+        """Validity of its horizontal position and velocity."""
         return self._dead_reckoning < _MAX_DEAD_RECKONING
 
     @property
     def _spread(self) -> float:
-        return self.noise * 2 + 0.02 * self._dead_reckoning**2
+        return self._noise * 2 + 0.02 * self._dead_reckoning**2
 
     def _wander(self) -> None:
         keep = math.exp(-TICK / 20.0)
-        kick = self.noise * math.sqrt(1.0 - keep * keep)
+        kick = self._noise * math.sqrt(1.0 - keep * keep)
         self._error = [keep * error + self._random.gauss(0.0, kick) for error in self._error]
 
     def _drift_away(self) -> None:
@@ -178,37 +145,29 @@ class Estimator:
 
     def _reset_position(self) -> None:
         """Reset position and velocity to those of GPS, which is back."""
-        new = [self._random.gauss(0.0, self.noise) for _ in range(2)]
-        resets = self._resets
-        resets.delta_xy = (new[0] - self._error[0], new[1] - self._error[1])
-        resets.delta_vxy = (-self._drift[0], -self._drift[1])
-        resets.xy, resets.vxy = (resets.xy + 1) % 256, (resets.vxy + 1) % 256
+        new = [self._random.gauss(0.0, self._noise) for _ in range(2)]
+        self._reset("xy", (new[0] - self._error[0], new[1] - self._error[1]))
+        self._reset("vxy", (-self._drift[0], -self._drift[1]))
         self._error[:2], self._drift, self._dead_reckoning = new, [0.0, 0.0], 0.0
+
+    def _reset(self, name: str, delta: float | tuple[float, float]) -> None:
+        self._deltas[name], self._counters[name] = delta, (self._counters[name] + 1) % 256
 
 
 def truth_fields(time: float, truth: Truth) -> dict[str, object]:
     """Return the groundtruth message: variances and limits are 0, as simulators send them."""
-    zero = """z_deriv delta_z delta_vz heading_var delta_heading tilt_var eph epv evh evv
-              vxy_max vz_max hagl_min hagl_max_z hagl_max_xy"""
     return {
-        **dict.fromkeys(zero.split(), 0.0),
-        **dict.fromkeys(
-            (name for name, kind in VehicleLocalPosition.DEFINITION.types.items() if kind.base == "uint8"), 0
-        ),
-        "dead_reckoning": False,
+        **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
         **_timestamps(time),
+        "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
         **dict(zip(("x", "y", "z"), truth.position, strict=True)),
         **dict(zip(("vx", "vy", "vz"), truth.velocity, strict=True)),
         **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
-        "z_deriv": truth.velocity[2],
-        "delta_xy": (0.0, 0.0),
-        "delta_vxy": (0.0, 0.0),
-        "heading": truth.heading,
-        "unaided_heading": truth.heading,
+        "z_deriv": truth.velocity[2], "heading": truth.heading, "unaided_heading": truth.heading,
         **_origin(known=True),
         **_terrain(truth.position[2]),
-    }
+    }  # fmt: skip
 
 
 def _timestamps(time: float) -> dict[str, object]:
@@ -229,13 +188,10 @@ def _terrain(z: float) -> dict[str, object]:
     distance = max(0.1, -z)
     in_range = distance < _SENSOR_RANGE
     return {
-        "dist_bottom_valid": in_range,
-        "dist_bottom": distance,
-        "dist_bottom_var": 0.01,
-        "delta_dist_bottom": 0.0,
-        "dist_bottom_reset_counter": 0,
+        "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
+        "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
         "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
-    }
+    }  # fmt: skip
 
 
 def _is_at(lap_time: float, moment: float) -> bool:

@@ -8,8 +8,8 @@ from typing import Final
 
 from nedbus_msgs import MESSAGES
 
-from .simulated_estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
-from .simulated_trajectory import CLIMB, Truth
+from .estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
+from .trajectory import CLIMB, Truth
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
@@ -22,7 +22,7 @@ _BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: 2026 begins
 
 
 class SimulatedVehicle:
-    """What a vehicle says that flies by this estimate; `fields` of each are not those that are not known."""
+    """The messages of a vehicle that flies by this estimate, without the fields that are not known."""
 
     def __init__(self, seed: int, estimator: Estimator) -> None:
         self._estimator = estimator

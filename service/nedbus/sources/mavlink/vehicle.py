@@ -7,20 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any, Final, cast
 
+from nedbus.sources.options import MavlinkOptions
+from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
 
-from .mavlink_fields import SAID, sensors_of
-from .options import MavlinkOptions
-from .source import Rejection, SourceMessage
+from .fields import SAID, sensors_of
 
 _WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
 _VALUE_TIMEOUT: Final = 2.0  # s after which a value is no longer part of the estimate
-_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second if nobody requests it
-_SILENCE: Final = 3.0  # s after which all state is reset
+_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second without a request
+_SILENCE_TIMEOUT: Final = 3.0  # s after which all state is reset
 _ACK_TIMEOUT: Final = 1.0  # s until a request is repeated
 _MAX_TRIES: Final = 5
 _RETRY_INTERVAL: Final = 5.0  # s until an unknown origin, or positions that do not arrive, are requested again
@@ -48,22 +47,11 @@ STREAMS: Final = {
     242: (72, 1.0, "home_position"),
     245: (14, 1.0, "vehicle_land_detected"),
 }
-"""What to request, in that order: its bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), the topics in need."""
+"""The messages to request, in order: bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), topics that need it."""
 
-_LEAST: Final = 2.0  # Hz, on a link that is full
-_USABLE: Final = 0.9  # of a link; the rest is for heartbeats and answers
-_BITS: Final = 10  # of a byte on a serial line, with start and stop
-
-
-@dataclass(slots=True, eq=False)
-class _Expiring:
-    """Fields from one message, and until when they are valid."""
-
-    until: float = 0.0
-    fields: dict[str, object] | None = None
-
-    def at(self, now: float) -> dict[str, object]:
-        return self.fields if self.fields and now <= self.until else {}
+_MIN_RATE: Final = 2.0  # Hz, on a link that is full
+_USABLE_PART: Final = 0.9  # of a link; the rest is for heartbeats and answers
+_BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop
 
 
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
@@ -72,15 +60,15 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
     That is, up to the rate that it wants; on a link that does not carry it all, up to one that is the same for all.
     """
     wanted = {
-        number: max(_LEAST, rate) if number == _STATUS else hertz or rate
+        number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
         for number, (_, hertz, needed) in STREAMS.items()
         if not set(needed.split()).isdisjoint(topics)
     }
     others = sorted(wanted.keys() - {_POSITION}, key=wanted.__getitem__)
-    free = _USABLE * baud / _BITS - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
+    free = _USABLE_PART * baud / _BITS_PER_BYTE - STREAMS[_POSITION][0] * wanted.get(_POSITION, 0.0)
     for index, number in enumerate(others):
         level = free / sum(STREAMS[each][0] for each in others[index:])
-        wanted[number] = min(wanted[number], max(_LEAST, level))
+        wanted[number] = min(wanted[number], max(_MIN_RATE, level))
         free -= STREAMS[number][0] * wanted[number]
     return wanted
 
@@ -102,10 +90,8 @@ class Vehicle:
 
     def _reset(self, now: float) -> None:
         """Discard what was received, and request everything again: it was silent, or rebooted."""
-        self._heading, self._yaw, self._status, self._bottom, self._velocity = (_Expiring() for _ in range(5))
-        self._global_status, self._sensors, self._utc = (_Expiring() for _ in range(3))
+        self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and until when
         self._quaternion_until = now + _VALUE_TIMEOUT
-        self._origin = _Expiring()
         self._is_global = False
         self._last: dict[Address, int] = {}  # timestamps
         self._pending = [*self._rates, ORIGIN] if _POSITION in self._rates else [*self._rates]
@@ -115,7 +101,7 @@ class Vehicle:
 
     def track_sequence(self, component: int, sequence: int, now: float) -> None:
         """Count the messages that were lost before this one, whatever its type."""
-        if now - self._last_message > _SILENCE:
+        if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
         last = self._sequences.get(component)
@@ -128,9 +114,9 @@ class Vehicle:
 
     def requests(self, now: float) -> Iterator[tuple[int, float]]:
         """Yield what to request now: the number of a message, and its rate [Hz], 0 for once."""
-        if now < self._next_request or now - self._last_message > _SILENCE:
+        if now < self._next_request or now - self._last_message > _SILENCE_TIMEOUT:
             return
-        if not self._pending and now - self._last_position > _SILENCE:
+        if not self._pending and now - self._last_position > _SILENCE_TIMEOUT:
             self._pending, self._tries = [*self._rates], 0  # it sends messages, but no positions
         if self._tries >= _MAX_TRIES:
             self._pending, self._tries = self._pending[1:], 0
@@ -138,7 +124,7 @@ class Vehicle:
             self._tries += 1
             self._next_request = now + _ACK_TIMEOUT
             yield self._pending[0], self._rates.get(self._pending[0], 0.0)
-        elif not self._origin.fields and _POSITION in self._rates:
+        elif "origin" not in self._kept and _POSITION in self._rates:
             self._pending, self._next_request = [ORIGIN], now + _RETRY_INTERVAL
 
     def acknowledge(self, now: float) -> int | None:
@@ -155,7 +141,7 @@ class Vehicle:
         return number != ORIGIN or self._is_global
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Return what a message says of a topic that is wanted: of one at most; late ones are rejected."""
+        """Return the message of a chosen topic that this one holds, if any; late ones are rejected."""
         kind = message.get_type()
         topic, fields_of = SAID.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
@@ -180,61 +166,62 @@ class Vehicle:
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
-        """Keep what belongs to later messages."""
+        """Keep the fields that belong to later messages."""
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
-                self._heading = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(heading, math.tau)})
+                self._keep("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
             case "ATTITUDE" if math.isfinite(message.yaw):
-                self._yaw = _Expiring(now + _VALUE_TIMEOUT, {"heading": math.remainder(message.yaw, math.tau)})
+                self._keep("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
             case "ATTITUDE_QUATERNION":
                 self._quaternion_until = now + _VALUE_TIMEOUT
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
-                origin = {
-                    "xy_global": True,
-                    "z_global": True,
-                    "ref_lat": message.latitude / 1e7,
-                    "ref_lon": message.longitude / 1e7,
-                    "ref_alt": message.altitude / 1e3,
-                    **({"ref_timestamp": message.time_usec} if message.time_usec else {}),
-                }
-                self._origin = _Expiring(math.inf, origin)
+                known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
+                latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+                known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
+                self._keep("origin", math.inf, xy_global=True, z_global=True, **known)
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance)
-                bottom: dict[str, object] = {"dist_bottom": message.bottom_clearance} if is_known else {}
-                self._bottom = _Expiring(now + _VALUE_TIMEOUT, {"dist_bottom_valid": is_known, **bottom})
+                bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
+                self._keep("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
-                fields = _velocity_deviations(message.velocity_covariance)
-                self._velocity = _Expiring(now + _VALUE_TIMEOUT, fields)
+                self._keep("velocity", now + _VALUE_TIMEOUT, **_velocity_deviations(message.velocity_covariance))
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
                 self._is_global = bool(message.flags & _POS_HORIZ_ABS)
                 valid = _validity(message.flags)
-                self._status = _Expiring(now + _STATUS_TIMEOUT, valid | known)
+                self._keep("status", now + _STATUS_TIMEOUT, **valid, **known)
                 on_globe = {"lat_lon_valid": valid["xy_valid"] and self._is_global, "alt_valid": valid["z_valid"]}
-                self._global_status = _Expiring(now + _STATUS_TIMEOUT, on_globe | known)
+                self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
-                self._sensors = _Expiring(now + _STATUS_TIMEOUT, sensors_of(message))
+                self._keep("sensors", now + _STATUS_TIMEOUT, **sensors_of(message))
             case "SYSTEM_TIME" if timestamp is not None and message.time_unix_usec > _LONG_AGO:
-                self._utc = _Expiring(now + _STATUS_TIMEOUT, {"boot": message.time_unix_usec - timestamp})
+                self._keep("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
+
+    def _keep(self, name: str, until: float, **fields: object) -> None:
+        self._kept[name] = fields, until
+
+    def _recall(self, name: str, now: float) -> dict[str, object]:
+        fields, until = self._kept.get(name, ({}, 0.0))
+        return fields if now <= until else {}
 
     def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
-        """Add what earlier messages said."""
+        """Add the fields of earlier messages."""
         match topic:
             case "vehicle_local_position":
-                for each in (self._yaw, self._heading, self._status, self._bottom, self._velocity, self._origin):
-                    fields |= each.at(now)
+                for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
+                    fields |= self._recall(name, now)
                 # The flags are from an earlier message: these fields may have become NaN since.
                 for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
                     values = cast("Iterator[float]", (fields[name] for name in FLAGS[flag].fields))
                     if fields.get(flag) and not all(map(math.isfinite, values)):
                         fields[flag] = False
             case "vehicle_global_position":
-                fields |= self._global_status.at(now)
+                fields |= self._recall("global status", now)
             case "vehicle_status":
-                fields |= self._sensors.at(now)
-            case "sensor_gps" if utc := self._utc.at(now):
+                fields |= self._recall("sensors", now)
+            case "sensor_gps" if utc := self._recall("utc", now):
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
     def _track_time(self, message: Any, now: float) -> int | None:
@@ -259,7 +246,7 @@ class Vehicle:
 
 
 def _validity(bits: int) -> dict[str, object]:
-    """Return what ESTIMATOR_STATUS.flags say about position and velocity.
+    """Return the validity of position and velocity by ESTIMATOR_STATUS.flags.
 
     The constant position mode was the opposite of a horizontal velocity up to PX4 1.15; since PX4's commit 48f1687d3a
     it is set for every vehicle at rest too, whose velocity and position are valid.

@@ -1,0 +1,78 @@
+"""The files of flights: their formats by suffix, opening one, and choosing streams of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import BinaryIO, Final
+
+from nedbus.errors import AddressError, ConfigError, SourceError
+from nedbus_msgs import ANY, Address, Selection
+
+SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap"}
+"""The kind of source that replays a file, by the file's suffix."""
+
+_MAX_NAMED: Final = 10  # addresses that an error names
+
+
+def format_of(path: str | PurePath) -> str:
+    """Return the format of a flight, "ulog" or "mcap"; raise ConfigError for a file with another suffix."""
+    found = SUFFIXES.get(PurePath(path).suffix)
+    if found is None:
+        raise ConfigError(str(path), f"expected a flight log: a file that ends with {' or '.join(SUFFIXES)}")
+    return found
+
+
+def check_recording(path: Path, *, flight: str) -> None:
+    """Raise ConfigError for a recording whose name is that of another format.
+
+    `flight` is the file that the hint for a table or a picture names.
+    """
+    if SUFFIXES.get(path.suffix) == "mcap":
+        return
+    hints = {
+        ".csv": f'; for a table: nedbus.read("{flight}", dataframe="pandas").to_csv("{path.name}")',
+        **dict.fromkeys((".png", ".svg", ".pdf"), f"; for a picture: nedbus plot {flight} -o {path.name}"),
+    }
+    raise ConfigError(str(path), f"expected a recording: a file that ends with .mcap{hints.get(path.suffix, '')}")
+
+
+def open_flight(path: Path) -> BinaryIO:
+    """Open a file for reading; raise SourceError when that fails, and for a pipe or folder: a flight is read twice."""
+    try:
+        if path.exists() and not path.is_file():
+            raise SourceError(str(path), "not a regular file: save it as one first")
+        return path.open("rb")
+    except OSError as exc:
+        raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
+
+
+def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
+    """Return the addresses of a file that are selected; raise AddressError when there is none."""
+    found = [address for address in addresses if selection.matches(address)]
+    if found:
+        return found
+    has = f"which has {_list(addresses)}"
+    of_vehicle = [address for address in addresses if selection.vehicle in (ANY, address.vehicle)]
+    if not of_vehicle:
+        raise AddressError("vehicle", selection.vehicle, f"one that is in {path}, {has}")
+    if not any(selection.topic in (ANY, address.topic) for address in of_vehicle):
+        of = "" if selection.vehicle == ANY else f" of vehicle {selection.vehicle}"
+        raise AddressError("topic", selection.topic, f"one{of} that is in {path}, {has}")
+    raise AddressError("instance", selection.instance, f"one of {selection.topic} that is in {path}, {has}")
+
+
+def the_one(path: Path, addresses: Sequence[Address], selection: Selection) -> Address:
+    """Return the only address of a file that is selected; raise AddressError when there is none, or more than one."""
+    found = matching(path, addresses, selection)
+    if len(found) == 1:
+        return found[0]
+    parts = ("topic", "vehicle", "instance")
+    lacking = [part for part in parts if len({getattr(address, part) for address in found}) > 1]
+    problem = f"one stream of {path}, where several match: name {' and '.join(lacking)} too, of {_list(found)}"
+    raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+
+
+def _list(addresses: Sequence[Address]) -> str:
+    more = len(addresses) - _MAX_NAMED
+    return ", ".join(map(str, addresses[:_MAX_NAMED])) + (f" and {more} more" if more > 0 else "")

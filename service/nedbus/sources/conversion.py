@@ -1,0 +1,77 @@
+"""Convert a replay to a recording, message by message, validated."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final
+
+from pydantic import ValidationError
+
+from nedbus import recording
+from nedbus.errors import OutputError
+from nedbus.log_event import about
+from nedbus.whole_file import whole_file
+from nedbus_msgs import BY_TOPIC, Address, Message, Provenance, describe, upgrade_with
+
+from .source import SourceMessage
+
+_log = logging.getLogger(__name__)
+
+_MAX_START: Final = 2**63  # ns: what follows must fit as well
+_CHUNK: Final = 1024  # messages that are written together
+_CHUNK_BYTES: Final = 2**18  # what damage costs, some seconds of a flight
+_MAX_LOGGED: Final = 5  # rejected messages that are logged
+
+
+def convert(
+    messages: Iterable[SourceMessage],
+    path: Path,
+    *,
+    source: str,
+    on_progress: Callable[[int], object],
+    flight: str = "flight.ulg",
+) -> str:
+    """Write messages to a new MCAP file and return a summary; without success there is no file.
+
+    A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
+    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far,
+    and `flight` is the file that the hint of an error names.
+
+    Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
+    """
+    recording.check_recording(path, flight=flight)
+    try:
+        with whole_file(path) as part:
+            return _write(messages, part, source=source, on_progress=on_progress)
+    except OSError as exc:
+        cause = exc.__cause__ if isinstance(exc, OutputError) else exc
+        raise OutputError(path, cause if isinstance(cause, OSError) else exc) from exc
+
+
+def _write(messages: Iterable[SourceMessage], path: Path, *, source: str, on_progress: Callable[[int], object]) -> str:
+    pending: list[tuple[Message, Address, Provenance, int]] = []
+    rejected, start = 0, None
+    with recording.RecordingWriter(path, chunk_size=_CHUNK_BYTES) as writer:
+        for done, each in enumerate(messages, 1):
+            definition = each.definition or BY_TOPIC[each.address.topic]
+            try:
+                message = upgrade_with(definition, each.fields)
+            except ValidationError as exc:
+                rejected += 1
+                if rejected <= _MAX_LOGGED:
+                    reason = each.error or describe(exc, definition)
+                    extra = about("rejected", each.address, source=source, reason=reason)
+                    _log.warning("%s rejected: %s", each.address, reason, extra=extra)
+                continue
+            if start is None:
+                start = min(message.timestamp * 1000, _MAX_START)
+            provenance = Provenance(source, definition.all_fields - message.model_fields_set)
+            pending.append((message, each.address, provenance, start + round(each.due * 1e9)))
+            if len(pending) == _CHUNK:
+                writer.write_messages(pending)
+                pending.clear()
+                on_progress(done)
+        writer.write_messages(pending)
+    return f"{writer.messages} messages" + (f", {rejected} rejected" if rejected else "")

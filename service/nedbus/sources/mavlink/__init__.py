@@ -1,0 +1,1 @@
+"""Vehicles that speak MAVLink: `mavlink:`, over UDP, TCP or a serial port."""

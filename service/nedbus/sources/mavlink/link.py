@@ -1,0 +1,122 @@
+"""The links to a MAVLink vehicle: UDP, TCP, or a serial port; bytes in with their sender, bytes out."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from typing import Any, Final
+
+from nedbus.errors import ConfigError, SourceError
+
+_MAX_DATAGRAMS: Final = 100  # that one read returns
+_MAX_READ: Final = 65535  # bytes
+_CONNECT_TIMEOUT: Final = 3.0  # s
+_LINK = re.compile(r"(udpin|udp|udpout|tcp):(.+):(\d{1,5})|serial:(/.+)|(/dev/.+)")
+_FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
+
+Peer = Any  # the address of the other side, in the form that its socket uses
+
+
+class _UdpLink:
+    """A UDP socket; `peer` is None where the other side must send first."""
+
+    stream = False
+
+    def __init__(self, host: str, port: int, *, listens: bool) -> None:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self.close = self._socket.close
+        self.peer: Peer = None if listens else address
+        if listens:
+            try:
+                self._socket.bind(address)
+            except OSError:
+                self.close()
+                raise
+
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        """Yield the datagrams that have arrived and their senders; wait up to `timeout` seconds for the first."""
+        if not _is_ready(self._socket, timeout):
+            return
+        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen, yet
+            for _ in range(_MAX_DATAGRAMS):
+                yield self._socket.recvfrom(_MAX_READ)
+
+    def send(self, data: bytes, peer: Peer) -> None:
+        """Send now, or drop it if that is not possible."""
+        with suppress(OSError):  # a missing route comes back, or the vehicle times out
+            self._socket.sendto(data, peer)
+
+
+class _StreamLink:
+    """A TCP connection or a serial port: messages may arrive in pieces."""
+
+    stream = True
+
+    def __init__(self, file: Any, peer: Peer) -> None:
+        self.peer = peer
+        self.close = file.close
+        self._file = file
+        self._is_socket = isinstance(file, socket.socket)
+        self._receive: Callable[[int], bytes] = file.recv if self._is_socket else file.read
+        self._send: Callable[[bytes], object] = file.sendall if self._is_socket else file.write
+
+    def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
+        """Yield what has arrived and its sender; wait up to `timeout` seconds for it."""
+        if _is_ready(self._file, timeout):
+            data = self._receive(_MAX_READ)
+            if not data and self._is_socket:
+                raise ConnectionResetError(None, "the other side closed the connection")
+            yield data, self.peer
+
+    def send(self, data: bytes, _: Peer) -> None:
+        """Send now, or raise OSError."""
+        self._send(data)
+
+
+Link = _UdpLink | _StreamLink
+"""An open connection to one or several vehicles; what fails raises OSError."""
+
+
+def check_link(text: str) -> None:
+    """Raise ConfigError for an invalid link."""
+    _parse(text)
+
+
+def open_link(text: str, *, baud: int) -> Link:
+    """Open a link; raise SourceError when that fails, ConfigError for an invalid one."""
+    kind, host, port = _parse(text)
+    try:
+        if kind == "serial":
+            from serial import Serial
+
+            return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
+        if kind == "tcp":
+            return _StreamLink(socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT), (host, port))
+        return _UdpLink(host, port, listens=kind != "udpout")
+    except (OSError, UnicodeError) as exc:
+        number = exc.errno if isinstance(exc, OSError) else None
+        reason = os.strerror(number).lower() if number and number > 0 else str(exc)
+        raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
+
+
+def _parse(text: str) -> tuple[str, str, int]:
+    """Return the kind of a link, its host or device, and its port."""
+    found = _LINK.fullmatch(text)
+    if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
+        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
+    if found[1]:
+        return found[1], found[2].strip("[]"), int(found[3])
+    return "serial", found[4] or found[5], 0
+
+
+def _is_ready(file: Any, timeout: float) -> bool:
+    """Wait until there is data or the other side has closed; unlike select, with any number of open files."""
+    poll = select.poll()
+    poll.register(file, select.POLLIN)
+    return bool(poll.poll(timeout * 1000))

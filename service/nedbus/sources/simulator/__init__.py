@@ -1,0 +1,1 @@
+"""The simulated flight: `sim:`, the same seed gives the same messages, to the bit."""
