@@ -6,9 +6,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from .event import WINDOW, Condition, Event, Severity, State, state_of
-from .rules import RULES
-from .vehicle import OUTLIVING, RECENT, explain
+from .event import WINDOW, Condition, Event, Severity, State, explain, state_of
+from .rules import OUTLIVING, RECENT, RULES
 
 _TOGETHER: Final = 1.0  # s within which conditions that begin are one story
 _HEADS: Final = (
