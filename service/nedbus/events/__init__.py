@@ -1,4 +1,8 @@
-"""What happened, and why: events of vehicles from their messages, live or of a file; no I/O."""
+"""Events of vehicles from their messages, live or of a file, and the answer to why; no I/O.
+
+A new kind of event is a row of KINDS in `event.py`, its flags or thresholds in `rules.py`, and a finding of a detector
+in `detectors.py` or `position.py`.
+"""
 
 from .account import KEPT, Account
 from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State, to_age

@@ -7,20 +7,8 @@ from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
+from . import rules
 from .event import Severity
-from .rules import (
-    ARMED,
-    ENOUGH_SATELLITES,
-    FEW_SATELLITES,
-    FIXES,
-    JAMMING_BEGIN,
-    JAMMING_END,
-    MIN_FIX_TYPE,
-    MODES,
-    RULES,
-    WARNINGS,
-    FlagRule,
-)
 
 Change = Literal["begin", "end", "once"]
 Fields = dict[str, Any]
@@ -98,14 +86,19 @@ class ChangeDetector:
         last, self._last = self._last, message
         if state == self._state and (missing is self._missing or missing == self._missing):
             return None
-        before = {} if last is None else self._by_name(last, self._missing)
-        self._state, self._missing = state, missing
-        return self._detect(before, self._by_name(message, missing))
+        return self._change(last, message, state, missing)
 
     def forget(self) -> None:
         """Begin anew: the vehicle has rebooted."""
         self._last = self._state = None
         self.stamp = self.earlier = 0
+
+    def _change(
+        self, last: object, message: object, state: tuple[Any, ...], missing: frozenset[str]
+    ) -> Iterator[Finding]:
+        before = {} if last is None else self._by_name(last, self._missing)
+        self._state, self._missing = state, missing
+        return self._detect(before, self._by_name(message, missing))
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
@@ -129,28 +122,31 @@ class GpsDetector(ChangeDetector):
     def _detect_gps(self, before: Fields, after: Fields) -> Iterator[Finding]:
         fix, was = after["fix_type"], before.get("fix_type")
         satellites, earlier = after["satellites_used"], before.get("satellites_used")
-        if was is None and fix is not None and fix < MIN_FIX_TYPE:
+        if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
             yield Finding("gps_fix_lost", "begin", "info", "no GPS fix", initial=True)
         elif was is not None and fix is not None and was != fix:
-            names = FIXES.get(was, str(was)), FIXES.get(fix, str(fix))
+            names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
             numbers = {"fix_before": was, "fix": fix}
             text = f"GPS fix {names[0]} to {names[1]}"
             if satellites is not None and earlier is not None and satellites != earlier:
                 numbers |= {"satellites_before": earlier, "satellites": satellites}
                 text += f", {earlier} satellites to {satellites}"
-            if was >= MIN_FIX_TYPE > fix:
+            if was >= rules.MIN_FIX_TYPE > fix:
                 yield Finding("gps_fix_lost", "begin", "watch", text, names, numbers)
-            elif was < MIN_FIX_TYPE <= fix:
+            elif was < rules.MIN_FIX_TYPE <= fix:
                 yield Finding("gps_fix_lost", "end", "info", text, names, numbers)
             elif names[0] != names[1]:
                 yield Finding("gps_fix", "once", "info", text, names, numbers)
         if satellites is not None and satellites != _UNKNOWN_SATELLITES:
-            is_few, is_enough = satellites < FEW_SATELLITES, satellites >= ENOUGH_SATELLITES
+            is_few, is_enough = satellites < rules.FEW_SATELLITES, satellites >= rules.ENOUGH_SATELLITES
             text = f"{'only ' * is_few}{satellites} satellites"
             yield from self._detect_level("few_satellites", is_few, is_enough, text, {"satellites": satellites})
         indicator, state = after["jamming_indicator"] or 0, after["jamming_state"] or 0
         text = f"GNSS jamming: indicator {indicator}" + (f", state {state}" if state > 1 else "")
-        is_jammed, is_clear = state > 1 or indicator >= JAMMING_BEGIN, state <= 1 and indicator < JAMMING_END
+        is_jammed, is_clear = (
+            state > 1 or indicator >= rules.JAMMING_BEGIN,
+            state <= 1 and indicator < rules.JAMMING_END,
+        )
         yield from self._detect_level("jamming", is_jammed, is_clear, text, {"indicator": indicator, "state": state})
         spoofed = after["spoofing_state"] or 0
         text = f"GNSS spoofing: state {spoofed}"
@@ -170,13 +166,13 @@ class GpsDetector(ChangeDetector):
 
 def make_detector(message: str) -> ChangeDetector | None:
     """Return the detector of a stream of a message, None for one of which no change is an event."""
-    rules = RULES.get(message, ())
-    flags = [flag for rule in rules for flag in rule.flags]
+    flag_rules = rules.RULES.get(message, ())
+    flags = [flag for rule in flag_rules for flag in rule.flags]
     match message:
         case "VehicleStatus":
             return ChangeDetector(["arming_state", "nav_state", *flags], detect_status)
         case "EstimatorStatusFlags" | "FailsafeFlags":
-            return ChangeDetector(flags, lambda before, after: detect_flags(rules, before, after))
+            return ChangeDetector(flags, lambda before, after: detect_flags(flag_rules, before, after))
         case "SensorGps":
             return GpsDetector()
         case "BatteryStatus":
@@ -186,9 +182,9 @@ def make_detector(message: str) -> ChangeDetector | None:
     return None
 
 
-def detect_flags(rules: Sequence[FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
+def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the flags that begin and end; one that was not known, or is not known any more, is no event."""
-    for rule in rules:
+    for rule in flag_rules:
         found: dict[tuple[Change, bool], list[str]] = {}
         for name in rule.flags:
             was, now = before.get(name), after.get(name)
@@ -210,13 +206,13 @@ def detect_flags(rules: Sequence[FlagRule], before: Fields, after: Fields) -> It
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the events of a VehicleStatus: armed and disarmed, mode, failsafe, link to the ground station."""
     was, now = before.get("arming_state"), after["arming_state"]
-    if now is not None and (was is None or (was == ARMED) != (now == ARMED)):
-        kind = "armed" if now == ARMED else "disarmed"
+    if now is not None and (was is None or (was == rules.ARMED) != (now == rules.ARMED)):
+        kind = "armed" if now == rules.ARMED else "disarmed"
         yield Finding(kind, "once", "info", kind, initial=was is None)
-    yield from detect_flags(RULES["VehicleStatus"], before, after)
+    yield from detect_flags(rules.RULES["VehicleStatus"], before, after)
     was, now = before.get("nav_state"), after["nav_state"]
     if was is not None and now is not None and was != now:
-        names = MODES.get(was, str(was)), MODES.get(now, str(now))
+        names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
         yield Finding("mode", "once", "info", f"mode {names[0]} to {names[1]}", names, {"from": was, "to": now})
 
 
@@ -238,10 +234,12 @@ def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
         numbers, left = {"warning": warning, "remaining": remaining}, f", {100 * remaining:.0f} % left"
     if warning:
         severity: Severity = "watch" if warning in (1, 7) else "bad"
-        text = f"battery {WARNINGS.get(warning, warning)}{left}"
+        text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
         yield Finding("battery", "begin", severity, text, numbers=numbers, initial=not before)
     else:
-        yield Finding("battery", "end", "info", f"battery no longer {WARNINGS.get(was, was)}{left}", numbers=numbers)
+        yield Finding(
+            "battery", "end", "info", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers
+        )
 
 
 def _warning_of(battery: Fields) -> int | None:

@@ -37,20 +37,21 @@ class PositionDetector(ChangeDetector):
     def __init__(self) -> None:
         super().__init__(_COMPARED, self._detect_position, told=tuple(_TOLD))
         self._read_motion = FieldReader(("timestamp", "x", "y", "vx", "vy"), math.nan)
-        self._motion: tuple[Any, ...] = ()
-        self._motion_before: tuple[Any, ...] = ()
+        self._read_state = FieldReader(_COMPARED)
+        self._motion: tuple[float, ...] = ()
+        self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # by now
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
         """Add a message; return None while nothing changes."""
         before, motion = self._motion, self._read_motion(message)
         self._motion_before, self._motion = before, motion
-        found = super().add(message, missing)
-        if found is not None:
-            return found
-        is_valid = self._state and self._state[0]
-        has_moved = is_valid and (abs(motion[1] - before[1]) > _MIN_STEP or abs(motion[2] - before[2]) > _MIN_STEP)
-        step = _unexplained_step(before, motion) if has_moved else None
+        self.earlier, self.stamp, state = self.stamp, motion[0], self._read_state(message)
+        last, self._last = self._last, message
+        if state != self._state or not (missing is self._missing or missing == self._missing):
+            return self._change(last, message, state, missing)
+        has_moved = abs(motion[1] - before[1]) > _MIN_STEP or abs(motion[2] - before[2]) > _MIN_STEP
+        step = self._unexplained_step() if has_moved and state[0] else None
         return None if step is None and self._jump is None else self._follow_jump(step)
 
     def forget(self) -> None:
@@ -70,9 +71,19 @@ class PositionDetector(ChangeDetector):
                 yield _reset(quantities, values, track)
             step = None
             if values["xy_valid"] and not track.origin_changed and "xy" not in track.reset:
-                step = _unexplained_step(self._motion_before, self._motion)
+                step = self._unexplained_step()
             yield from self._follow_jump(step)
         yield from detect_flags(_RULES, before, after)
+
+    def _unexplained_step(self) -> Step | None:
+        """Return the last step beyond what the velocity explains; None if it explains all of it."""
+        seconds = (self.stamp - self.earlier) / 1e6
+        if not 0 < seconds <= _MAX_INTERVAL:
+            return None
+        (_, x_before, y_before, vx_before, vy_before), (_, x, y, vx, vy) = self._motion_before, self._motion
+        north, east = x - x_before - (vx + vx_before) / 2 * seconds, y - y_before - (vy + vy_before) / 2 * seconds
+        limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
+        return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
 
     def _follow_jump(self, step: Step | None) -> Iterator[Finding]:
         """Add a step to a jump, or yield the jump when it has ended."""
@@ -84,17 +95,6 @@ class PositionDetector(ChangeDetector):
             text = f"position jumps by {distance:.1f} m within {seconds:.2f} s, without a reset"
             numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
             yield Finding("jump", "once", "watch", text, numbers=numbers)
-
-
-def _unexplained_step(before: Sequence[float], after: Sequence[float]) -> Step | None:
-    """Return the step between two motions beyond their velocity; None if the velocity explains it."""
-    seconds = (after[0] - before[0]) / 1e6
-    if not 0 < seconds <= _MAX_INTERVAL:
-        return None
-    north = after[1] - before[1] - (after[3] + before[3]) / 2 * seconds
-    east = after[2] - before[2] - (after[4] + before[4]) / 2 * seconds
-    limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(after[3], after[4]) * seconds
-    return (before[0] / 1e6, north, east) if north * north + east * east > limit * limit else None
 
 
 def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:

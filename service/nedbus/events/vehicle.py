@@ -194,12 +194,14 @@ class Vehicle:
         if old is None:
             return
         self._detectors[old] = None
-        held = dict.fromkeys(id(each) for (kind, _), each in self.conditions.items() if kind in kinds)
-        for number in held:
-            flags = tuple(flag for (_, flag), other in self.conditions.items() if id(other) == number)
-            each = next(other for other in self.conditions.values() if id(other) == number)
+        held: dict[Condition, list[str]] = {}
+        for (kind, flag), each in self.conditions.items():
+            if kind in kinds:
+                held.setdefault(each, []).append(flag)
+        for each, flags in held.items():
             text = f"{each.text}: over, {new.stream} tells from now on"
-            ended = Finding(each.kind, "end", "info", text, each.begin.names, flags=flags, initial=each.initial)
+            names = each.begin.names
+            ended = Finding(each.kind, "end", "info", text, names, flags=tuple(flags), initial=each.initial)
             self.emit(ended, new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:

@@ -1,4 +1,4 @@
-"""An observer: keep an account of the vehicles on a bus, from the samples that somebody else reads."""
+"""An observer: keep an account of the vehicles on a bus, from the samples of a reader."""
 
 from __future__ import annotations
 
