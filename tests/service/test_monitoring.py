@@ -25,7 +25,7 @@ from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.status import SourceStatus, State, StreamStatus
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, metrics, service_pages
-from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_families
+from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_metrics
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.transport import Session
@@ -333,9 +333,9 @@ def streams(count: int, topic: str = VLP) -> list[Stream]:
 def test_number_of_streams_is_bounded() -> None:
     """Beyond 1,000 streams the counts of the rest are added up for each source, and nothing else of them is shown."""
     count = MAX_STREAMS + 201
-    families = {each.name: each for each in stream_families(streams(count), messages=("nedbus_messages", "Messages"))}
+    families = {each.name: each for each in stream_metrics(streams(count), messages="nedbus_messages_received")}
     assert families["nedbus_streams"].samples[0].value == count
-    messages = {tuple(sample.labels.values()): sample.value for sample in families["nedbus_messages"].samples}
+    messages = {tuple(sample.labels.values()): sample.value for sample in families["nedbus_messages_received"].samples}
     assert len(messages) == MAX_STREAMS + 2
     assert messages["other", "other", "source 0"] == 3 * 101
     assert messages["other", "other", "source 1"] == 3 * 100
@@ -347,8 +347,8 @@ def test_number_of_streams_is_bounded() -> None:
 def test_positions_have_labels_before_others() -> None:
     """Alerts are about positions; of what has no rate there is no age, which an alert would take for silence."""
     many = [*streams(2, "home_position"), *streams(MAX_STREAMS, "battery_status"), *streams(3)]
-    families = {each.name: each for each in stream_families(many, messages=("nedbus_messages", "Messages"))}
-    topics = Counter(sample.labels["topic"] for sample in families["nedbus_messages"].samples)
+    families = {each.name: each for each in stream_metrics(many, messages="nedbus_messages_received")}
+    topics = Counter(sample.labels["topic"] for sample in families["nedbus_messages_received"].samples)
     assert topics == {VLP: 3, "home_position": 2, "battery_status": MAX_STREAMS - 5, "other": 2}
     ages = {sample.labels["topic"] for sample in families["nedbus_stream_age_seconds"].samples}
     assert ages == {VLP, "battery_status"}
@@ -359,10 +359,10 @@ def test_labels_are_escaped() -> None:
     """A source with quotes and line breaks in it is one label, and the page has the metrics of the process."""
     source = 'ulog:a"b\\c\nd{}é'
     strange = replace(streams(1)[0], source=source, latencies=Histogram((0.001, 1.0)))
-    families = stream_families([*streams(3), strange], messages=("nedbus_messages", "Messages"))
+    families = stream_metrics([*streams(3), strange], messages="nedbus_messages_received")
     text = metrics_page(families).content.decode()
     found = read_families(text)
-    assert [each.labels["source"] for each in found["nedbus_messages"].samples][-1] == source
+    assert [each.labels["source"] for each in found["nedbus_messages_received"].samples][-1] == source
     assert [each.value for each in found["nedbus_latency_seconds"].samples] == [0, 0, 0, 0, 0]
     assert text.count("\n# TYPE process_") == 6
 

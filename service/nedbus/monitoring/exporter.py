@@ -15,7 +15,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from typing import Any, Final
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 
 from nedbus.client import Bus, Monitor, Sample
 from nedbus.errors import NedbusError
@@ -24,7 +24,16 @@ from nedbus.transport import RouterState, Session, ask_routers
 from nedbus_msgs import Address, Selection
 
 from .http_server import Page
-from .metrics import MAX_STREAMS, Stream, build_info, is_switched_off, metrics_page, stream_families, vehicle_families
+from .metrics import (
+    MAX_STREAMS,
+    Stream,
+    build_info,
+    is_switched_off,
+    make_metrics,
+    metrics_page,
+    stream_metrics,
+    vehicle_metrics,
+)
 from .observer import Observer, Sight
 from .pages import vehicles_page
 
@@ -87,35 +96,28 @@ class Exporter:
     def pages(self) -> Mapping[str, Callable[[], Page]]:
         """The pages by path."""
         return {
-            "/metrics": lambda: metrics_page(self._families()),
+            "/metrics": lambda: metrics_page(self._metrics()),
             "/healthz": lambda: Page.text("ok"),
             "/readyz": lambda: Page.verdict(self._faults(), "ready"),
             "/vehicles": self._vehicles,
             "/status": self._status,
         }
 
-    def _families(self) -> Iterator[Metric]:
+    def _metrics(self) -> Iterator[Metric]:
         """Yield all metrics."""
+        counts, streams = self._subscription.counts, self._streams()
+        rooms = [((each.zid,), each.max_sessions) for each in self._routers if each.max_sessions is not None]
         yield build_info(self._version)
-        yield GaugeMetricFamily("nedbus_connected", "1 while there is a link to a router", value=self._bus.connected)
-        counts = self._subscription.counts
-        text = "Messages for which the exporter was too slow"
-        yield CounterMetricFamily("nedbus_messages_dropped", text, counts.dropped)
-        yield CounterMetricFamily("nedbus_messages_invalid", "Payloads that were no valid message", counts.invalid)
-        waiting = self._subscription.waiting
-        yield GaugeMetricFamily("nedbus_queue_messages", "Messages that wait to be read", value=waiting)
-        text = "Zenoh sessions at a router of the network, by its id"
-        sessions = GaugeMetricFamily("nedbus_router_sessions", text, labels=["router"])
-        room = GaugeMetricFamily("nedbus_router_sessions_max", "Sessions that a router accepts", labels=["router"])
-        for state in self._routers:
-            sessions.add_metric([state.zid], state.sessions)
-            if state.max_sessions is not None:
-                room.add_metric([state.zid], state.max_sessions)
-        yield from (sessions, room)
-        streams = self._streams()
-        received = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
-        yield from stream_families(streams, messages=received)
-        yield from vehicle_families(self.account, streams)
+        yield from make_metrics({
+            "nedbus_connected": [((), self._bus.connected)],
+            "nedbus_messages_dropped": [((), counts.dropped)],
+            "nedbus_messages_invalid": [((), counts.invalid)],
+            "nedbus_queue_messages": [((), self._subscription.waiting)],
+            "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
+            "nedbus_router_sessions_max": rooms,
+        })  # fmt: skip
+        yield from stream_metrics(streams, messages="nedbus_messages_received")
+        yield from vehicle_metrics(self.account, streams)
 
     def _streams(self) -> list[Stream]:
         """Return all streams, the first seen first, so that the same ones keep labels of their own."""

@@ -75,5 +75,5 @@ def _metrics(daemon: Daemon) -> Page:
         metrics = needs("metrics", "nedbus.monitoring.metrics")
     except ConfigError as exc:
         return Page.text(str(exc), status=501)
-    page: Page = metrics.metrics_page(metrics.service_families(daemon))
+    page: Page = metrics.metrics_page(metrics.service_metrics(daemon))
     return page
