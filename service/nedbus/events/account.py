@@ -82,6 +82,7 @@ class Account:
             if time < self._settled <= time + MAX_SILENCE:  # else the clock was set back
                 self.settle(time)
                 return
+            self._common.settle(time)
             for vehicle in self.vehicles.values():
                 state = None if states is None or vehicle.main is None else states.get(vehicle.main)
                 vehicle.look(time, state, is_connected=not link)
@@ -89,7 +90,7 @@ class Account:
     def settle(self, time: float) -> None:
         """Tell what is over by this time, at the end of a file."""
         with self._lock:
-            for vehicle in self.vehicles.values():
+            for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)
 
     def state(self, vehicle: str, time: float) -> State:
