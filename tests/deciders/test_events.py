@@ -210,6 +210,19 @@ def test_vehicle_that_does_not_return_with_the_link(flight: Flight) -> None:
     assert [each.text for each in told[0].evidence] == ["link is back after 60.0 s"]
 
 
+def test_link_that_flaps(flight: Flight) -> None:
+    """Of more than four changes in ten seconds the last is told, as of any condition, and the state is always true."""
+    told = []
+    for index in range(9):
+        flight.link = "no link" if index % 2 == 0 else ""
+        told += flight.wait(0.5).look("unknown")
+    assert brief(told) == [("link_down", "begin", "bad"), ("link_down", "end", "info")] * 2
+    told = flight.wait(6.0).look("unknown")
+    assert [event.text for event in told] == ["no link, the last of 5 changes that are not told"]
+    flight.link = ""
+    assert brief(flight.wait(10.0).look("unknown")) == [("link_down", "end", "info")]
+
+
 def test_overload(flight: Flight) -> None:
     """A reader that drops messages says so once, and after five seconds without a drop how many they were."""
     assert flight.look(dropped=0) == []
@@ -514,7 +527,7 @@ def test_memory_is_bounded() -> None:
     for number in range(1100):
         flight.send(f"unknown_{number}", vehicle="v1")
     known = flight.account.vehicles["v1"]
-    assert len(known._watches) <= 1000
+    assert len(known._detectors) <= 1000
     assert len(known.messages) <= 1000
     for number in range(KEPT + 100):
         flight.status(DISARMED, vehicle="v2", nav_state=number % 2)

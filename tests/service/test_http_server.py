@@ -7,15 +7,15 @@ import socket
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, nullcontext, suppress
 
 import pytest
 
 from nedbus.monitoring import HttpServer, Page, http_server
 from tests.http_pages import Pages
-from tests.waits import DEADLINE, wait_for
+from tests.waits import DEADLINE, repeating
 
-GO = threading.Event()
+GO, BUSY = threading.Event(), threading.Semaphore(0)
 PATHS = ("/metrics", "/healthz", "/readyz", "/vehicles", "/status")
 
 
@@ -27,6 +27,7 @@ def server() -> Iterator[Pages]:
         raise RuntimeError("a page that fails")
 
     def wait() -> Page:
+        BUSY.release()
         return Page.text(str(GO.wait(DEADLINE)))
 
     pages = {"/page": lambda: Page.text("a page"), "/fails": fail, "/waits": wait}
@@ -94,21 +95,6 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
     assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
-@pytest.mark.parametrize("sent", [b"", b"GET /page HTTP/1.0\r\nHost:"], ids=["silent", "half a request"])
-def test_silent_clients_block_nobody(server: Pages, sent: bytes) -> None:
-    """With 16 clients that send nothing, or half a request, the next one is answered, and the oldest has to go."""
-    address = "127.0.0.1", server.port
-    with ExitStack() as closing:
-        silent = [closing.enter_context(socket.create_connection(address, DEADLINE)) for _ in range(16)]
-        for client in silent:
-            client.sendall(sent)
-        for _ in range(20):
-            assert server.ask("/page") == (200, "a page\n")
-        assert silent[0].recv(1) == b""
-        silent[-1].sendall(b"\r\n\r\n" if sent else b"GET /page HTTP/1.0\r\n\r\n")
-        assert b"200 OK" in silent[-1].recv(1000)
-
-
 @pytest.mark.parametrize(
     ("sent", "answer"),
     [
@@ -130,37 +116,39 @@ def test_bad_requests_are_refused(server: Pages, caplog: pytest.LogCaptureFixtur
     assert not caplog.records
 
 
-def test_clients_that_do_not_read_their_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With 16 clients that read nothing of a large page, the next one is answered when their time is over."""
-    monkeypatch.setattr(http_server, "_PATIENCE", 0.1)
-    made = threading.Semaphore(0)
+@pytest.mark.parametrize(
+    ("sent", "each_second"),
+    [(b"", b""), (b"GET /page HTTP/1.0\r\nHost:", b""), (b"GET /", b"a"), (b"GET /large HTTP/1.0\r\n\r\n", b"")],
+    ids=["silent", "half a request", "byte by byte", "reads no answer"],
+)
+def test_slow_clients_are_ended(monkeypatch: pytest.MonkeyPatch, sent: bytes, each_second: bytes) -> None:
+    """With 16 clients that send nothing, or not all, or read nothing, the next is answered when their time is over."""
+    monkeypatch.setattr(http_server._Handler, "timeout", 0.5)
     large = Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
-
-    def make() -> Page:
-        made.release()
-        return large
-
-    server = HttpServer("127.0.0.1:0", {"/large": make, "/page": lambda: Page.text("a page")})
+    server = HttpServer("127.0.0.1:0", {"/large": lambda: large, "/page": lambda: Page.text("a page")})
     with closing(server), ExitStack() as clients:
-        for _ in range(16):
-            client = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
-            client.sendall(b"GET /large HTTP/1.0\r\n\r\n")
-            assert made.acquire(timeout=DEADLINE)
-        wait_for(lambda: Pages(server.port).ask("/page") == (200, "a page\n"), what="the time of one to be over")
+        slow = [
+            clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE)) for _ in range(16)
+        ]
+        for client in slow:
+            client.sendall(sent)
+
+        def drip() -> None:
+            for client in slow:
+                with suppress(OSError):
+                    client.sendall(each_second)
+
+        with repeating(drip) if each_second else nullcontext():
+            for _ in range(20):
+                assert Pages(server.port).ask("/page") == (200, "a page\n")
 
 
 def test_more_clients_than_it_has_room_for(server: Pages) -> None:
-    """While 16 are being answered no further one is; they get their answers, and then there is room again."""
-
-    def wait() -> tuple[int, str]:
-        """Ask until there is room: a client that has its answer may still count for a moment."""
-        while (answer := server.ask("/waits")) == (0, ""):
-            pass
-        return answer
-
-    with ThreadPoolExecutor(16) as pool:
-        waiting = [pool.submit(wait) for _ in range(16)]
-        wait_for(lambda: server.ask("/page") == (0, ""), what="no room")
+    """While 16 are being answered a further one waits; all get their answers."""
+    with ThreadPoolExecutor(17) as pool:
+        answers = [pool.submit(server.ask, "/waits") for _ in range(17)]
+        for _ in range(16):
+            assert BUSY.acquire(timeout=DEADLINE)
+        assert not BUSY.acquire(timeout=0.2)
         GO.set()
-        assert {answer.result(DEADLINE) for answer in waiting} == {(200, "True\n")}
-    wait_for(lambda: server.ask("/page") == (200, "a page\n"), what="room")
+        assert {answer.result(DEADLINE) for answer in answers} == {(200, "True\n")}

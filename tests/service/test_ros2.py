@@ -407,7 +407,7 @@ def test_one_instance_for_humble(run_nedbus: Start, endpoint: str, bus: nedbus.B
 
 def test_router_that_hides_ros_2_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A router whose access control has no rule for ROS 2 denies in silence: the bridge finds out, and ends."""
-    monkeypatch.setattr("nedbus.bridges.ros2._VISIBLE", 0.2)
+    monkeypatch.setattr("nedbus.bridges.ros2._VISIBLE_TIMEOUT", 0.2)
     endpoint, file = free_endpoint(), tmp_path / "router.json5"
     rules = [{"id": "no", "permission": "deny", "messages": ["liveliness_token"], "key_exprs": ["@ros2_lv/**"]}]
     policies = [{"rules": ["no"], "subjects": ["all"]}]

@@ -20,7 +20,7 @@ from nedbus.doctor import Finding
 from nedbus.doctor.endpoint import check_endpoint
 from nedbus.doctor.network import check_network
 from nedbus.errors import ConfigError
-from nedbus.monitoring import Exporter, router_watch, service_pages
+from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
 from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, router, router_max_sessions
 from nedbus.transport.router import allow_sessions
@@ -234,7 +234,7 @@ def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
 
 def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It asks the routers now and then, keeps the first few, and knows nothing of them when they are silent."""
-    monkeypatch.setattr(router_watch, "_PAUSE", 0.05)
+    monkeypatch.setattr(exporter, "_ROUTERS_PERIOD", 0.05)
     with nedbus.connect(small) as bus, exporting(bus) as shows:
         (state,) = ask(small)
         label = f'{{router="{state.zid}"}}'
@@ -242,14 +242,14 @@ def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> 
         with open_client([small], timeout=5.0):
             wait_for(lambda: shows(f"sessions{label} 3.0\n"), what="one more")
         wait_for(lambda: shows(f"sessions{label} 2.0\n"), what="its end")
-        monkeypatch.setattr(router_watch, "MAX_ROUTERS", 0)
+        monkeypatch.setattr(exporter, "_MAX_ROUTERS", 0)
         wait_for(lambda: not shows(f"sessions{label}"), what="nobody")
 
 
 def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a session to ask with it goes on reading, and asks as soon as there is room for one."""
-    monkeypatch.setattr(router_watch, "_PAUSE", 0.05)
-    monkeypatch.setattr(router_watch, "_OPEN", 0.1)
+    monkeypatch.setattr(exporter, "_ROUTERS_PERIOD", 0.05)
+    monkeypatch.setattr(exporter, "_SESSION_TIMEOUT", 0.1)
     where, tries, original = free_endpoint(), [], nedbus.Bus.open_session
 
     def count(bus: nedbus.Bus, *, timeout: float) -> Session:
@@ -281,31 +281,6 @@ def test_client_of_a_full_router(tmp_path: Path) -> None:
             *_, finding = check_endpoint(endpoint, None)
             assert (finding.state, "max_sessions" in finding.advice) == ("wrong", True)
         nedbus.connect(endpoint, timeout=DEADLINE).close()
-
-
-class Once(threading.Event):
-    """The exception that ends a loop where it would wait."""
-
-    def wait(self, timeout: float | None = None) -> bool:
-        self.set()
-        return True
-
-
-def test_watch_that_is_closed_opens_nothing(bus: nedbus.Bus) -> None:
-    """Whoever closes it while its session opens leaves none behind, and it opens no other."""
-    watch = router_watch.RouterWatch(bus)
-    original, opened = bus.open_session, []
-
-    def open_late(*, timeout: float) -> Session:
-        watch.close()
-        opened.append(original(timeout=timeout))
-        return opened[-1]
-
-    bus.open_session = open_late  # type: ignore[method-assign,assignment] # as the end of a process may come
-    for _ in range(2):
-        watch.run(Once())
-    assert [session.is_closed() for session in opened] == [True]
-    assert watch.states == ()
 
 
 class Limits:

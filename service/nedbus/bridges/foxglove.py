@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
+from foxglove.messages import Quaternion
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
@@ -90,9 +91,7 @@ class FoxgloveServer:
         if sample.topic == _ATTITUDE:
             self._attitudes[sample.vehicle] = sample.message
         if sample.topic == DEFAULT_TOPIC:
-            self._open_channels(sample.vehicle)
-            self._show_pose(sample.vehicle, sample.message, time_ns)
-            self._show_location(sample.vehicle, sample.message, time_ns)
+            self._show_position(sample.vehicle, sample.message, time_ns)
 
     def close(self) -> None:
         """Stop the server; it closes the connections of its clients."""
@@ -119,21 +118,17 @@ class FoxgloveServer:
         elif not get_topic(address.topic).rate:
             self._unseen[address] = message, time_ns  # it may never come again
 
-    def _open_channels(self, vehicle: str) -> None:
+    def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         if vehicle not in self._poses:
             self._poses[vehicle] = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
             self._locations[vehicle] = LocationFixChannel(f"/{vehicle}/location", context=self._context)
-
-    def _show_pose(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
-        if not has_position(message):
-            return
-        orientation = orientation_of(message, self._attitudes.get(vehicle))
-        self._poses[vehicle].log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
-        local_in_map = self._map.locate(vehicle, message)
-        transforms = to_transforms(vehicle, message, orientation, local_in_map=local_in_map, time_ns=time_ns)
-        self._transforms.log(transforms, log_time=time_ns)
-
-    def _show_location(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
+        if has_position(message):
+            x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
+            orientation = Quaternion(x=x, y=y, z=z, w=w)
+            self._poses[vehicle].log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
+            local_in_map = self._map.locate(vehicle, message)
+            transforms = to_transforms(vehicle, message, orientation, local_in_map=local_in_map, time_ns=time_ns)
+            self._transforms.log(transforms, log_time=time_ns)
         location = to_location(vehicle, message, time_ns=time_ns)
         if location is not None:
             self._locations[vehicle].log(location, log_time=time_ns)

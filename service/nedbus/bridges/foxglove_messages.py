@@ -20,7 +20,7 @@ from foxglove.messages import (
 from nedbus_msgs import MapProjection, VehicleLocalPosition, ned_to_enu, to_global, yaw_ned_to_enu
 
 _MAP: Final = "map"
-_FRESH: Final = 500_000  # us between a position and the attitude that goes with it
+_MAX_APART: Final = 500_000  # us between a position and the attitude that goes with it
 
 
 class MapFrame:
@@ -63,7 +63,7 @@ def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple
 
     Without either the vehicle faces east.
     """
-    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _FRESH:
+    if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
         w, x, y, z = (each * math.sqrt(0.5) for each in attitude.q)
         if math.isfinite(w + x + y + z):  # from ENU to NED, q, and from FLU to FRD, multiplied out
             return x + y, x - y, w - z, w + z
@@ -72,33 +72,26 @@ def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple
     return 0.0, 0.0, math.sin(half), math.cos(half)
 
 
-def to_pose(
-    vehicle: str, message: VehicleLocalPosition, orientation: tuple[float, ...], *, time_ns: int
-) -> PoseInFrame:
+def to_pose(vehicle: str, message: VehicleLocalPosition, orientation: Quaternion, *, time_ns: int) -> PoseInFrame:
     """Return the pose of a vehicle in its local frame."""
-    pose = Pose(position=_position(message), orientation=_quaternion(*orientation))
-    return PoseInFrame(timestamp=_stamp(time_ns), frame_id=_local(vehicle), pose=pose)
+    pose = Pose(position=_position(message), orientation=orientation)
+    return PoseInFrame(timestamp=_stamp(time_ns), frame_id=f"{vehicle}/local", pose=pose)
 
 
 def to_transforms(
-    vehicle: str, message: VehicleLocalPosition, orientation: tuple[float, ...], *, local_in_map: Vector3, time_ns: int
+    vehicle: str, message: VehicleLocalPosition, orientation: Quaternion, *, local_in_map: Vector3, time_ns: int
 ) -> FrameTransforms:
     """Return where the local frame is in the map, and where the vehicle is in its local frame."""
-    local = FrameTransform(
-        timestamp=_stamp(time_ns),
-        parent_frame_id=_MAP,
-        child_frame_id=_local(vehicle),
-        translation=local_in_map,
-        rotation=Quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
-    )
-    body = FrameTransform(
-        timestamp=_stamp(time_ns),
-        parent_frame_id=_local(vehicle),
-        child_frame_id=vehicle,
-        translation=_position(message),
-        rotation=_quaternion(*orientation),
-    )
-    return FrameTransforms(transforms=[local, body])
+    local, stamp, no_rotation = f"{vehicle}/local", _stamp(time_ns), Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    return FrameTransforms(transforms=[
+        FrameTransform(
+            timestamp=stamp, parent_frame_id=_MAP, child_frame_id=local, translation=local_in_map, rotation=no_rotation
+        ),
+        FrameTransform(
+            timestamp=stamp, parent_frame_id=local, child_frame_id=vehicle, translation=_position(message),
+            rotation=orientation,
+        ),
+    ])  # fmt: skip
 
 
 def to_location(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) -> LocationFix | None:
@@ -120,17 +113,9 @@ def to_location(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) ->
     )
 
 
-def _local(vehicle: str) -> str:
-    return f"{vehicle}/local"
-
-
 def _position(message: VehicleLocalPosition) -> Vector3:
     east, north, up = ned_to_enu((message.x, message.y, message.z))
     return Vector3(x=east, y=north, z=up)
-
-
-def _quaternion(x: float, y: float, z: float, w: float) -> Quaternion:
-    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _stamp(time_ns: int) -> Timestamp:

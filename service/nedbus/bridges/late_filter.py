@@ -24,7 +24,7 @@ _STANDING: Final = 1000  # ns between two timestamps of a clock that stands
 class LateFilter:
     """Admit what is current of each address, and count the rest.
 
-    `last` are the last samples from before: these are held back, as nobody knows how old they are.
+    `last` are the last samples from before: these are held back, as their age is not known.
     """
 
     def __init__(self, last: Iterable[Sample] = ()) -> None:

@@ -55,9 +55,9 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 _log = logging.getLogger(__name__)
 
 _POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
-_REMEMBERED: Final = 60.0  # s that a vehicle may be gone and still be recovered from; publishers keep 20 s
-_MAX_LEFT_OUT: Final = 1000  # addresses of which is said that they are left out
-_VISIBLE: Final = 5.0  # s after which what was announced is visible to others, or denied
+_MAX_ABSENCE: Final = 60.0  # s that a vehicle may be gone and still be recovered from; publishers keep 20 s
+_MAX_LEFT_OUT: Final = 1000  # addresses that are logged as left out
+_VISIBLE_TIMEOUT: Final = 5.0  # s after which a token is visible to other sessions, or denied
 
 
 class Ros2Bridge:
@@ -136,10 +136,10 @@ class Ros2Bridge:
 
     def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
         """Wait until the observer sees this node's token; raise NedbusError if the router hides it."""
-        end = time.monotonic() + _VISIBLE
+        end = time.monotonic() + _VISIBLE_TIMEOUT
         while not stop.is_set() and not alive_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
-                end = time.monotonic() + _VISIBLE  # without a link nobody sees anything
+                end = time.monotonic() + _VISIBLE_TIMEOUT  # without a link no other session sees anything
             elif time.monotonic() > end:
                 raise NedbusError(
                     "this router hides what nedbus announces to ROS 2: its access control has no rule for the keys of"
@@ -172,13 +172,12 @@ class Ros2Bridge:
         if held_back:
             _log.warning("%s: ROS 2 would use them as the current estimate", held_back, extra=about("held-back"))
         for address, since in list(self._withdrawn.items()):
-            if time.monotonic() - since > _REMEMBERED:
+            if time.monotonic() - since > _MAX_ABSENCE:
                 del self._withdrawn[address]
                 self._held.pop(address, None)
                 self._late_filter.forget(address)
-        addresses = [
-            address for addresses in self._bus.vehicles().values() for address in addresses if self._is_bridged(address)
-        ]
+        published = [address for addresses in self._bus.vehicles().values() for address in addresses]
+        addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
             return  # without a link the answers are incomplete
         nodes = self._other_nodes()
@@ -188,6 +187,7 @@ class Ros2Bridge:
 
     def _apply(self, decision: Decision) -> None:
         address, topic, other = decision.address, decision.topic, decision.other
+        conflict = about("conflict", address)
         if decision.action == "publish":
             self._open(address)
             self._withdrawn.pop(address, None)
@@ -196,31 +196,21 @@ class Ros2Bridge:
             _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
             if address in self._held:
                 self._put(self._held.pop(address))
-        elif decision.action == "conflict":
-            _log.warning(
-                "%s is not published: %s has the topic /%s already: set --namespace",
-                address,
-                other,
-                topic,
-                extra=about("conflict", address),
-            )
+            return
+        if decision.action == "conflict":
+            text = "%s is not published: %s has the topic /%s already: set --namespace"
+            _log.warning(text, address, other, topic, extra=conflict)
+            return
+        if address in self._publishers:
+            self._publishers.pop(address).close()
+        if decision.action == "defer":
+            text = "%s: node %s publishes /%s already: left to that node"
+            _log.warning(text, address, other, topic, extra=conflict)
         else:
-            if address in self._publishers:
-                self._publishers.pop(address).close()
-            if decision.action == "defer":
-                _log.warning(
-                    "%s: node %s publishes /%s already: left to that node",
-                    address,
-                    other,
-                    topic,
-                    extra=about("conflict", address),
-                )
-            else:
-                # After a router's restart it is back in a moment, and with it come the messages of the outage.
-                self._withdrawn[address] = time.monotonic()
-                _log.info(
-                    "%s is no longer published: /%s is withdrawn", address, topic, extra=about("withdrawn", address)
-                )
+            # After a router's restart it is back in a moment, and with it come the messages of the outage.
+            self._withdrawn[address] = time.monotonic()
+            text = "%s is no longer published: /%s is withdrawn"
+            _log.info(text, address, topic, extra=about("withdrawn", address))
 
     def _other_nodes(self) -> dict[TopicKey, str]:
         """Return the name of another node for each topic that one publishes, by one query: there may be thousands."""
@@ -235,15 +225,11 @@ class Ros2Bridge:
     def _open(self, address: Address) -> None:
         key = self._key(address)
         self._entities += 1
-        token = publisher_token(key, self._zid, self._node, self._entities)
+        token, drop = publisher_token(key, self._zid, self._node, self._entities), zenoh.CongestionControl.DROP
         with while_open():
-            self._publishers[address] = _Ros2Publisher(
-                gid_of_token(token),
-                self._session.declare_publisher(
-                    str(key), encoding=BRIDGED_ENCODING, congestion_control=zenoh.CongestionControl.DROP
-                ),
-                self._session.liveliness().declare_token(token),
-            )
+            publisher = self._session.declare_publisher(str(key), encoding=BRIDGED_ENCODING, congestion_control=drop)
+            declared = self._session.liveliness().declare_token(token)
+        self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
 
     def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]

@@ -1,13 +1,17 @@
-"""What happened, and why: events of vehicles from their messages, live or of a file; no I/O."""
+"""Events of vehicles from their messages, live or of a file, and the answer to why; no I/O.
+
+A new kind of event is a row of KINDS in `event.py`, its flags or thresholds in `rules.py`, and a finding of a detector
+in `detectors.py` or `position.py`.
+"""
 
 from .account import KEPT, Account
 from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State, to_age
 from .faults import VALID, Expectation, faults_of, merge_vehicles
 from .report import FORGOTTEN, QUESTION, AccountReport, VehicleReport, by_vehicle, from_json, report_of
-from .rules import FIXES, MODES
+from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, about, spans_of, state_at, tell
 from .times import Times, to_clock
-from .vehicle import RECENT, Vehicle
+from .vehicle import Vehicle
 
 __all__ = [
     "ALL",

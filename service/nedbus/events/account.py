@@ -9,21 +9,23 @@ from typing import Final
 
 from nedbus_msgs import Address
 
-from .event import ALL, Condition, Event, Severity, State, state_of, to_age
-from .vehicle import SILENT, Vehicle
+from .detectors import Finding
+from .event import ALL, Condition, Event, Severity, State, state_of
+from .rules import MAX_SILENCE, PAUSE
+from .vehicle import Vehicle
 
 KEPT: Final = 2000
 """Events that an account keeps."""
 
 _MAX_VEHICLES: Final = 1000
-_OVERLOADED: Final = 5.0  # s without a dropped message after which an overload is over
 _NONE: Final[frozenset[str]] = frozenset()
 
 
 class Account:
     """Follow vehicles; samples may come from another thread than looks and questions.
 
-    `events`: the last ones, in the order in which they were told; `counts`: of all, by vehicle and severity.
+    `events`: the last ones, in the order in which they were told; `told`: the number of all; `counts`: of all, by
+    vehicle and severity.
     """
 
     def __init__(self, keep: int = KEPT) -> None:
@@ -31,11 +33,15 @@ class Account:
         self.vehicles: dict[str, Vehicle] = {}
         self.counts: Counter[tuple[str, Severity]] = Counter()
         self.told = 0
-        self.link: Condition | None = None
-        self.overload: Condition | None = None
+        self._common = Vehicle(ALL, self._keep)  # the link, and the reader itself
         self._dropped = 0
-        self._overloaded = self._calm = self._looked = 0.0
+        self._last_overload = self._settled = 0.0
         self._lock = threading.RLock()
+
+    @property
+    def overload(self) -> Condition | None:
+        """The overload of this reader, while there is one."""
+        return self._common.conditions.get(("overload", ""))
 
     def add(
         self, address: Address, message: object, time: float, *, missing: frozenset[str] = _NONE, lost: int = 0
@@ -69,28 +75,22 @@ class Account:
         What a reader has not read says nothing of its vehicles.
         """
         with self._lock:
-            if time < self._looked:  # the clock was set back
-                self._calm, self._overloaded = min(self._calm, time), min(self._overloaded, time)
-            self._looked = time
             self._look_at_link(time, link)
             self._look_at_reader(time, dropped, is_behind=is_behind)
             if self.overload is not None:
-                self._calm = time + SILENT  # what was held up needs a moment to arrive
-            if time < self._calm:
+                self._settled = time + MAX_SILENCE  # what was held up needs a moment to arrive
+            if time < self._settled <= time + MAX_SILENCE:  # else the clock was set back
                 self.settle(time)
                 return
+            self._common.settle(time)
             for vehicle in self.vehicles.values():
                 state = None if states is None or vehicle.main is None else states.get(vehicle.main)
-                if state is not None:
-                    silent = {"stale": "silent", "gone": "gone"}.get(state)
-                else:
-                    silent = "silent" if self.link is None and vehicle.silence(time) > SILENT else None
-                vehicle.look(time, silent=silent)
+                vehicle.look(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
         """Tell what is over by this time, at the end of a file."""
         with self._lock:
-            for vehicle in self.vehicles.values():
+            for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)
 
     def state(self, vehicle: str, time: float) -> State:
@@ -100,7 +100,7 @@ class Account:
             return known.state(time) if known is not None else state_of(())
 
     def take(self, seen: int) -> tuple[list[Event], int]:
-        """Return the events after the first `seen` ones, and how many there have been by now."""
+        """Return the events after the first `seen` ones, and the number of all by now."""
         with self._lock:
             new = min(self.told - seen, len(self.events))
             return list(self.events)[len(self.events) - new :], self.told
@@ -111,43 +111,26 @@ class Account:
             known = self.vehicles[name] = Vehicle(name, self._keep, self._common)
         return known
 
-    def _common(self) -> list[Condition]:
-        """Return what holds for all vehicles."""
-        return [each for each in (self.link, self.overload) if each is not None]
-
-    def _tell_all(self, event: Event) -> None:
-        self._keep(event)
-        for vehicle in self.vehicles.values():
-            vehicle.note(event)
-
     def _keep(self, event: Event) -> None:
         self.events.append(event)
         self.counts[event.vehicle, event.severity] += 1
         self.told += 1
 
     def _look_at_link(self, time: float, link: str) -> None:
-        if link and self.link is None:
-            event = Event(ALL, "link_down", "begin", "bad", link, time)
-            self.link = Condition("link_down", "bad", link, time, event)
-            self._tell_all(event)
-        elif not link and self.link is not None:
-            lasted = time - self.link.since
-            text = f"link is back after {to_age(lasted)}"
-            self._tell_all(Event(ALL, "link_down", "end", "info", text, time, lasted=lasted))
-            self.link = None
+        is_down = ("link_down", "") in self._common.conditions
+        if link and not is_down:
+            self._common.emit(Finding("link_down", "begin", "bad", link), "", time)
+        elif is_down and not link:
+            self._common.emit(Finding("link_down", "end", "info", "link is back"), "", time)
 
     def _look_at_reader(self, time: float, dropped: int, *, is_behind: bool) -> None:
         if dropped > self._dropped or is_behind:
-            self._overloaded = time
+            self._last_overload = time
             if self.overload is None:
                 text = "this reader is slower than the data: messages are not read"
-                event = Event(ALL, "overload", "begin", "watch", text, time)
-                self.overload = Condition("overload", "watch", text, time, event)
-                self._tell_all(event)
-        elif self.overload is not None and time - self._overloaded > _OVERLOADED:
-            lasted = self._overloaded - self.overload.since
-            text = f"this reader keeps up again: {dropped} messages were not read"
-            numbers = {"messages": dropped}
-            self._tell_all(Event(ALL, "overload", "end", "info", text, time, numbers=numbers, lasted=lasted))
-            self.overload = None
+                self._common.emit(Finding("overload", "begin", "watch", text), "", time)
+        elif self.overload is not None and not 0 <= time - self._last_overload <= PAUSE:
+            text = f"{dropped} messages were not read: this reader keeps up again"
+            ended = Finding("overload", "end", "info", text, numbers={"messages": dropped})
+            self._common.emit(ended, "", time, changed=self._last_overload)
         self._dropped = dropped

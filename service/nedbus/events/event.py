@@ -1,4 +1,4 @@
-"""An event: what happened to a vehicle, when, how bad it is, and which events before it explain it."""
+"""Events, conditions and states of a vehicle; all kinds of events, and the evidence that may explain each."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What holds for a vehicle now: since when, by the account's clock, and the event that began it.
+    """A condition of a vehicle: since when it holds, by the account's clock, and the event that began it.
 
     `initial`: it held at the first message already: it began at an unknown time before.
     `on_ground`: its severity while the vehicle is disarmed, where that is another.
@@ -91,6 +91,7 @@ _SENSING: Final = (
     "gps_fix_lost", "gps_fix", "few_satellites", "jamming", "spoofing", "not_fused", "innovation_rejected",
     "estimator_fault",
 )  # fmt: skip
+_CORRECTIONS: Final = ("reset", "jump", "origin_set", "origin_moved")
 _ESTIMATE: Final = ("xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "dead_reckoning")
 KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("xy_invalid", "v_xy_invalid"), (*_SENSING, "dead_reckoning", "reboot")),
@@ -128,6 +129,26 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "overload": (),
 }  # fmt: skip
 """All kinds, each with those that may explain it."""
+
+
+def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
+    """Return the events that may explain one, the last of each kind: at most WINDOW before it, or begun and going on.
+
+    A begin is explained by what went wrong, an end by what ended; a correction of the estimate by either.
+    """
+    kinds, latest = KINDS[event.kind], {}
+    unwanted = "begin" if event.change == "end" else "end" if event.kind not in _CORRECTIONS else ""
+    for each in before:
+        is_bad = each.severity != "info" or event.change == "end" or event.kind in _CORRECTIONS
+        is_near = event.time - WINDOW <= each.time <= event.time
+        is_link = each.kind == "link_down"  # what was lost is seen when the link is back
+        if each is not event and each.kind in kinds and is_near and (is_link or (is_bad and each.change != unwanted)):
+            latest[each.kind] = each
+    for condition in conditions:
+        is_before = condition.begin.time <= event.time  # an event may be told late
+        if condition.kind in kinds and condition.severity != "info" and event.change != "end" and is_before:
+            latest.setdefault(condition.kind, condition.begin)
+    return sorted(latest.values(), key=lambda each: each.time)
 
 
 def to_age(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""What is wrong with vehicles, a line for each fault: the judgement of health checks, whoever asks for it."""
+"""Faults of vehicles for health checks, a line each."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .times import to_clock
 VALID: Final[Mapping[str, str]] = {
     "xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid",
 }  # fmt: skip
-"""What may be asked to be valid, and the flag that says so."""
+"""Quantities that may be required to be valid, and their flags."""
 
 _MAX_LINES: Final = 20  # of what happened lately
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What somebody counts on.
+    """The conditions of a health check.
 
-    `expect`: vehicles that must be heard; `vehicles`: how many must be, at least; `valid`: keys of VALID that must be
+    `expect`: vehicles that must be heard; `vehicles`: the least number of them; `valid`: keys of VALID that must be
     valid; `within`: seconds in which nothing may have happened that is bad or to be watched; `well`: no state is bad.
     """
 

@@ -69,7 +69,7 @@ def since_text(since: float | None, now: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """What one service remembers; times are seconds since the epoch by its host's clock."""
+    """The memory of one service; times are seconds since the epoch by its host's clock."""
 
     service: str
     host: str

@@ -1,4 +1,4 @@
-"""The flags whose change is an event, by message, and the words for each; thresholds and the names of modes."""
+"""The flags whose change is an event, by message, with their texts; all thresholds, and the names of modes."""
 
 from __future__ import annotations
 
@@ -39,33 +39,6 @@ def _valid(field: str, kind: str, word: str) -> FlagRule:
     )
 
 
-POSITION: Final = (
-    _valid("xy_valid", "xy_invalid", "xy"),
-    _valid("z_valid", "z_invalid", "z"),
-    _valid("v_xy_valid", "v_xy_invalid", "vxy"),
-    _valid("v_z_valid", "v_z_invalid", "vz"),
-    FlagRule(
-        "dead_reckoning", {"dead_reckoning": "dead reckoning"}, "dead reckoning", "dead reckoning ends",
-        initial=True,
-    ),
-    FlagRule(
-        "heading_not_good", {"heading_good_for_control": "heading"}, "heading not good for control",
-        "heading good for control", bad=False, severity="info",
-    ),
-    FlagRule(
-        "xy_not_global", {"xy_global": "xy"}, "xy has no global reference", "xy has a global reference", bad=False,
-        on_ground="info",
-    ),
-    FlagRule(
-        "z_not_global", {"z_global": "z"}, "z has no global reference", "z has a global reference", bad=False,
-        on_ground="info",
-    ),
-    FlagRule(
-        "dist_bottom_invalid", {"dist_bottom_valid": "distance to ground"}, "distance to ground not valid",
-        "distance to ground valid", bad=False, severity="info",
-    ),
-)  # fmt: skip
-
 _AIDING: Final = {
     "cs_gnss_pos": "GNSS position", "cs_gnss_vel": "GNSS velocity", "cs_ev_pos": "vision position",
     "cs_ev_vel": "vision velocity", "cs_opt_flow": "optical flow", "cs_aux_gpos": "auxiliary position",
@@ -94,24 +67,6 @@ _REJECTED: Final = {
     "reject_airspeed": "airspeed", "reject_sideslip": "sideslip", "reject_hagl": "height above ground",
     "reject_optflow_x": "optical flow x", "reject_optflow_y": "optical flow y",
 }  # fmt: skip
-ESTIMATOR: Final = (
-    FlagRule(
-        "not_fused", {**_AIDING, **_HEIGHTS}, "no longer fused: {}", "fused: {}", bad=False, on_ground="info",
-        minor=frozenset(_HEIGHTS),
-    ),
-    FlagRule("innovation_rejected", _REJECTED, "EKF rejects {}", "EKF accepts {} again"),
-    FlagRule("estimator_fault", _FAULTS, "EKF fault: {}", "EKF fault over: {}", initial=True),
-)  # fmt: skip
-STATUS: Final = (
-    FlagRule(
-        "failsafe", {"failsafe": "failsafe"}, "failsafe", "failsafe ends", severity="bad", initial=True
-    ),
-    FlagRule(
-        "gcs_lost", {"gcs_connection_lost": "ground station"}, "link to the ground station lost",
-        "link to the ground station", on_ground="info",
-    ),
-)  # fmt: skip
-
 _LACKS: Final = (
     "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
     "local_position_invalid_relaxed", "local_velocity_invalid", "global_position_invalid",
@@ -121,32 +76,94 @@ _LACKS: Final = (
     "vtol_fixed_wing_system_failure", "wind_limit_exceeded", "flight_time_limit_exceeded", "position_accuracy_low",
     "navigator_failure", "parachute_unhealthy", "traffic_avoidance_unhealthy", "remote_id_unhealthy", "gnss_lost",
 )  # fmt: skip
-FAILSAFE: Final = (
-    FlagRule(
-        "failsafe_flag", {name: name.replace("_", " ") for name in _LACKS}, "failsafe flags: {}",
-        "failsafe flags cleared: {}", on_ground="info",
-    ),
-)  # fmt: skip
-
 RULES: Final[Mapping[str, tuple[FlagRule, ...]]] = {
-    "VehicleLocalPosition": POSITION, "EstimatorStatusFlags": ESTIMATOR, "VehicleStatus": STATUS,
-    "FailsafeFlags": FAILSAFE,
+    "VehicleLocalPosition": (
+        _valid("xy_valid", "xy_invalid", "xy"),
+        _valid("z_valid", "z_invalid", "z"),
+        _valid("v_xy_valid", "v_xy_invalid", "vxy"),
+        _valid("v_z_valid", "v_z_invalid", "vz"),
+        FlagRule(
+            "dead_reckoning", {"dead_reckoning": "dead reckoning"}, "dead reckoning", "dead reckoning ends",
+            initial=True,
+        ),
+        FlagRule(
+            "heading_not_good", {"heading_good_for_control": "heading"}, "heading not good for control",
+            "heading good for control", bad=False, severity="info",
+        ),
+        FlagRule(
+            "xy_not_global", {"xy_global": "xy"}, "xy has no global reference", "xy has a global reference",
+            bad=False, on_ground="info",
+        ),
+        FlagRule(
+            "z_not_global", {"z_global": "z"}, "z has no global reference", "z has a global reference", bad=False,
+            on_ground="info",
+        ),
+        FlagRule(
+            "dist_bottom_invalid", {"dist_bottom_valid": "distance to ground"}, "distance to ground not valid",
+            "distance to ground valid", bad=False, severity="info",
+        ),
+    ),
+    "EstimatorStatusFlags": (
+        FlagRule(
+            "not_fused", {**_AIDING, **_HEIGHTS}, "no longer fused: {}", "fused: {}", bad=False, on_ground="info",
+            minor=frozenset(_HEIGHTS),
+        ),
+        FlagRule("innovation_rejected", _REJECTED, "EKF rejects {}", "EKF accepts {} again"),
+        FlagRule("estimator_fault", _FAULTS, "EKF fault: {}", "EKF fault over: {}", initial=True),
+    ),
+    "VehicleStatus": (
+        FlagRule("failsafe", {"failsafe": "failsafe"}, "failsafe", "failsafe ends", severity="bad", initial=True),
+        FlagRule(
+            "gcs_lost", {"gcs_connection_lost": "ground station"}, "link to the ground station lost",
+            "link to the ground station", on_ground="info",
+        ),
+    ),
+    "FailsafeFlags": (
+        FlagRule(
+            "failsafe_flag", {name: name.replace("_", " ") for name in _LACKS}, "failsafe flags: {}",
+            "failsafe flags cleared: {}", on_ground="info",
+        ),
+    ),
 }  # fmt: skip
 
-FIX: Final = 3
+RECENT: Final = 60.0
+"""Seconds for which something that happened once is a reason to watch a vehicle."""
+
+MAX_SILENCE: Final = 3.0
+"""Seconds without a position after which a vehicle is silent, where nothing better is known of its stream."""
+
+MIN_FIX_TYPE: Final = 3
 """The fix_type of SensorGps from which on a position is a fix in three dimensions."""
 
-FEW: Final = 6, 7
-"""Satellites: fewer than the first are few (PX4's EKF2_REQ_NSATS), until there are as many as the second."""
+FEW_SATELLITES: Final = 6
+"""Fewer satellites are few (PX4's EKF2_REQ_NSATS), until there are ENOUGH_SATELLITES."""
 
-JAMMED: Final = 80, 60
-"""The jamming_indicator from which on PX4's guide to logs calls it too high, and below which it is over."""
+ENOUGH_SATELLITES: Final = 7
 
-JUMP: Final = 1.0, 0.2
-"""A jump is more than so many metres beyond what the velocity explains, and this share of the distance flown."""
+JAMMING_BEGIN: Final = 80
+"""The jamming_indicator that PX4's guide to logs calls too high, until it is below JAMMING_END."""
 
-SMALL: Final = 0.5
+JAMMING_END: Final = 60
+
+JUMP_DISTANCE: Final = 1.0
+"""Metres: a jump is more than this, and JUMP_SHARE of the distance flown, beyond what the velocity explains."""
+
+JUMP_SHARE: Final = 0.2
+
+SMALL_RESET: Final = 0.5
 """Metres, and metres a second, below which a reset is nothing to watch."""
+
+FLAPPING_CHANGES: Final = 4
+"""Changes of a condition within WINDOW after which further ones are told when they end."""
+
+PAUSE: Final = 5.0
+"""Seconds without another one after which flapping, losses, rejections or an overload of the reader are over."""
+
+MAX_BURST: Final = 20.0
+"""Seconds after which losses are told, though more may follow."""
+
+OUTLIVING: Final = ("silent", "gone", "rejected")
+"""Conditions that a reboot does not end."""
 
 ARMED: Final = 2
 """The arming_state of a vehicle that is armed."""

@@ -18,7 +18,7 @@ _UNIX: Final = 1e9  # s since boot beyond which PX4's time is Unix time, as some
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """How times are told: live, or by the offsets of the vehicles of a file.
+    """The rule by which times are shown: live, or by the offsets of the vehicles of a file.
 
     `is_live`: the account's clock is this host's, in seconds since the epoch.
     `offsets`: Unix time minus time since boot [s], by vehicle, where a message tells it.

@@ -1,4 +1,4 @@
-"""What a monitoring system reads over HTTP: metrics, health, readiness, status."""
+"""Monitoring over HTTP: metrics, health, readiness and status."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""An exporter: a reader of every message that shows what it sees, where no service of ours serves metrics.
+"""An exporter: metrics of all that a reader receives, for networks where no service of ours serves metrics.
 
 Needs the extra `metrics`.
 """
@@ -11,32 +11,46 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from typing import Any, Final
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
-from prometheus_client.registry import Collector
+from prometheus_client.core import Metric
 
 from nedbus.client import Bus, Monitor, Sample
+from nedbus.errors import NedbusError
 from nedbus.events import Account, report_of
+from nedbus.transport import RouterState, Session, ask_routers
 from nedbus_msgs import Address, Selection
 
-from .exposition import build_info, metrics_page
-from .families import MAX_STREAMS, Stream, is_switched_off, stream_families, vehicle_families
 from .http_server import Page
+from .metrics import (
+    MAX_STREAMS,
+    Stream,
+    build_info,
+    is_switched_off,
+    make_metrics,
+    metrics_page,
+    stream_metrics,
+    vehicle_metrics,
+)
 from .observer import Observer, Sight
 from .pages import vehicles_page
-from .router_watch import RouterWatch
 
-_LOOK: Final = 0.5  # s between two looks at all vehicles
-_MAX_SOURCES: Final = 4 * MAX_STREAMS  # that are remembered
-_RECEIVED: Final = "nedbus_messages_received", "Messages that arrived here, were valid and were read"
+_LOOK_PERIOD: Final = 0.5  # s between two looks at all vehicles
+_MAX_SOURCES: Final = 4 * MAX_STREAMS  # addresses whose source is remembered
+_MAX_ROUTERS: Final = 16  # that are shown: any peer may claim to be one
+_ROUTERS_PERIOD: Final = 10.0  # s between two queries of all routers; longer where the answers are large:
+_MAX_ROUTERS_PERIOD: Final = 60.0
+_SESSIONS_PER_SECOND: Final = 20  # 3.7 kB: a router's answer has 183 bytes for each of its sessions
+_ROUTERS_TIMEOUT: Final = 5.0  # s for all answers, over a slow link perhaps
+_SESSION_TIMEOUT: Final = 1.0  # s
 
 
-class Exporter(Collector):
-    """Read all that a selection matches, and make pages of what was seen.
+class Exporter:
+    """Read all that a selection matches, and make pages of it.
 
-    `watch` gets each sample as well, and `on_look` what is seen of all vehicles twice a second.
+    `watch` gets each sample as well, and `on_look` the sight of all vehicles twice a second.
     """
 
     def __init__(
@@ -51,31 +65,27 @@ class Exporter(Collector):
         self._bus = bus
         self._watch, self._on_look = watch, on_look
         self._version = version
-        self._subscription = bus.subscribe(
-            selection.topic, vehicle=selection.vehicle, instance=selection.instance, mode="every"
-        )
+        self._subscription = bus.subscribe_to(selection, mode="every")
         self._monitor = Monitor()
         self._observer = Observer(bus, selection)
-        self._routers = RouterWatch(bus)
+        self._routers: list[RouterState] = []
         self._sources: dict[Address, str] = {}
         self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
     def run(self, stop: threading.Event) -> None:
-        """Read until `stop` is set; raise what ends the reader before."""
+        """Read until `stop` is set; raise the error that ends the reader before."""
         with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
-            reading = pool.submit(self._read)
-            reading.add_done_callback(lambda _: stop.set())
-            asking = pool.submit(self._routers.run, stop)
-            asking.add_done_callback(lambda _: stop.set())
+            tasks = pool.submit(self._read), pool.submit(self._ask_routers, stop)
+            for task in tasks:
+                task.add_done_callback(lambda _: stop.set())
             try:
-                while not stop.wait(_LOOK):
+                while not stop.wait(_LOOK_PERIOD):
                     self._look()
             finally:
                 stop.set()
-                self._routers.close()
                 self._subscription.close()
-            reading.result()
-            asking.result()
+            for task in tasks:
+                task.result()
 
     @property
     def account(self) -> Account:
@@ -86,43 +96,31 @@ class Exporter(Collector):
     def pages(self) -> Mapping[str, Callable[[], Page]]:
         """The pages by path."""
         return {
-            "/metrics": lambda: metrics_page(self),
+            "/metrics": lambda: metrics_page(self._metrics()),
             "/healthz": lambda: Page.text("ok"),
-            "/readyz": self._ready,
+            "/readyz": lambda: Page.verdict(self._faults(), "ready"),
             "/vehicles": self._vehicles,
             "/status": self._status,
         }
 
-    def collect(self) -> Iterator[Metric]:
+    def _metrics(self) -> Iterator[Metric]:
         """Yield all metrics."""
+        counts, streams = self._subscription.counts, self._streams()
+        rooms = [((each.zid,), each.max_sessions) for each in self._routers if each.max_sessions is not None]
         yield build_info(self._version)
-        yield GaugeMetricFamily("nedbus_connected", "1 while there is a link to a router", value=self._bus.connected)
-        counts = self._subscription.counts
-        yield CounterMetricFamily(
-            "nedbus_messages_dropped", "Messages for which the exporter was too slow", counts.dropped
-        )
-        yield CounterMetricFamily("nedbus_messages_invalid", "Payloads that were no valid message", counts.invalid)
-        yield GaugeMetricFamily(
-            "nedbus_queue_messages", "Messages that wait to be read", value=self._subscription.waiting
-        )
-        yield from self._router_families()
-        streams = self._streams()
-        yield from stream_families(streams, messages=_RECEIVED)
-        yield from vehicle_families(self.account, streams)
-
-    def _router_families(self) -> Iterator[Metric]:
-        sessions = GaugeMetricFamily(
-            "nedbus_router_sessions", "Zenoh sessions at a router of the network, by its id", labels=["router"]
-        )
-        room = GaugeMetricFamily("nedbus_router_sessions_max", "Sessions that a router accepts", labels=["router"])
-        for state in self._routers.states:
-            sessions.add_metric([state.zid], state.sessions)
-            if state.max_sessions is not None:
-                room.add_metric([state.zid], state.max_sessions)
-        yield from (sessions, room)
+        yield from make_metrics({
+            "nedbus_connected": [((), self._bus.connected)],
+            "nedbus_messages_dropped": [((), counts.dropped)],
+            "nedbus_messages_invalid": [((), counts.invalid)],
+            "nedbus_queue_messages": [((), self._subscription.waiting)],
+            "nedbus_router_sessions": [((state.zid,), state.sessions) for state in self._routers],
+            "nedbus_router_sessions_max": rooms,
+        })  # fmt: skip
+        yield from stream_metrics(streams, messages="nedbus_messages_received")
+        yield from vehicle_metrics(self.account, streams)
 
     def _streams(self) -> list[Stream]:
-        """Return all streams, those that were seen first first: which ones have labels of their own does not change."""
+        """Return all streams, the first seen first, so that the same ones keep labels of their own."""
         with self._lock:
             healths = sorted(self._monitor.snapshot().items(), key=lambda item: item[0] not in self._sources)
             latencies = {address: self._monitor.latencies(address) for address, _ in healths}
@@ -131,15 +129,11 @@ class Exporter(Collector):
             silent.difference_update(*self._bus.vehicles().values())
         return [
             Stream(
-                address.vehicle,
-                str(address).partition("/")[2],
-                self._sources.get(address, ""),
-                health,
-                active=address not in silent,
-                latencies=latencies[address],
+                address.vehicle, address.stream, self._sources.get(address, ""), health, address not in silent,
+                latencies[address],
             )
             for address, health in healths
-        ]
+        ]  # fmt: skip
 
     def _read(self) -> None:
         for sample in self._subscription.rows():
@@ -150,21 +144,35 @@ class Exporter(Collector):
             self._observer.add(sample)
             self._watch(sample)
 
+    def _ask_routers(self, stop: threading.Event) -> None:
+        """Ask all routers for their sessions every 10 s, less often where there are more than 200, until `stop` is set.
+
+        In a session of its own: the answer of a router with 1,000 sessions, 183 kB, does not hold up messages.
+        """
+        session: Session | None = None
+        with ExitStack() as closing:
+            while not stop.is_set():
+                states: list[RouterState] = []
+                with suppress(NedbusError):  # no room for this session, a broken link: then nothing is known
+                    session = session or closing.enter_context(self._bus.open_session(timeout=_SESSION_TIMEOUT))
+                    states = ask_routers(session, timeout=_ROUTERS_TIMEOUT)
+                self._routers = states[:_MAX_ROUTERS]
+                period = sum(state.sessions for state in states) / _SESSIONS_PER_SECOND
+                stop.wait(min(_MAX_ROUTERS_PERIOD, max(_ROUTERS_PERIOD, period)))
+
     def _look(self) -> None:
         with self._lock:
             healths = self._monitor.snapshot()
         dropped, waiting = self._subscription.counts.dropped, self._subscription.waiting
         self._on_look(self._observer.look(healths, dropped=dropped, waiting=waiting))
 
+    def _faults(self) -> list[str]:
+        return [] if self._bus.connected else [f"no router answers at {' or '.join(self._bus.routers)}"]
+
     def _vehicles(self) -> Page:
         if not self._bus.connected:
-            return self._ready()
+            return Page.verdict(self._faults(), "")
         return vehicles_page(report_of(self.account, "export", socket.gethostname(), time.time(), within=0.0))
-
-    def _ready(self) -> Page:
-        if self._bus.connected:
-            return Page.text("ready")
-        return Page.text(f"no router answers at {' or '.join(self._bus.routers)}", status=503)
 
     def _status(self) -> Page:
         with self._lock:

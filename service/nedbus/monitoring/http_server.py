@@ -1,4 +1,4 @@
-"""A small HTTP server that can only be read: each path has a page, and a client can change nothing."""
+"""A read-only HTTP server: one page per path."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, cast
 
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
@@ -18,8 +18,8 @@ from nedbus.settings import is_loopback, split_http
 
 _log = logging.getLogger(__name__)
 
-_CLIENTS: Final = 16  # that are answered at the same time
-_PATIENCE: Final = 5.0  # s that a client may take to ask, and to read the answer
+_MAX_REQUESTS: Final = 16  # at the same time
+_CLIENT_TIMEOUT: Final = 5.0  # s to send a request, to read the answer, and to wait for a free thread
 _ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # a Prometheus or a probe calls a host as it likes
 
 
@@ -35,13 +35,18 @@ class Page(NamedTuple):
         """Return a page of plain text."""
         return cls(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
+    @classmethod
+    def verdict(cls, faults: list[str], good: str) -> Page:
+        """Return the faults, a line each, with status 503; `good` if there are none."""
+        return cls.text("\n".join(faults), status=503) if faults else cls.text(good)
+
 
 class HttpServer:
     """Serve pages by path on HOST:PORT, in threads of its own, until it is closed.
 
-    A page of somebody else in a browser on this network may make its own name lead here and read what is answered
-    under that name. So a page is answered under names that only lead here: addresses, localhost, the names of this
-    host and, for others than this host, names without a dot, as in Docker. Others may ask by any name for metrics,
+    DNS rebinding: a foreign page in a browser on this network may point its own name at this host and read what is
+    answered under that name. So a page is answered under names that only lead here: addresses, localhost, the names of
+    this host and, for others than this host, names without a dot, as in Docker. Others may ask by any name for metrics,
     health, readiness and the states of vehicles.
 
     Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
@@ -53,7 +58,7 @@ class HttpServer:
         except ValueError as exc:
             raise ConfigError("--http", str(exc)) from exc
         try:
-            self._server = _Server((host, port), _make_handler(pages, local=is_loopback(host)))
+            self._server = _Server(host, port, pages)
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
@@ -62,105 +67,81 @@ class HttpServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         self._server.shutdown()
         self._server.server_close()
 
 
 class _Server(ThreadingHTTPServer):
-    """Answer at most 16 clients at a time; when there are more, the one that was silent for longest has to go."""
-
     daemon_threads = True
-    allow_reuse_address = True
-    request_queue_size = 2 * _CLIENTS  # with Python's five the sixth that connects at once waits for a second
+    request_queue_size = 2 * _MAX_REQUESTS  # with Python's five the sixth that connects at once waits for a second
 
-    def __init__(self, where: tuple[str, int], handler: type[BaseHTTPRequestHandler]) -> None:
-        self.address_family = socket.AF_INET6 if ":" in where[0] else socket.AF_INET
-        self._free = threading.BoundedSemaphore(_CLIENTS)
-        self._silent: dict[socket.socket, None] = {}  # those that have not asked yet, the oldest first
-        self._changing = threading.Lock()
-        super().__init__(where, handler)
+    def __init__(self, host: str, port: int, pages: Mapping[str, Callable[[], Page]]) -> None:
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.pages, self.is_local = pages, is_loopback(host)
+        self._free = threading.BoundedSemaphore(_MAX_REQUESTS)
+        super().__init__((host, port), _Handler)
 
-    def process_request(self, request: socket.socket | tuple[bytes, socket.socket], client_address: object) -> None:
-        if not (self._free.acquire(blocking=False) or self._make_room()):
+    def process_request(self, request: Any, client_address: object) -> None:
+        if self._free.acquire(timeout=_CLIENT_TIMEOUT):
+            super().process_request(request, client_address)
+        else:
             self.shutdown_request(request)
-            return
-        if isinstance(request, socket.socket):
-            with self._changing:
-                self._silent[request] = None
-        super().process_request(request, client_address)
 
-    def process_request_thread(
-        self, request: socket.socket | tuple[bytes, socket.socket], client_address: object
-    ) -> None:
+    def process_request_thread(self, request: Any, client_address: object) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            if isinstance(request, socket.socket):
-                self.has_asked(request)
             self._free.release()
-
-    def has_asked(self, request: socket.socket) -> None:
-        """Note that a client has sent its request: it is answered, however many others come."""
-        with self._changing:
-            self._silent.pop(request, None)
-
-    def _make_room(self) -> bool:
-        """Disconnect the client that was silent for longest, and return whether there is room then."""
-        with self._changing:
-            oldest = next(iter(self._silent), None)
-            if oldest is None:
-                return False
-            del self._silent[oldest]
-            with suppress(OSError):  # it has gone by itself
-                oldest.shutdown(socket.SHUT_RDWR)
-        return self._free.acquire(timeout=_PATIENCE)
 
     def handle_error(self, request: object, client_address: object) -> None:
         _log.debug("an HTTP client went away", exc_info=True)
 
 
-def _make_handler(pages: Mapping[str, Callable[[], Page]], *, local: bool) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        timeout = _PATIENCE
-        server_version = "nedbus"
-        sys_version = ""
+class _Handler(BaseHTTPRequestHandler):
+    timeout = _CLIENT_TIMEOUT  # of each receive, and of the whole answer
+    server_version = "nedbus"
+    sys_version = ""
 
-        def do_GET(self) -> None:
-            self._answer()
+    def handle(self) -> None:
+        """Answer one request; stop receiving from a client that sends it byte by byte."""
+        deadline = threading.Timer(self.timeout, self._stop_receiving)
+        deadline.start()
+        try:
+            super().handle()
+        finally:
+            deadline.cancel()
 
-        def do_HEAD(self) -> None:
-            self._answer()
+    def do_GET(self) -> None:
+        server = cast("_Server", self.server)
+        path = self.path.partition("?")[0]
+        host = self.headers.get("Host") or "localhost"  # every browser names it
+        is_refused = (server.is_local or path not in _ANY_NAME) and not _leads_here(host, local=server.is_local)
+        if path in server.pages and is_refused:
+            page = Page.text(f"{path} is answered under an address or a name of this host only", status=403)
+        else:
+            page = _make_page(server.pages, path)
+        self.send_response(page.status)
+        self.send_header("Content-Type", page.content_type)
+        self.send_header("Content-Length", str(len(page.content)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(page.content)
 
-        def parse_request(self) -> bool:
-            is_valid = super().parse_request()
-            cast("_Server", self.server).has_asked(self.connection)
-            return is_valid
+    do_HEAD = do_GET  # noqa: N815 - the name that http.server calls
 
-        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-            _log.debug(format, *args)
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        _log.debug(format, *args)
 
-        def _answer(self) -> None:
-            path = self.path.partition("?")[0]
-            host = self.headers.get("Host") or "localhost"  # every browser names it
-            if path in pages and (local or path not in _ANY_NAME) and not _leads_here(host, local=local):
-                page = Page.text(f"{path} is answered under an address or a name of this host only", status=403)
-            else:
-                page = _make_page(pages, path)
-            self.send_response(page.status)
-            self.send_header("Content-Type", page.content_type)
-            self.send_header("Content-Length", str(len(page.content)))
-            self.send_header("Cache-Control", "no-store")
-            self.send_header("X-Content-Type-Options", "nosniff")
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(page.content)
-
-    return Handler
+    def _stop_receiving(self) -> None:
+        with suppress(OSError):  # the client has disconnected
+            self.connection.shutdown(socket.SHUT_RD)
 
 
 def _leads_here(host: str, *, local: bool) -> bool:
-    """Return whether a Host is a name that nobody else can make lead to this host."""
+    """Return whether a Host header is a name that no foreign page can point at this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")
     with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""An observer: follow vehicles on a bus, whoever reads the samples, so that an account of what happened is kept."""
+"""An observer: keep an account of the vehicles on a bus, from the samples of a reader."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from nedbus.client import Bus, Health, RejectionReport, Sample, stream_state
 from nedbus.events import Account
 from nedbus_msgs import Address, Selection
 
-_WAITING: Final = 200  # messages that may wait at any time
-_STOOD: Final = 2.5  # s between two looks from which on this process was held up itself
-_SETTLING: Final = 3.0  # s after a link is back, in which what was held up arrives
-_OLD: Final = 3.0  # s that the first sample of a stream may be old
+_MAX_WAITING: Final = 200  # messages that may wait to be read, at any rate
+_MAX_LAG: Final = 1.0  # s of messages that may wait to be read
+_MAX_PAUSE: Final = 2.5  # s between two looks; after a longer one this process was held up itself
+_SETTLING_TIME: Final = 3.0  # s after a link is back, in which what was held up arrives
+_MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one is of a stream that has ended
 _MAX_STREAMS: Final = 4096
-_LATE: Final = 1.0  # s of messages that wait, from which on a reader is behind
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What was seen at one moment [s since the epoch]: what is published, what was rejected, and the link.
+    """All that was seen at one moment [s since the epoch]: published addresses, rejections, and the link.
 
     `link`: "" or what is wrong with it. `healths`: of all streams. `behind`: what is wrong with this reader itself.
     """
@@ -43,40 +43,38 @@ class Observer:
         self._rejections = bus.rejections()
         self._looked: float | None = None
         self._seen: set[Address] = set()
-        self._cut = 0.0  # when there was no link, last
+        self._disconnected = 0.0  # when there was no link, last
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample that was read just now; the last one of a stream that ended long ago says nothing of now."""
         if sample.address not in self._seen:
             if len(self._seen) < _MAX_STREAMS:
                 self._seen.add(sample.address)
-            if sample.latency is not None and sample.latency > _OLD:
+            if sample.latency is not None and sample.latency > _MAX_AGE:
                 return
-        self.account.add(
-            sample.address, sample.message, sample.received / 1e9,
-            missing=sample.provenance.missing, lost=sample.lost,
-        )  # fmt: skip
+        received, missing = sample.received / 1e9, sample.provenance.missing
+        self.account.add(sample.address, sample.message, received, missing=missing, lost=sample.lost)
 
     def look(self, healths: Mapping[Address, Health], *, dropped: int, waiting: int = 0) -> Sight:
-        """Note how streams arrive now, what was rejected, and what this reader did not read in time, or not yet."""
+        """Note how streams arrive now, rejections, and the messages that this reader dropped, or has not read yet."""
         now, connected = time.time(), self._bus.connected
         rejected = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         for report in rejected:
             self.account.reject(report.address, report.reason, report.received / 1e9)
         alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
-        self._cut = min(self._cut, now) if connected else now
-        settled = now - self._cut > _SETTLING
+        self._disconnected = min(self._disconnected, now) if connected else now
+        settled = now - self._disconnected > _SETTLING_TIME
+        mains = [vehicle.main for vehicle in list(self.account.vehicles.values())]
         states = {
             main: stream_state(healths[main], alive=main in alive).name if settled and main in healths else "unknown"
-            for vehicle in list(self.account.vehicles.values())
-            if (main := vehicle.main) is not None and (main in healths or not settled)
+            for main in mains
+            if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"
-        stood, self._looked = self._looked is not None and now - self._looked > _STOOD, now
+        paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
-        self.account.look(
-            now, states, link=link, dropped=dropped, is_behind=stood or waiting > max(_WAITING, _LATE * rate)
-        )
+        is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
+        self.account.look(now, states, link=link, dropped=dropped, is_behind=is_behind)
         behind = ""
         if self.account.overload is not None:
             behind = f"this reader does not read in time: {waiting} messages wait, {dropped} were never read"

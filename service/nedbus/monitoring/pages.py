@@ -14,7 +14,7 @@ from nedbus.extras import needs
 
 from .http_server import Page
 
-_STUCK: Final = 20.0  # s that no message takes
+_MAX_BUSY: Final = 20.0  # s that a source may take for one message
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
@@ -22,21 +22,20 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
     return {
         "/metrics": lambda: _metrics(daemon),
         "/healthz": lambda: _health(daemon),
-        "/readyz": lambda: _ready(daemon),
+        "/readyz": lambda: Page.verdict(why_not_ready(daemon), "ready"),
         "/vehicles": lambda: vehicles_page(daemon.report()),
         "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
     }
 
 
 def vehicles_page(report: AccountReport) -> Page:
-    """Return the states of all vehicles; of these only what is wrong, with 503, if anything is."""
+    """Return the states of all vehicles; only the faults, with 503, if there are any."""
     faults = faults_of([report], Expectation(well=True))
-    if faults:
-        return Page.text("\n".join(map(_one_line, faults)), status=503)
     lines = [
         f"{name} {vehicle.text}{vehicle.since_text(report.now)}" for name, vehicle in sorted(report.vehicles.items())
     ]
-    return Page.text("\n".join(map(_one_line, lines)) or "no vehicle is known")
+    good = "\n".join(map(_one_line, lines)) or "no vehicle is known"
+    return Page.verdict(list(map(_one_line, faults)), good)
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
@@ -60,11 +59,10 @@ def _one_line(text: str) -> str:
 
 
 def _health(daemon: Daemon) -> Page:
-    stuck = daemon.busy
-    reasons = _refusals(daemon)
-    if stuck >= _STUCK:
-        reasons.append(f"a source has been at one message for {stuck:.0f} s")
-    return Page.text("\n".join(reasons), status=503) if reasons else Page.text("ok")
+    reasons, busy = _refusals(daemon), daemon.busy
+    if busy >= _MAX_BUSY:
+        reasons.append(f"a source has been at one message for {busy:.0f} s")
+    return Page.verdict(reasons, "ok")
 
 
 def _refusals(daemon: Daemon) -> list[str]:
@@ -72,15 +70,10 @@ def _refusals(daemon: Daemon) -> list[str]:
     return [f"the router refuses vehicle {', '.join(refused)}"] if refused else []
 
 
-def _ready(daemon: Daemon) -> Page:
-    reasons = why_not_ready(daemon)
-    return Page.text("\n".join(reasons), status=503) if reasons else Page.text("ready")
-
-
 def _metrics(daemon: Daemon) -> Page:
     try:
-        collector = needs("metrics", "nedbus.monitoring.service_metrics").ServiceCollector(daemon)
+        metrics = needs("metrics", "nedbus.monitoring.metrics")
     except ConfigError as exc:
         return Page.text(str(exc), status=501)
-    page: Page = needs("metrics", "nedbus.monitoring.exposition").metrics_page(collector)
+    page: Page = metrics.metrics_page(metrics.service_metrics(daemon))
     return page

@@ -1,0 +1,246 @@
+"""Event detectors: the changes of flags, modes, receivers and batteries that mean an event."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from operator import attrgetter, itemgetter
+from typing import Any, Final, Literal, cast
+
+from . import rules
+from .event import Severity
+
+Change = Literal["begin", "end", "once"]
+Fields = dict[str, Any]
+_NONE: Final[frozenset[str]] = frozenset()
+_UNKNOWN_SATELLITES: Final = 255
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The meaning of a change of one message; the vehicle makes an event of it.
+
+    `flags`: those that begin or end; a condition holds for each.
+    `on_ground`: its severity while the vehicle is disarmed, where that is another.
+    `first`: the text of an end where the condition has held since the first message.
+    `initial`: it held at the first message: a condition, and no event.
+    """
+
+    kind: str
+    change: Change
+    severity: Severity
+    text: str
+    names: tuple[str, ...] = ()
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    flags: tuple[str, ...] = ("",)
+    on_ground: Severity | None = None
+    first: str = ""
+    initial: bool = False
+
+
+class FieldReader:
+    """Read fields of messages fast, from a model, a row, or fields by name, which may lack some: these are `absent`."""
+
+    def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
+        self.names, self._absent = tuple(names), absent
+        self._of_message: Callable[[object], tuple[Any, ...]] = attrgetter(*names)
+        self._of_fields: Callable[[Mapping[str, object]], tuple[Any, ...]] = itemgetter(*names)
+
+    def __call__(self, message: object) -> tuple[Any, ...]:
+        """Return the values, in the order of the names."""
+        if type(message) is not dict:
+            return self._of_message(message)
+        try:
+            return self._of_fields(message)
+        except KeyError:
+            return tuple(message.get(name, self._absent) for name in self.names)
+
+
+class ChangeDetector:
+    """Detect the events of one stream; fast while none of the `compared` fields changes.
+
+    `detect` yields findings from two messages, as fields by name: None for those that were not provided, and no fields
+    before the first message. `told` are fields that it gets beside the compared ones.
+    `stamp` and `earlier` are the timestamps of the last two messages [us].
+    """
+
+    def __init__(
+        self,
+        compared: Sequence[str],
+        detect: Callable[[Fields, Fields], Iterator[Finding]],
+        *,
+        told: Sequence[str] = (),
+    ) -> None:
+        self._read = FieldReader(("timestamp", *compared))
+        self._read_all = FieldReader(("timestamp", *compared, *told))
+        self._detect = detect
+        self._last: object = None
+        self._state: tuple[Any, ...] | None = None
+        self._missing = _NONE
+        self.stamp = self.earlier = 0
+
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
+        """Add a message, of which `missing` fields were not provided; return None while nothing changes."""
+        values = self._read(message)
+        self.earlier, self.stamp, state = self.stamp, values[0], values[1:]
+        last, self._last = self._last, message
+        if state == self._state and (missing is self._missing or missing == self._missing):
+            return None
+        return self._change(last, message, state, missing)
+
+    def forget(self) -> None:
+        """Begin anew: the vehicle has rebooted."""
+        self._last = self._state = None
+        self.stamp = self.earlier = 0
+
+    def _change(
+        self, last: object, message: object, state: tuple[Any, ...], missing: frozenset[str]
+    ) -> Iterator[Finding]:
+        before = {} if last is None else self._by_name(last, self._missing)
+        self._state, self._missing = state, missing
+        return self._detect(before, self._by_name(message, missing))
+
+    def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
+        values = zip(self._read_all.names, self._read_all(message), strict=True)
+        return {name: None if name in missing else value for name, value in values}
+
+
+class GpsDetector(ChangeDetector):
+    """Detect the events of a GNSS receiver: its fix, satellites, jamming and spoofing."""
+
+    _NAMES: Final = ("fix_type", "satellites_used", "jamming_state", "jamming_indicator", "spoofing_state")
+
+    def __init__(self) -> None:
+        super().__init__(self._NAMES, self._detect_gps)
+        self._levels: dict[str, bool] = {}  # whether a value is beyond its threshold, by kind
+
+    def forget(self) -> None:
+        """Begin anew: the vehicle has rebooted."""
+        super().forget()
+        self._levels.clear()
+
+    def _detect_gps(self, before: Fields, after: Fields) -> Iterator[Finding]:
+        fix, was = after["fix_type"], before.get("fix_type")
+        satellites, earlier = after["satellites_used"], before.get("satellites_used")
+        if was is None and fix is not None and fix < rules.MIN_FIX_TYPE:
+            yield Finding("gps_fix_lost", "begin", "info", "no GPS fix", initial=True)
+        elif was is not None and fix is not None and was != fix:
+            names = rules.FIXES.get(was, str(was)), rules.FIXES.get(fix, str(fix))
+            numbers = {"fix_before": was, "fix": fix}
+            text = f"GPS fix {names[0]} to {names[1]}"
+            if satellites is not None and earlier is not None and satellites != earlier:
+                numbers |= {"satellites_before": earlier, "satellites": satellites}
+                text += f", {earlier} satellites to {satellites}"
+            if was >= rules.MIN_FIX_TYPE > fix:
+                yield Finding("gps_fix_lost", "begin", "watch", text, names, numbers)
+            elif was < rules.MIN_FIX_TYPE <= fix:
+                yield Finding("gps_fix_lost", "end", "info", text, names, numbers)
+            elif names[0] != names[1]:
+                yield Finding("gps_fix", "once", "info", text, names, numbers)
+        if satellites is not None and satellites != _UNKNOWN_SATELLITES:
+            is_few, is_enough = satellites < rules.FEW_SATELLITES, satellites >= rules.ENOUGH_SATELLITES
+            text = f"{'only ' * is_few}{satellites} satellites"
+            yield from self._detect_level("few_satellites", is_few, is_enough, text, {"satellites": satellites})
+        indicator, state = after["jamming_indicator"] or 0, after["jamming_state"] or 0
+        text = f"GNSS jamming: indicator {indicator}" + (f", state {state}" if state > 1 else "")
+        is_jammed, is_clear = (
+            state > 1 or indicator >= rules.JAMMING_BEGIN,
+            state <= 1 and indicator < rules.JAMMING_END,
+        )
+        yield from self._detect_level("jamming", is_jammed, is_clear, text, {"indicator": indicator, "state": state})
+        spoofed = after["spoofing_state"] or 0
+        text = f"GNSS spoofing: state {spoofed}"
+        yield from self._detect_level("spoofing", spoofed > 1, spoofed <= 1, text, {"state": spoofed})
+
+    def _detect_level(self, kind: str, begins: bool, ends: bool, text: str, numbers: Fields) -> Iterator[Finding]:
+        """Yield a condition that begins beyond one threshold, and ends beyond another; the first value may begin it."""
+        initial, held = kind not in self._levels, self._levels.get(kind, False)
+        holds = self._levels[kind] = begins or (held and not ends)
+        if holds and not held:
+            calm = initial and kind == "few_satellites"  # a vehicle without GNSS has none
+            yield Finding(kind, "begin", "info" if calm else "watch", text, numbers=numbers, initial=initial)
+        elif held and not holds:
+            text = text if kind == "few_satellites" else f"{text}: over"
+            yield Finding(kind, "end", "info", text, numbers=numbers)
+
+
+def make_detector(message: str) -> ChangeDetector | None:
+    """Return the detector of a stream of a message, None for one of which no change is an event."""
+    flag_rules = rules.RULES.get(message, ())
+    flags = [flag for rule in flag_rules for flag in rule.flags]
+    match message:
+        case "VehicleStatus":
+            return ChangeDetector(["arming_state", "nav_state", *flags], detect_status)
+        case "EstimatorStatusFlags" | "FailsafeFlags":
+            return ChangeDetector(flags, lambda before, after: detect_flags(flag_rules, before, after))
+        case "SensorGps":
+            return GpsDetector()
+        case "BatteryStatus":
+            return ChangeDetector(["warning", "connected"], detect_battery, told=["remaining"])
+        case "VehicleLandDetected":
+            return ChangeDetector(["landed"], detect_landing)
+    return None
+
+
+def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the flags that begin and end; one that was not known, or is not known any more, is no event."""
+    for rule in flag_rules:
+        found: dict[tuple[Change, bool], list[str]] = {}
+        for name in rule.flags:
+            was, now = before.get(name), after.get(name)
+            if was is None and now == rule.bad and rule.initial:
+                found.setdefault(("begin", True), []).append(name)
+            elif now is None and was == rule.bad:
+                found.setdefault(("end", True), []).append(name)
+            elif was is not None and now is not None and was != now:
+                found.setdefault(("begin" if now == rule.bad else "end", False), []).append(name)
+        for (change, initial), flags in sorted(found.items(), key=lambda item: (not item[0][1], item[0][0])):
+            is_info = change == "end" or rule.minor.issuperset(flags)
+            text = (rule.begin if change == "begin" else rule.end).format(", ".join(rule.flags[name] for name in flags))
+            yield Finding(
+                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), flags=tuple(flags),
+                on_ground=rule.on_ground, first=rule.first, initial=initial,
+            )  # fmt: skip
+
+
+def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the events of a VehicleStatus: armed and disarmed, mode, failsafe, link to the ground station."""
+    was, now = before.get("arming_state"), after["arming_state"]
+    if now is not None and (was is None or (was == rules.ARMED) != (now == rules.ARMED)):
+        kind = "armed" if now == rules.ARMED else "disarmed"
+        yield Finding(kind, "once", "info", kind, initial=was is None)
+    yield from detect_flags(rules.RULES["VehicleStatus"], before, after)
+    was, now = before.get("nav_state"), after["nav_state"]
+    if was is not None and now is not None and was != now:
+        names = rules.MODES.get(was, str(was)), rules.MODES.get(now, str(now))
+        yield Finding("mode", "once", "info", f"mode {names[0]} to {names[1]}", names, {"from": was, "to": now})
+
+
+def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the events of a VehicleLandDetected."""
+    was, now = before.get("landed"), after["landed"]
+    if was is not None and now is not None and was != now:
+        kind, text = ("landed", "landed") if now else ("takeoff", "took off")
+        yield Finding(kind, "once", "info", text)
+
+
+def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the warnings of a BatteryStatus; their severity grows with them."""
+    warning, was = _warning_of(after), _warning_of(before) if before else 0
+    if warning is None or was is None or was == warning:
+        return
+    remaining, numbers, left = after["remaining"], {"warning": warning}, ""
+    if remaining is not None and 0 <= remaining <= 1:
+        numbers, left = {"warning": warning, "remaining": remaining}, f", {100 * remaining:.0f} % left"
+    if warning:
+        severity: Severity = "watch" if warning in (1, 7) else "bad"
+        text = f"battery {rules.WARNINGS.get(warning, warning)}{left}"
+        yield Finding("battery", "begin", severity, text, numbers=numbers, initial=not before)
+    else:
+        yield Finding(
+            "battery", "end", "info", f"battery no longer {rules.WARNINGS.get(was, was)}{left}", numbers=numbers
+        )
+
+
+def _warning_of(battery: Fields) -> int | None:
+    return 0 if battery["connected"] is False else cast("int | None", battery["warning"])

@@ -1,0 +1,151 @@
+"""The detector of the position that a vehicle is judged by: flags, resets, origins, and unexplained jumps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any, Final, cast
+
+from nedbus_msgs import RESET_COUNTERS, MapProjection, ResetTracker
+
+from .detectors import ChangeDetector, FieldReader, Fields, Finding, detect_flags
+from .event import Severity
+from .rules import JUMP_DISTANCE, JUMP_SHARE, RULES, SMALL_RESET
+
+_RULES: Final = RULES["VehicleLocalPosition"]
+_COMPARED: Final = (
+    "xy_valid", *(name for rule in _RULES for name in rule.flags if name != "xy_valid"), *RESET_COUNTERS.values(),
+    "ref_timestamp",
+)  # fmt: skip
+# The fields that are told when one of these changes, with PX4's values for those that are not given.
+_TOLD: Final[Mapping[str, object]] = {
+    **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom"), math.nan),
+    **dict.fromkeys(("delta_z", "delta_vz", "delta_heading", "delta_dist_bottom"), math.nan),
+    **dict.fromkeys(("ref_lat", "ref_lon", "ref_alt"), math.nan),
+    **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
+}
+_MIN_STEP: Final = JUMP_DISTANCE / 2  # m to one side; a smaller step is no jump, whatever the velocity
+_MAX_INTERVAL: Final = 0.5  # s between two messages that a jump is looked for in
+
+Step = tuple[float, float, float]  # begin [s], north and east [m] beyond what the velocity explains
+
+
+class PositionDetector(ChangeDetector):
+    """Detect the events of a VehicleLocalPosition, or of an estimate with its fields."""
+
+    def __init__(self) -> None:
+        super().__init__(_COMPARED, self._detect_position, told=tuple(_TOLD))
+        self._read_motion = FieldReader(("timestamp", "x", "y", "vx", "vy"), math.nan)
+        self._read_state = FieldReader(_COMPARED)
+        self._motion: tuple[float, ...] = ()
+        self._motion_before: tuple[float, ...] = ()
+        self._jump: Step | None = None  # by now
+
+    def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
+        """Add a message; return None while nothing changes."""
+        before, motion = self._motion, self._read_motion(message)
+        self._motion_before, self._motion = before, motion
+        self.earlier, self.stamp, state = self.stamp, motion[0], self._read_state(message)
+        last, self._last = self._last, message
+        if state != self._state or not (missing is self._missing or missing == self._missing):
+            return self._change(last, message, state, missing)
+        has_moved = abs(motion[1] - before[1]) > _MIN_STEP or abs(motion[2] - before[2]) > _MIN_STEP
+        step = self._unexplained_step() if has_moved and state[0] else None
+        return None if step is None and self._jump is None else self._follow_jump(step)
+
+    def forget(self) -> None:
+        """Begin anew: the vehicle has rebooted."""
+        super().forget()
+        self._jump = None
+
+    def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
+        if before:
+            earlier, values = _complete(before), _complete(after)
+            tracker = ResetTracker()
+            tracker.add(cast("Any", SimpleNamespace(**earlier)))
+            track = tracker.add(cast("Any", SimpleNamespace(**values)))
+            yield from _detect_origin(earlier, values)
+            quantities = [name for name in RESET_COUNTERS if name in track.reset and name != "dist_bottom"]
+            if quantities:
+                yield _reset(quantities, values, track)
+            step = None
+            if values["xy_valid"] and not track.origin_changed and "xy" not in track.reset:
+                step = self._unexplained_step()
+            yield from self._follow_jump(step)
+        yield from detect_flags(_RULES, before, after)
+
+    def _unexplained_step(self) -> Step | None:
+        """Return the last step beyond what the velocity explains; None if it explains all of it."""
+        seconds = (self.stamp - self.earlier) / 1e6
+        if not 0 < seconds <= _MAX_INTERVAL:
+            return None
+        (_, x_before, y_before, vx_before, vy_before), (_, x, y, vx, vy) = self._motion_before, self._motion
+        north, east = x - x_before - (vx + vx_before) / 2 * seconds, y - y_before - (vy + vy_before) / 2 * seconds
+        limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
+        return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
+
+    def _follow_jump(self, step: Step | None) -> Iterator[Finding]:
+        """Add a step to a jump, or yield the jump when it has ended."""
+        jump, self._jump = self._jump, step
+        if jump is not None and step is not None:
+            self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
+        elif jump is not None:
+            distance, seconds = math.hypot(*jump[1:]), self.stamp / 1e6 - jump[0]
+            text = f"position jumps by {distance:.1f} m within {seconds:.2f} s, without a reset"
+            numbers = {"distance": distance, "north": jump[1], "east": jump[2], "begin": jump[0]}
+            yield Finding("jump", "once", "watch", text, numbers=numbers)
+
+
+def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
+    """Return a reset, with its size as far as the message tells it: deltas of what was not reset are old."""
+    numbers: dict[str, float] = {}
+    words = []
+    explained = {name for name in quantities if name not in track.discontinued}
+    if "xy" in explained:
+        numbers |= {"north": values["x"] - track.x, "east": values["y"] - track.y}
+        size = math.hypot(numbers["north"], numbers["east"])
+        words.append(f"xy by {size:.1f} m ({_signed(numbers['north'])} north, {_signed(numbers['east'])} east)")
+    if "z" in explained:
+        numbers["up"] = track.z - values["z"]
+        words.append(f"height by {_signed(numbers['up'])} m")
+    if "vxy" in explained:
+        numbers |= {"v_north": values["vx"] - track.vx, "v_east": values["vy"] - track.vy}
+        words.append(f"vxy by {math.hypot(numbers['v_north'], numbers['v_east']):.1f} m/s")
+    if "vz" in explained:
+        numbers["v_up"] = track.vz - values["vz"]
+        words.append(f"vz by {_signed(numbers['v_up'])} m/s")
+    is_small = all(abs(each) < SMALL_RESET for each in numbers.values()) and explained.issuperset(quantities)
+    if "heading" in explained:
+        numbers["heading"] = values["delta_heading"]
+        words.append(f"heading by {_signed(math.degrees(numbers['heading']), 0)} deg")
+    words += [f"{name} by an unknown amount" for name in quantities if name not in explained]
+    severity: Severity = "info" if is_small else "watch"
+    text = f"reset of {', '.join(words)}"
+    return Finding("reset", "once", severity, text, tuple(quantities), numbers, on_ground="info")
+
+
+def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield an origin that is set, or moves; one that only has a new time does not."""
+    had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
+    if has and not had:
+        text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
+        numbers = {"latitude": after["ref_lat"], "longitude": after["ref_lon"]}
+        yield Finding("origin_set", "once", "info", text, numbers=numbers)
+    elif has and had:
+        moved = MapProjection(before["ref_lat"], before["ref_lon"]).project(after["ref_lat"], after["ref_lon"])
+        distance, up = math.hypot(*moved), after["ref_alt"] - before["ref_alt"]
+        up = up if math.isfinite(up) else 0.0
+        if distance >= 0.01 or abs(up) >= 0.01:
+            text = f"origin moved by {distance:.1f} m, {_signed(up)} m up"
+            severity: Severity = "info" if max(distance, abs(up)) < SMALL_RESET else "watch"
+            numbers = {"distance": distance, "up": up}
+            yield Finding("origin_moved", "once", severity, text, numbers=numbers, on_ground="info")
+
+
+def _signed(value: float, digits: int = 1) -> str:
+    return f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _complete(fields: Fields) -> Fields:
+    return {name: _TOLD.get(name, 0) if value is None else value for name, value in fields.items()}
