@@ -39,9 +39,11 @@ ONLY_BY_FOLDER = {
     "xxhash": {"nedbus/transport": "rmw_zenoh"},
     "numpy": {
         "nedbus_msgs": "arrays", "nedbus_msgs/codecs": "arrays", "nedbus/client": "batch", "nedbus/sources": "ulog",
-        "nedbus/recording": "ulog arrays alignment utc plot", "nedbus/web": "stream tracks background plots",
+        "nedbus/recording": "ulog arrays alignment utc plot",
+        "nedbus/web": "stream column_data background map time_plots",
     },
-    "bokeh": {"nedbus/web": "background map_plot playback plots send serve server style timeline tracks viewer"},
+    "bokeh": {"nedbus/web": "background column_data map playback serve server style time_plots viewer"},
+    "jinja2": {"nedbus/web": "panels"},
     "tornado": {"nedbus/web": "server"},
     "PIL": {"nedbus/web": "background"},
     "pydantic": {

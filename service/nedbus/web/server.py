@@ -5,15 +5,17 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
-from bokeh.resources import Component, Resources
+from bokeh.resources import Resources
 from bokeh.server.auth_provider import NullAuth
 from bokeh.server.server import Server
 from bokeh.server.views.static_handler import StaticHandler
@@ -28,28 +30,39 @@ MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
-_PARTS: Final[list[Component]] = ["bokeh", "bokeh-widgets", "bokeh-tables"]
-_POLL: Final = 100  # ms until the end is noticed
-_MAX_BODY: Final = 2**16  # bytes of a request, which has none: Tornado keeps it before anybody looks at its Host
-_MAX_EVENT: Final = 2**20  # bytes of what a browser says of its page at a time
-_UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+_STOP_POLL: Final = 100  # ms until the end is noticed
+_MAX_BODY_BYTES: Final = 2**16  # of a request, which has none: Tornado keeps it before its Host is checked
+_MAX_MESSAGE_BYTES: Final = 2**20  # of a browser about its page
+_UNUSED_LIFETIME: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """The address of a page, further ORIGINs that browsers may call it by, and the file that is drawn under the map."""
+
+    host: str
+    port: int
+    origins: tuple[str, ...] = ()
+    background: Path | None = None
 
 
 class WebServer:
-    """Serve a page on HOST:PORT, and pages of text by their path, until it is told to stop.
+    """Serve a page, and pages of text by their path, until it is told to stop.
 
-    `origins`: HOST:PORT that browsers may call it by, besides the names of this host: a page of anybody else that is
-    open in the same browser gets nothing, also where that has made its own name lead here.
+    A page of somebody else that is open in the same browser gets nothing, also where that has made its own name lead
+    here: browsers have to call this one by a name of this host or one of `where.origins`.
 
     Raises ListenError when it cannot listen there.
     """
 
     def __init__(
-        self, host: str, port: int, open_page: Callable[[Document], object], *,
-        pages: Mapping[str, Callable[[], Page]], origins: Sequence[str] = (),
-    ) -> None:  # fmt: skip
+        self, where: Where, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
+    ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # each tab that is closed would be a warning
+        host = where.host
+        names = set(where.origins)
+        text_names = names if is_loopback(host) else None
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
@@ -58,37 +71,36 @@ class WebServer:
             else:
                 open_page(document)
 
-        names = set(origins)
-        texts = {"names": names if is_loopback(host) else None}
         try:
             self._server = Server(
-                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=port,
-                allow_websocket_origin=["*"], auth_provider=_Names(names),
-                unused_session_lifetime_milliseconds=_UNUSED, check_unused_sessions_milliseconds=_UNUSED // 3,
-                keep_alive_milliseconds=5000, websocket_max_message_size=_MAX_EVENT,
-                http_server_kwargs={"max_body_size": _MAX_BODY, "max_buffer_size": 2 * _MAX_EVENT},
-                extra_patterns=[(path, _Text, {"make": make, **texts}) for path, make in pages.items()],
+                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=where.port,
+                allow_websocket_origin=["*"], auth_provider=_Names(names), keep_alive_milliseconds=5000,
+                unused_session_lifetime_milliseconds=_UNUSED_LIFETIME,
+                check_unused_sessions_milliseconds=_UNUSED_LIFETIME // 3,
+                websocket_max_message_size=_MAX_MESSAGE_BYTES,
+                http_server_kwargs={"max_body_size": _MAX_BODY_BYTES, "max_buffer_size": 2 * _MAX_MESSAGE_BYTES},
+                extra_patterns=[(path, _Text, {"make": make, "names": text_names}) for path, make in pages.items()],
             )  # fmt: skip
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --listen"
-            raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
+            raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
         # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
-        parts = Resources(mode="server", root_url="/", path_versioner=StaticHandler.append_version, components=_PARTS)
+        parts = Resources(
+            mode="server", root_url="/", path_versioner=StaticHandler.append_version,
+            components=["bokeh", "bokeh-widgets", "bokeh-tables"],
+        )  # fmt: skip
         self._server._tornado.resources = lambda *_: parts  # type: ignore[method-assign]  # noqa: SLF001
-        names |= _names_of(host, self._server.port or port)
+        port = self._server.port or where.port
+        names |= _names_of(host, port)
         shown = "127.0.0.1" if host in _ANY else host
-        self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
+        self.url = f"http://{_join(shown, port)}"
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set, in this thread."""
-        poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _POLL)
-
-        def begin() -> None:
-            poll.start()
-            self._server.start()
-
-        self._loop.add_callback(begin)
+        poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _STOP_POLL)
+        self._loop.add_callback(poll.start)
+        self._loop.add_callback(self._server.start)
         self._loop.start()
         poll.stop()  # it would stop the loop once more, amid the end of the server
         self._server.stop()
@@ -98,7 +110,7 @@ class WebServer:
 class _Names(NullAuth):
     """Answer only browsers that ask for one of these names."""
 
-    login_url = "/"  # which Bokeh asks of whoever checks users; nobody is sent there
+    login_url = "/"  # Bokeh demands it where users are checked; nobody is sent there
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = names
@@ -109,18 +121,18 @@ class _Names(NullAuth):
         """Return what checks a request before anything is answered; everybody is the same user."""
 
         async def check(handler: RequestHandler) -> str:
-            return _require_name(handler, self._names)
+            _require_name(handler, self._names)
+            return "viewer"
 
         return check
 
 
-def _require_name(handler: RequestHandler, names: Collection[str]) -> str:
+def _require_name(handler: RequestHandler, names: Collection[str]) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
     for name in (host, headers.get("Origin", f"//{host}").partition("//")[2]):  # Origin: null has no name
         if name not in names:
             raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
-    return "viewer"
 
 
 class _Text(RequestHandler):
@@ -138,10 +150,14 @@ class _Text(RequestHandler):
 
 
 def _names_of(host: str, port: int) -> set[str]:
-    """Return under which names a browser may ask for a page on this address."""
+    """Return the names by which a browser may ask for a page on this address."""
     names = {"localhost", "127.0.0.1", "::1", host}
     if host in _ANY:
         names |= {socket.gethostname(), socket.getfqdn()}
         with suppress(OSError):  # a host that does not find itself: --origin names it
             names |= {str(address[4][0]) for address in socket.getaddrinfo(socket.gethostname(), None)}
-    return {f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in names}
+    return {_join(name, port) for name in names}
+
+
+def _join(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
