@@ -42,8 +42,8 @@ ONLY_BY_FOLDER = {
         "nedbus/recording": "ulog arrays alignment utc plot",
         "nedbus/web": "stream column_data background map time_plots",
     },
-    "bokeh": {"nedbus/web": "background column_data map playback serve server style time_plots viewer"},
-    "jinja2": {"nedbus/web": "panels"},
+    "bokeh": {"nedbus/web": "background column_data map playback server style time_plots viewer"},
+    "jinja2": {"nedbus/web": "style"},
     "tornado": {"nedbus/web": "server"},
     "PIL": {"nedbus/web": "background"},
     "pydantic": {

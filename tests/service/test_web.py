@@ -26,7 +26,7 @@ from nedbus.transport import Session, open_router
 from nedbus.web.column_data import NAMES, Track, Tracks
 from nedbus.web.fleet import TRUTH
 from nedbus.web.map import MIN_SIDE
-from nedbus.web.serve import LiveFleet
+from nedbus.web.server import LiveFleet
 from nedbus.web.stream import COLUMNS, History
 from nedbus.web.style import DARK, LIGHT, Style
 from nedbus_msgs import Address, Selection

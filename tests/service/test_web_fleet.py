@@ -211,18 +211,18 @@ def test_positions_come_before_other_messages(sky: Sky, monkeypatch: pytest.Monk
 def test_other_messages_tell_facts(sky: Sky) -> None:
     """Mode, arming, battery and GPS are of a vehicle's own messages; another battery, or an unknown charge, is none."""
     sky.fly(1)
-    assert (sky.row().facts.mode, sky.row().facts.battery, sky.row().facts.gps) == ("", "", "")
+    assert (sky.row().facts["mode"], sky.row().facts["battery"], sky.row().facts["gps"]) == ("", "", "")
     sky.add(Address("wing", "vehicle_status"), nav_state=4, arming_state=2)
     sky.add(Address("wing", "battery_status", 0), remaining=0.834)
     sky.add(Address("wing", "battery_status", 1), remaining=0.1)
     sky.add(Address("wing", "sensor_gps", 0), fix_type=2, satellites_used=5)
     facts = sky.row().facts
-    assert (facts.mode, facts.armed, facts.battery, facts.gps) == ("Hold", "armed", "83 %", "2D · 5")
+    assert (facts["mode"], facts["armed"], facts["battery"], facts["gps"]) == ("Hold", "armed", "83 %", "2D · 5")
     sky.add(Address("wing", "vehicle_gps_position"), fix_type=3, satellites_used=14)
     sky.add(Address("wing", "battery_status", 0), remaining=-1.0)
     sky.add(Address("wing", "vehicle_status"), nav_state=200, arming_state=1)
     facts = sky.row().facts
-    assert (facts.mode, facts.armed, facts.battery, facts.gps) == ("200", "disarmed", "", "3D · 14")
+    assert (facts["mode"], facts["armed"], facts["battery"], facts["gps"]) == ("200", "disarmed", "", "3D · 14")
 
 
 def test_last_valid_place_is_told(sky: Sky) -> None:

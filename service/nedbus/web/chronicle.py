@@ -47,15 +47,23 @@ class Chronicle:
         """Return the state of a vehicle at a time."""
         return state_at(self.spans.get(vehicle, ()), time)
 
+    @property
+    def has_utc(self) -> bool:
+        """Whether its times are known in UTC."""
+        return self.times.is_live or self.start is not None
+
     def moment(self, seconds: float) -> str:
-        """Return a time of the account in words: UTC live or where a recording tells it, else since its start."""
-        if self.times.is_live or self.start is not None:
-            return to_clock(seconds + (self.start or 0.0))[:-2]
-        return to_elapsed(seconds)
+        """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
+        return self.address_of(seconds)[:-2] if self.has_utc else _elapsed(seconds)
+
+    def clock(self, seconds: float) -> str:
+        """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
+        utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
+        return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
 
     def address_of(self, seconds: float) -> str:
         """Return a time of the account as `Times.find` understands it: UTC, or seconds since boot."""
-        if self.times.is_live or self.start is not None:
+        if self.has_utc:
             return to_clock(seconds + (self.start or 0.0))
         first = next(iter(self.events), None)
         return f"{seconds if first is None or first.boot is None else seconds + first.boot - first.time:.1f}"
@@ -107,7 +115,6 @@ class Chronicle:
         }
 
 
-def to_elapsed(seconds: float) -> str:
-    """Return the minutes and seconds since the start of a recording."""
+def _elapsed(seconds: float) -> str:
     tenths = round(seconds * 10)
     return f"{tenths // 600}:{tenths % 600 / 10:04.1f}"

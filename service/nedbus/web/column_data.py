@@ -30,17 +30,17 @@ def table(*names: str) -> ColumnDataSource:
     return ColumnDataSource({name: [] for name in names})
 
 
-def replace(source: ColumnDataSource, rows: Sequence[Sequence[Any]]) -> None:
-    """Send the cells that are different, or all when the number of rows is; values are in the order of columns."""
-    names, old = source.column_names, source.data
-    columns = dict(zip(names, [list(column) for column in zip(*rows, strict=True)] or [[] for _ in names], strict=True))
-    if len(old[names[0]]) != len(rows):
-        source.data = columns
+def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Send the cells that are different, or all when the number of rows is."""
+    old = source.data
+    new = {name: [row[name] for row in rows] for name in old}
+    if any(len(column) != len(rows) for column in old.values()):
+        source.data = new
         return
     patches = {}
-    for name, values in columns.items():
+    for name, values in new.items():
         cells = enumerate(zip(old[name], values, strict=True))
-        patch = [(index, new) for index, (was, new) in cells if was != new and repr(was) != repr(new)]  # NaN != NaN
+        patch = [(index, value) for index, (was, value) in cells if was != value and repr(was) != repr(value)]  # NaN
         if patch:
             patches[name] = patch
     if patches:

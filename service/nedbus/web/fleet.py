@@ -49,28 +49,19 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """Values of other messages of a vehicle, as text; "" where there are none."""
-
-    mode: str = ""
-    armed: str = ""
-    battery: str = ""
-    gps: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Row:
     """One vehicle at one moment: its state and its streams.
 
     `main`: the stream that its marker shows; `rank`: its place among the others, 0 for the worst; one that was
-    switched off long ago comes last. `number`: for its colour.
+    switched off long ago comes last. `number`: for its colour. `facts`: mode, armed, battery and gps of its other
+    messages, "" where there are none.
     """
 
     vehicle: str
     state: State
     main: Line
     lines: tuple[Line, ...]
-    facts: Facts
+    facts: Mapping[str, str]
     rank: int
     number: int
 
@@ -220,17 +211,18 @@ class Fleet:
             rank = 3
         return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), rank, number)
 
-    def _facts(self, vehicle: str) -> Facts:
+    def _facts(self, vehicle: str) -> dict[str, str]:
         status = self._last(vehicle, "vehicle_status")
         battery = self._last(vehicle, "battery_status", 0)
         gps = self._last(vehicle, "vehicle_gps_position") or self._last(vehicle, "sensor_gps", 0)
         left = getattr(battery, "remaining", math.nan)
-        return Facts(
-            "" if status is None else MODES.get(status.nav_state, str(status.nav_state)),
-            "" if status is None else "armed" if status.arming_state == _ARMED else "disarmed",
-            f"{100 * left:.0f} %" if 0 <= left <= 1 else "",
-            "" if gps is None else f"{FIXES.get(gps.fix_type, gps.fix_type)} · {gps.satellites_used}",
-        )
+        armed = status is not None and status.arming_state == _ARMED
+        return {
+            "mode": "" if status is None else MODES.get(status.nav_state, str(status.nav_state)),
+            "armed": "" if status is None else "armed" if armed else "disarmed",
+            "battery": f"{100 * left:.0f} %" if 0 <= left <= 1 else "",
+            "gps": "" if gps is None else f"{FIXES.get(gps.fix_type, gps.fix_type)} · {gps.satellites_used}",
+        }
 
     def _last(self, vehicle: str, topic: str, instance: int | None = None) -> Any:
         stream = self.streams.get(Address(vehicle, topic, instance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from bokeh.models import HoverTool, TapTool
@@ -41,28 +41,13 @@ class View:
     truth: bool = True
 
 
-class _Mark(NamedTuple):
-    """The marker of a vehicle: filled where it is now, or open where it was last; its shape is its grade."""
-
-    east: float
-    north: float
-    angle: float
-    shape: str
-    colour: str
-    edge: str
-    fill: str
-    label: str
-    name: str
-    words: str
-    align: str
-    offset: int
-
-
 class Map:
     """The map of one viewer; `marks` has a row for each of `shown`, `events` for each of `told`; both can be tapped."""
 
     def __init__(self, style: Style, background: Background | None) -> None:
-        self.marks = table(*_Mark._fields)
+        self.marks = table(
+            "east", "north", "angle", "shape", "colour", "edge", "fill", "label", "name", "words", "align", "offset"
+        )
         self.events = table("east", "north", "marker", "colour", "words")
         self.shown: list[str] = []
         self.told: list[Event] = []
@@ -88,14 +73,14 @@ class Map:
         if view.focus == "follow" and chosen:
             half = _FOLLOWED_SIDE / 2
             frame = [[middle - half, middle + half] for middle in chosen[0][1][:2]]
-        replace(self._frame, list(zip(*frame, strict=True)))
+        replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
         labels = self._labels(placed, row, frame)
         marks = [self._mark(each, place, *labels.get(each.vehicle, ("", False))) for each, place in placed]
         replace(self.marks, marks)
-        self.shown = [mark.name for mark in marks]
+        self.shown = [each.vehicle for each, _ in placed]
         ephs = [each.main.stream.last.message.eph for each, _ in chosen if each.main.stream.last is not None]
         radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
-        replace(self._ring, [(round(place.east, 3), round(place.north, 3), radius) for _, place in chosen])
+        replace(self._ring, [{"east": place.east, "north": place.north, "radius": radius} for _, place in chosen])
         if self._background is not None and whole.origin.projection is not None:
             self._background.draw(self.figure, self._style, whole.origin.projection)
             self._background = None
@@ -110,9 +95,10 @@ class Map:
             placed = [(event, place) for event, place in zip(events, places, strict=True) if place is not None]
         self.told = [event for event, _ in placed]
         marks = [
-            (at.east, at.north, MARKERS[each.severity], self._style.grades[each.severity], each.text[:80])
-            for each, at in placed
-        ]
+            {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.text[:80],
+             "colour": self._style.grades[event.severity]}
+            for event, at in placed
+        ]  # fmt: skip
         replace(self.events, marks)
 
     def clear(self) -> None:
@@ -160,18 +146,18 @@ class Map:
                 labels[each.vehicle] = text, is_left
         return labels
 
-    def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> _Mark:
+    def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> dict[str, Any]:
+        """Return a marker: filled where the vehicle is now, or open where it was last; its shape is its grade."""
         last = row.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
         colour = self._style.vehicle(row.number)
-        return _Mark(
-            east=round(place.east, 3), north=round(place.north, 3), angle=round(math.pi / 2 - heading, 3),
-            shape=MARKERS[row.grade], colour=colour,
-            edge=colour if row.grade == "ok" else self._style.grades[row.grade],
-            fill=colour if row.is_here else self._style.ground,
-            label=label, name=row.vehicle, words=row.state.text,
-            align="right" if is_left else "left", offset=-11 if is_left else 11,
-        )  # fmt: skip
+        return {
+            "east": round(place.east, 3), "north": round(place.north, 3), "angle": round(math.pi / 2 - heading, 3),
+            "shape": MARKERS[row.grade], "colour": colour, "fill": colour if row.is_here else self._style.ground,
+            "edge": colour if row.grade == "ok" else self._style.grades[row.grade],
+            "label": label, "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
+            "name": row.vehicle, "words": row.state.text,
+        }  # fmt: skip
 
     def _draw(self) -> figure:
         style, tracks = self._style, self._tracks.source

@@ -28,7 +28,7 @@ from nedbus.sources import (
 )
 from nedbus_msgs import BY_TOPIC, Address, codec_of
 
-from .chronicle import Chronicle, to_elapsed
+from .chronicle import Chronicle
 from .fleet import Fleet
 from .stream import is_position
 
@@ -143,24 +143,13 @@ class Player:
             self._slider.update(end=max(1.0, self.length), value=self._shown)
         self._feed()
 
-    def clock(self, seconds: float) -> str:
-        """Return a time of the recording in words: UTC where the recording tells it, and since its start."""
-        elapsed = to_elapsed(seconds)
-        if self._recording.chronicle.start is None:
-            return elapsed
-        return f"{self._recording.chronicle.moment(seconds)} UTC, {elapsed}"
-
     def has(self, seconds: float) -> bool:
         """Return whether this time was read already, or will not come."""
         return self._recording.is_read or seconds <= self.length
 
-    def pause(self) -> None:
-        """Stay at this time."""
-        self._play.active = False
-
-    def toggle(self) -> None:
+    def toggle(self, *, pause: bool = False) -> None:
         """Pause, or play on."""
-        self._play.active = not self._play.active
+        self._play.active = not (pause or self._play.active)
 
     def jump(self, seconds: float) -> None:
         """Set the time, as far as the recording has it, with the minute before it."""

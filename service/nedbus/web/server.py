@@ -1,11 +1,13 @@
-"""The server of the page: Bokeh's, which listens on this host alone unless it is told otherwise."""
+"""The server of the page, of live vehicles or of a recording: Bokeh's, on this host alone unless told otherwise."""
 
 from __future__ import annotations
 
 import logging
 import socket
 import threading
+import time
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,13 +24,23 @@ from bokeh.server.views.static_handler import StaticHandler
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
+from nedbus.client import Bus
 from nedbus.errors import ListenError
-from nedbus.monitoring import Page
+from nedbus.events import ALL, Event
+from nedbus.monitoring import Exporter, Page, Sight
 from nedbus.settings import is_loopback
+from nedbus_msgs import Selection
+
+from .background import Background
+from .chronicle import PAST, Chronicle
+from .fleet import Fleet
+from .playback import Player, Recording
+from .viewer import Viewer
 
 MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
+_TICK: Final = 100  # ms between two moves of the map
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
 _STOP_POLL: Final = 100  # ms until the end is noticed
 _MAX_BODY_BYTES: Final = 2**16  # of a request, which has none: Tornado keeps it before its Host is checked
@@ -44,6 +56,88 @@ class Where:
     port: int
     origins: tuple[str, ...] = ()
     background: Path | None = None
+
+
+def serve_live(
+    bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
+) -> None:
+    """Serve the page of what a selection matches until `stop` is set; `tell` gets its address when it is there.
+
+    Raises ConfigError for a bad background, ListenError if it cannot listen.
+    """
+    live = LiveFleet(bus, selection, version=version)
+    background = Background(where.background) if where.background is not None else None
+
+    def open_page(document: Document) -> None:
+        viewer = Viewer(document, live.fleet, live.chronicle, background=background)
+        document.add_periodic_callback(viewer.update, _TICK)
+
+    server = WebServer(where, open_page, live.pages)
+    with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
+        reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
+        tell(server.url)
+        server.run(stop)
+        reading.result()
+
+
+def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:
+    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has a time of its own.
+
+    Raises ConfigError and SourceError for a file that cannot be read, and as `serve_live`.
+    """
+    recording = Recording(path)
+    background = Background(where.background) if where.background is not None else None
+
+    def open_page(document: Document) -> None:
+        player = Player(recording)
+        viewer = Viewer(
+            document, player.fleet, recording.chronicle, title=recording.name, background=background,
+            whole=recording.whole, player=player,
+        )  # fmt: skip
+        document.add_periodic_callback(viewer.update, _TICK)
+
+    server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
+    tell(server.url)
+    server.run(stop)
+
+
+class LiveFleet:
+    """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop.
+
+    `pages`: metrics and health, as `nedbus export` serves them.
+    """
+
+    def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+        self.fleet = Fleet()
+        self._exporter = Exporter(
+            bus, selection, version=version, on_look=self._look,
+            watch=lambda sample: self.fleet.add(sample, time.time()),
+        )  # fmt: skip
+        self.chronicle = Chronicle(self._exporter.account, before=_remembered(bus, selection))
+        self.pages: Mapping[str, Callable[[], Page]] = self._exporter.pages
+
+    def run(self, stop: threading.Event) -> None:
+        """Read until `stop` is set."""
+        self._exporter.run(stop)
+
+    def _look(self, sight: Sight) -> None:
+        """Make the picture of now."""
+        account = self._exporter.account
+        self.fleet.reject(sight.rejected)
+        states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
+        own = sight.behind.replace("this reader", "this page")
+        self.fleet.look(sight.time, sight.healths, states, alive=sight.alive, link=sight.link, own=own)
+
+
+def _remembered(bus: Bus, selection: Selection) -> list[Event]:
+    """Return the events of the last minutes that services remember."""
+    now = time.time()
+    return [
+        event
+        for report in bus.accounts(within=PAST)
+        for event in report.events
+        if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
+    ]
 
 
 class WebServer:

@@ -1,13 +1,24 @@
-"""The looks of the page: a dark and a light theme, colours and shapes of states, colours of vehicles, and the CSS."""
+"""The looks of the page: a dark and a light theme, shapes of states, and the template of its text."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import math
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Final
+from string import Template
+from typing import Any, Final
 
+import jinja2
 from bokeh.themes import Theme
+
+from nedbus.client import to_age
+
+from .fleet import GRADES, MAX_STREAMS
+from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
 """The shape of a grade, or of the severity of an event, in text."""
@@ -18,7 +29,7 @@ PALETTE: Final = 8
 
 
 def read_asset(name: str) -> str:
-    """Return a file of `assets/`: CSS, JavaScript and HTML of the page."""
+    """Return a file of `assets/`: CSS, JavaScript, the template, the theme of plots."""
     return (Path(__file__).parent / "assets" / name).read_text()
 
 
@@ -44,38 +55,34 @@ class Style:
         return self.vehicles[number % PALETTE]
 
     @property
+    def colours(self) -> dict[str, str]:
+        """The colours by the names that CSS and the theme of plots have for them."""
+        plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
+        return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
+
+    @property
     def theme(self) -> Theme:
         """Bokeh's theme for plots."""
-        axis = {
-            "axis_label_text_color": self.quiet, "major_label_text_color": self.quiet, "axis_line_color": self.line,
-            "major_tick_line_color": None, "minor_tick_line_color": None, "axis_label_text_font_size": "11px",
-            "axis_label_text_font_style": "normal", "major_label_text_font_size": "11px",
-        }  # fmt: skip
-        figure = {
-            "background_fill_color": self.ground, "border_fill_color": self.ground, "outline_line_color": self.line,
-            "min_border": 4,
-        }  # fmt: skip
-        title = {"text_color": self.text, "text_font_size": "12px", "text_font_style": "normal"}
-        legend = {
-            "background_fill_alpha": 0.0, "border_line_alpha": 0.0, "label_text_color": self.quiet, "padding": 0,
-            "label_text_font_size": "11px", "glyph_width": 14, "spacing": 8, "margin": 2, "label_height": 12,
-            "orientation": "horizontal", "location": "top_left",
-        }  # fmt: skip
-        scale_bar = {
-            "background_fill_alpha": 0.0, "border_line_alpha": 0, "label_text_color": self.text,
-            "bar_line_color": self.text, "label_text_font_size": "11px",
-        }  # fmt: skip
-        grid = {"grid_line_color": self.line}
-        attrs = {"figure": figure, "Axis": axis, "Grid": grid, "Title": title, "Legend": legend, "ScaleBar": scale_bar}
-        return Theme(json={"attrs": attrs})
+        return Theme(json=json.loads(Template(read_asset("theme.json")).substitute(self.colours)))
 
     @property
     def page_css(self) -> str:
         """CSS of the page itself: the colours as variables, for all that is on it."""
-        colours = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
-        colours |= {**self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
-        variables = " ".join(f"--{name}: {colour};" for name, colour in colours.items())
+        variables = " ".join(f"--{name}: {colour};" for name, colour in self.colours.items())
         return f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
+
+    def open_panels(self, moment: Callable[[float], str]) -> Any:
+        """Return the macros of `panels.html`, which write the text; `moment` writes a time of the account's clock."""
+        return _panels().make_module({"style": self, "moment": moment})
+
+
+@cache
+def _panels() -> jinja2.Template:
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    environment.filters.update(age=to_age, degrees=math.degrees)
+    environment.tests.update(finite=math.isfinite, position=is_position)
+    environment.globals.update(GRADES=GRADES, MAX_STREAMS=MAX_STREAMS, SHAPES=SHAPES, hypot=math.hypot)
+    return environment.from_string(re.sub(r"(?<=[>}])\n\s*(?=[<{])", "", read_asset("panels.html")))
 
 
 DARK: Final = Style(

@@ -81,19 +81,19 @@ class Timeline:
         colours = self._style.grades
         self.shown = [event for event in events if event.vehicle in rows]
         marks = [
-            (each.time * 1e3, rows[each.vehicle], MARKERS[each.severity], colours[each.severity], each.text[:100],
-             each.vehicle)
-            for each in self.shown
+            {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
+             "colour": colours[event.severity], "words": event.text[:100], "who": event.vehicle}
+            for event in self.shown
         ]  # fmt: skip
         replace(self.marks, marks)
         bars = [
-            (max(begin, span.since) * 1e3, min(end, now if span.until is None else span.until) * 1e3, rows[name],
-             colours[span.severity])
+            {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": colours[span.severity],
+             "end": min(end, now if span.until is None else span.until) * 1e3}
             for severity in ("watch", "bad") for name in names for span in held.get(name, ())
             if span.severity == severity
         ]  # fmt: skip
         replace(self._spans, bars)
-        replace(self._now, [(now * 1e3,)])
+        replace(self._now, [{"time": now * 1e3}])
         if names != self._names:
             self._names = names
             axis = self.figure.yaxis[0]
@@ -134,9 +134,9 @@ class Plots:
     def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
         """Show when events of the vehicle happened, and how long they held, up to `end` [s]."""
         colours = self._style.grades
-        replace(self._marks, [(event.time * 1e3, colours[event.severity]) for event in events])
+        replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [
-            (begin * 1e3, stop * 1e3, colours[severity])
+            {"begin": begin * 1e3, "end": stop * 1e3, "colour": colours[severity]}
             for severity in ("watch", "bad")
             for begin, stop in _union([span for span in spans if span.severity == severity], end)
         ]

@@ -30,7 +30,6 @@ from .background import Background
 from .chronicle import PAST, Chronicle
 from .fleet import TRUTH, Fleet, Picture, Row
 from .map import FOCUSES, Map, View
-from .panels import describe_frame, open_panels, tiles
 from .playback import Player
 from .stream import is_position
 from .style import DARK, LIGHT, read_asset
@@ -76,7 +75,7 @@ class Viewer:
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._map = Map(self._style, background)
-        self._panels = open_panels(self._style, world.moment)
+        self._panels = self._style.open_panels(world.moment)
         sheets: list[Any] = [read_asset("text.css")]
         self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in _PARTS}
         self._search = TextInput(
@@ -167,19 +166,19 @@ class Viewer:
                 if self._player is not None:
                     if not self._player.has(moment):
                         return  # it is still read
-                    self._player.pause()
+                    self._player.toggle(pause=True)
                 self._go_to(moment)
         self._asked_time = None
 
     def _write_all(self, picture: Picture, chosen: Row | None) -> None:
         """Write all text, the title and the address."""
-        panels, player, moment = self._panels, self._player, self._world.moment
+        panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
         title = f"({bad} bad) {self._name}" if bad else self._name
         if self._document.title != title:
             self._document.title = title
         self._clock.args = {"start": self._world.start or 0.0}
-        clock = player.clock(picture.time) if player else f"{moment(picture.time)} UTC" * bool(picture.time)
+        clock = self._world.clock(picture.time) if picture.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
         rows = [each for each in picture.rows if wanted in each.vehicle.lower() or wanted in each.state.text.lower()]
         self._listed = [each.vehicle for each in rows]
@@ -192,10 +191,10 @@ class Viewer:
         self._write("head", panels.head(self._name, picture, clock, self._slow))
         self._write("list", panels.vehicles(rows, self.chosen))
         self._write("why", panels.why(then, story, now, self.pinned is not None))
-        self._write("nums", panels.numbers(tiles(chosen)))
+        self._write("nums", panels.numbers(chosen))
         self._write("more", panels.streams(chosen, picture.reports, self._is_open))
-        long, note = "whole flight" if player else "15 min", describe_frame(self._fleet, picture.rows)
-        self._write("tool", panels.toolbar(self.view, long, self.pinned, note))
+        long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
+        self._write("tool", panels.toolbar(self.view, long, self.pinned, picture.rows, projection))
         asked = {"theme": "light"} if self._style is LIGHT else {}
         if chosen is not None and self._is_choice:
             asked["vehicle"] = chosen.vehicle
