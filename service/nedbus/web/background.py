@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
 
 from nedbus.errors import ConfigError
 from nedbus_msgs import MapProjection
 
-from .column_data import table
 from .style import Style
 
 _PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
@@ -58,13 +58,11 @@ class Background:
             (west, south), (east, north) = (place(*corner) for corner in self._corners)
             plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
         lines = [list(zip(*(place(*point) for point in ring), strict=True)) for ring in self.rings]
-        source = table("east", "north")
-        source.data = {"east": [list(east) for east, _ in lines], "north": [list(north) for _, north in lines]}
+        source = ColumnDataSource({"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]})
         plot.multi_line("east", "north", source=source, color=style.quiet, line_width=1.5, level="underlay")
-        points = [place(*ring[0]) for ring in self.rings if len(ring) == 1]
-        plot.scatter(
-            [x for x, _ in points], [y for _, y in points], marker="cross", color=style.quiet, level="underlay"
-        )
+        points = [line for line in lines if len(line[0]) == 1]
+        easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
+        plot.scatter(easts, norths, marker="cross", color=style.quiet, level="underlay")
 
     def _read_picture(self, path: Path) -> None:
         from PIL import Image
@@ -90,32 +88,26 @@ class Background:
         self._corners = [(left, top + rows * height), (left + columns * width, top)]
 
 
-def _rings(shape: dict[str, Any]) -> Iterator[Ring]:
-    """Yield the lines of a GeoJSON object; a point is a line of one place."""
-    kind = shape["type"]
-    if kind in {"FeatureCollection", "GeometryCollection"}:
-        for each in shape["features" if kind == "FeatureCollection" else "geometries"]:
+def _rings(shape: Any) -> Iterator[Ring]:
+    """Yield the lines of a GeoJSON object, or of its coordinates, however deeply nested; a point is a line of one."""
+    if isinstance(shape, dict) and shape["type"] in {"FeatureCollection", "GeometryCollection"}:
+        for each in shape["features" if shape["type"] == "FeatureCollection" else "geometries"]:
             yield from _rings(each)
-    elif kind == "Feature":
-        if shape["geometry"] is not None:
-            yield from _rings(shape["geometry"])
+    elif isinstance(shape, dict) and shape["type"] == "Feature":
+        yield from _rings(shape["geometry"]) if shape["geometry"] is not None else ()
+    elif isinstance(shape, dict):
+        yield from _rings(shape["coordinates"])
+    elif isinstance(shape[0], int | float):
+        yield [_place(shape)]
+    elif isinstance(shape[0][0], int | float):
+        yield [_place(each) for each in shape]
     else:
-        yield from _lines(shape["coordinates"])
+        for each in shape:
+            yield from _rings(each)
 
 
-def _lines(coordinates: Sequence[Any]) -> Iterator[Ring]:
-    """Yield the lines in coordinates, however deeply they are nested."""
-    if isinstance(coordinates[0], int | float):
-        yield [_check(coordinates)]
-    elif isinstance(coordinates[0][0], int | float):
-        yield [_check(each) for each in coordinates]
-    else:
-        for each in coordinates:
-            yield from _lines(each)
-
-
-def _check(place: Sequence[Any]) -> tuple[float, float]:
-    longitude, latitude = float(place[0]), float(place[1])
+def _place(point: Sequence[Any]) -> tuple[float, float]:
+    longitude, latitude = float(point[0]), float(point[1])
     if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
-        raise ValueError(f"{place} is no longitude and latitude")
+        raise ValueError(f"{point} is no longitude and latitude")
     return longitude, latitude

@@ -52,9 +52,8 @@ class Line:
 class Row:
     """One vehicle at one moment: its state and its streams.
 
-    `main`: the stream that its marker shows; `rank`: its place among the others, 0 for the worst; one that was
-    switched off long ago comes last. `number`: for its colour. `facts`: mode, armed, battery and gps of its other
-    messages, "" where there are none.
+    `main`: the stream that its marker shows; `facts`: mode, armed, battery and gps of its other messages, "" where
+    there are none; `number`: for its colour.
     """
 
     vehicle: str
@@ -62,7 +61,6 @@ class Row:
     main: Line
     lines: tuple[Line, ...]
     facts: Mapping[str, str]
-    rank: int
     number: int
 
     @property
@@ -194,22 +192,19 @@ class Fleet:
             state = stream_state(health, alive=None if alive is None else address in alive, connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(vehicle, each, states.get(vehicle), time, own) for vehicle, each in lines.items()]
-        rows.sort(key=lambda row: (row.rank, natural(row.vehicle)))
+        rows = [self._row(vehicle, each, states.get(vehicle), own) for vehicle, each in lines.items()]
+        rows.sort(key=lambda row: (_rank(row, time), natural(row.vehicle)))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
 
-    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, time: float, own: str) -> Row:
+    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, own: str) -> Row:
         main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
         state = state or State("info", "ok", None, ())
         if state.severity == "info" and main.state.name == "slow" and not own:  # else it is this page that is slow
             state = replace(state, severity="watch", text=str(main.state))
         number = self._numbers.setdefault(vehicle, len(self._numbers)) if len(self._numbers) < MAX_STREAMS else 0
-        rank = {"bad": 0, "watch": 1, "info": 2}[state.severity]
-        if any(each.kind == "gone" and time - each.since > _FORGOTTEN for each in state.conditions[:1]):
-            rank = 3
-        return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), rank, number)
+        return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number)
 
     def _facts(self, vehicle: str) -> dict[str, str]:
         status = self._last(vehicle, "vehicle_status")
@@ -238,6 +233,12 @@ class Fleet:
             if address.topic == TRUTH:
                 del self._truths[address.vehicle]
         return True
+
+
+def _rank(row: Row, time: float) -> int:
+    """Return the place of a vehicle among others, 0 for bad ones; those that went long ago come last."""
+    is_forgotten = any(each.kind == "gone" and time - each.since > _FORGOTTEN for each in row.state.conditions[:1])
+    return len(GRADES) if is_forgotten else GRADES.index(row.grade)
 
 
 def natural(name: str) -> list[tuple[bool, int, str]]:

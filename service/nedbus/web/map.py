@@ -163,16 +163,17 @@ class Map:
         style, tracks = self._style, self._tracks.source
         plot = figure(
             match_aspect=True, sizing_mode="stretch_both", x_axis_label="east [m]", y_axis_label="north [m]",
-            tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom", min_border=4, height=100, css_classes=["map"],
+            tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom", height=100, css_classes=["map"],
         )  # fmt: skip
         plot.toolbar.update(logo=None, autohide=True)
         frame = plot.scatter("east", "north", source=self._frame, size=0, alpha=0)
         for axis in (plot.x_range, plot.y_range):
             axis.update(renderers=[frame], range_padding=0)
-        plot.line("east", NAMES[-1], source=tracks, color=style.truth, line_dash="dotted", line_width=2)
-        for number, name in enumerate(NAMES[:-2]):
+        *valid, doubtful, truth = NAMES
+        plot.line("east", truth, source=tracks, color=style.truth, line_dash="dotted", line_width=2)
+        for number, name in enumerate(valid):
             plot.line("east", name, source=tracks, color=style.vehicle(number), line_width=1.5)
-        plot.line("east", NAMES[-2], source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
+        plot.line("east", doubtful, source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
         plot.circle(
             "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=style.text, line_dash="dashed"
         )

@@ -71,6 +71,10 @@ class Recording:
         """Seconds that have been read so far."""
         return self.dues[-1] if self.dues else 0.0
 
+    def has(self, seconds: float) -> bool:
+        """Return whether this time was read already, or will not come."""
+        return self.is_read or seconds <= self.length
+
     def before(self, index: int) -> list[int]:
         """Return the last entry of each stream before this one, in order."""
         found = (known[at - 1] for known in list(self._indices.values()) if (at := bisect_left(known, index)))
@@ -113,7 +117,7 @@ class Player:
         self.fleet = Fleet(recording.whole.origin)
         self.on_jump: Callable[[], object] = lambda: None
         self.time = 0.0
-        self._recording = recording
+        self.recording = recording
         self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
@@ -126,26 +130,17 @@ class Player:
         self._slider.on_change("value", lambda _, __, value: self._drag(value))
         self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
 
-    @property
-    def length(self) -> float:
-        """Seconds of the recording that have been read so far."""
-        return self._recording.length
-
     def tick(self) -> None:
         """Let the time run on."""
         now = time.monotonic()
         elapsed, self._ticked = now - self._ticked, now
         if self._play.active:
             speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
-            self.time = min(self.time + elapsed * speed, self.length)
+            self.time = min(self.time + elapsed * speed, self.recording.length)
         if not self._is_dragged:
             self._shown = round(self.time, 1)
-            self._slider.update(end=max(1.0, self.length), value=self._shown)
+            self._slider.update(end=max(1.0, self.recording.length), value=self._shown)
         self._feed()
-
-    def has(self, seconds: float) -> bool:
-        """Return whether this time was read already, or will not come."""
-        return self._recording.is_read or seconds <= self.length
 
     def toggle(self, *, pause: bool = False) -> None:
         """Pause, or play on."""
@@ -155,12 +150,12 @@ class Player:
         """Set the time, as far as the recording has it, with the minute before it."""
         self._is_dragged = False
         self.fleet.clear()
-        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.length)
-        self._next = bisect_left(self._recording.dues, self.time - _MINUTE)
-        for index in self._recording.before(self._next):  # the last message of streams that are silent by then
+        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
+        self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
+        for index in self.recording.before(self._next):  # the last message of streams that are silent by then
             self._show(index)
         for address, stream in self.fleet.streams.items():
-            whole = self._recording.whole.streams.get(address)
+            whole = self.recording.whole.streams.get(address)
             if stream.valid is None and whole is not None:
                 (stream.valid,) = whole.places_at([self.time])
         self._feed()
@@ -171,16 +166,16 @@ class Player:
 
     def _feed(self) -> None:
         """Show the messages up to this time."""
-        end = bisect_right(self._recording.dues, self.time)
+        end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
-        chronicle = self._recording.chronicle
+        chronicle = self.recording.chronicle
         states = {name: chronicle.state(name, self.time) for name in chronicle.spans}
         self.fleet.look(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
 
     def _show(self, index: int) -> None:
-        due, (address, kept) = self._recording.dues[index], self._recording.entries[index]
+        due, (address, kept) = self.recording.dues[index], self.recording.entries[index]
         received = round(due * 1e9)
         if isinstance(kept, str):
             self.fleet.reject([RejectionReport(address, kept, received)])

@@ -26,7 +26,7 @@ from tornado.web import HTTPError, RequestHandler
 
 from nedbus.client import Bus
 from nedbus.errors import ListenError
-from nedbus.events import ALL, Event
+from nedbus.events import ALL
 from nedbus.monitoring import Exporter, Page, Sight
 from nedbus.settings import is_loopback
 from nedbus_msgs import Selection
@@ -113,7 +113,14 @@ class LiveFleet:
             bus, selection, version=version, on_look=self._look,
             watch=lambda sample: self.fleet.add(sample, time.time()),
         )  # fmt: skip
-        self.chronicle = Chronicle(self._exporter.account, before=_remembered(bus, selection))
+        now = time.time()
+        remembered = [
+            event
+            for report in bus.accounts(within=PAST)
+            for event in report.events
+            if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
+        ]
+        self.chronicle = Chronicle(self._exporter.account, before=remembered)
         self.pages: Mapping[str, Callable[[], Page]] = self._exporter.pages
 
     def run(self, stop: threading.Event) -> None:
@@ -127,17 +134,6 @@ class LiveFleet:
         states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
         own = sight.behind.replace("this reader", "this page")
         self.fleet.look(sight.time, sight.healths, states, alive=sight.alive, link=sight.link, own=own)
-
-
-def _remembered(bus: Bus, selection: Selection) -> list[Event]:
-    """Return the events of the last minutes that services remember."""
-    now = time.time()
-    return [
-        event
-        for report in bus.accounts(within=PAST)
-        for event in report.events
-        if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
-    ]
 
 
 class WebServer:

@@ -69,12 +69,14 @@ class Timeline:
     ) -> None:  # fmt: skip
         """Show the events from `begin` to `end` [s]; `vehicles`: the most important first."""
         events = [event for event in events if begin <= event.time <= end and is_notable(event)]
-        held = {
-            name: [span for span in spans.get(name, ()) if _lasts(span) and (span.until is None or span.until > begin)]
+        held = [  # watched ones first, so that bad ones lie on them
+            (name, span)
+            for severity in ("watch", "bad")
             for name in vehicles
-        }
-        affected = {event.vehicle for event in events if event.severity != "info"}
-        affected |= {name for name, spans_of_one in held.items() if spans_of_one}
+            for span in spans.get(name, ())
+            if span.severity == severity and span.until != span.since and (span.until is None or span.until > begin)
+        ]
+        affected = {event.vehicle for event in events if event.severity != "info"} | {name for name, _ in held}
         names = [name for index, name in enumerate(vehicles) if name and (index == 0 or name in affected)]
         names = [*([ALL] if ALL in affected else []), *names][:_MAX_ROWS]
         rows = {name: len(names) - index for index, name in enumerate(names)}
@@ -89,8 +91,7 @@ class Timeline:
         bars = [
             {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": colours[span.severity],
              "end": min(end, now if span.until is None else span.until) * 1e3}
-            for severity in ("watch", "bad") for name in names for span in held.get(name, ())
-            if span.severity == severity
+            for name, span in held if name in rows
         ]  # fmt: skip
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
@@ -168,10 +169,6 @@ def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:
     )
     plot.xaxis.formatter = clock
     return plot
-
-
-def _lasts(span: Span) -> bool:
-    return span.severity != "info" and span.since != span.until
 
 
 def _union(spans: Sequence[Span], end: float) -> list[list[float]]:

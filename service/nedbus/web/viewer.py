@@ -13,14 +13,7 @@ from urllib.parse import urlencode
 from bokeh.document import Document
 from bokeh.events import ConnectionLost, DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import (
-    ColumnDataSource,
-    CustomJS,
-    CustomJSTickFormatter,
-    GlobalInlineStyleSheet,
-    InlineStyleSheet,
-    LayoutDOM,
-)
+from bokeh.models import ColumnDataSource, CustomJS, CustomJSTickFormatter, GlobalInlineStyleSheet, LayoutDOM
 from bokeh.models.widgets import Div, TextInput
 
 from nedbus.events import ALL, Event
@@ -45,7 +38,6 @@ _MAX_DIGITS: Final = 9  # of the number of a picture
 _MAX_SIDE: Final = 20_000  # pixels of a map
 _MAX_SAID: Final = 300  # characters of what a browser asks for
 _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s of a recording
-_PARTS: Final = ("head", "list", "why", "nums", "tool", "more", "marks")
 
 
 class Viewer:
@@ -77,7 +69,8 @@ class Viewer:
         self._map = Map(self._style, background)
         self._panels = self._style.open_panels(world.moment)
         sheets: list[Any] = [read_asset("text.css")]
-        self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in _PARTS}
+        names = "head", "list", "why", "nums", "tool", "more", "marks"
+        self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in names}
         self._search = TextInput(
             placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
         )
@@ -152,19 +145,18 @@ class Viewer:
             self.pinned = seconds
         elif seconds is not None:
             self._player.jump(seconds)
-        self._show_now()
 
     def _go_to_asked(self) -> None:
         """Go to the moment that the address asks for, as soon as events tell when that was."""
         events = self._world.events
-        if self._asked_time is None or not events or (self._player is not None and not self._player.length):
+        if self._asked_time is None or not events or (self._player is not None and not self._player.recording.length):
             return
         near = next((each for each in reversed(events) if each.vehicle == self.chosen), events[-1])
         with suppress(ValueError):  # an address that was written by hand: no moment is chosen then
             moment = self._world.times.find(self._asked_time, near)
             if abs(moment - near.time) < _DAY:
                 if self._player is not None:
-                    if not self._player.has(moment):
+                    if not self._player.recording.has(moment):
                         return  # it is still read
                     self._player.toggle(pause=True)
                 self._go_to(moment)
@@ -174,9 +166,7 @@ class Viewer:
         """Write all text, the title and the address."""
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
-        title = f"({bad} bad) {self._name}" if bad else self._name
-        if self._document.title != title:
-            self._document.title = title
+        self._document.title = f"({bad} bad) {self._name}" if bad else self._name
         self._clock.args = {"start": self._world.start or 0.0}
         clock = self._world.clock(picture.time) if picture.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
@@ -188,27 +178,21 @@ class Viewer:
             story = self._world.story(chosen.vehicle, now, at)
             if self.pinned is not None:
                 then = replace(chosen, state=self._world.state(chosen.vehicle, now))
-        self._write("head", panels.head(self._name, picture, clock, self._slow))
-        self._write("list", panels.vehicles(rows, self.chosen))
-        self._write("why", panels.why(then, story, now, self.pinned is not None))
-        self._write("nums", panels.numbers(chosen))
-        self._write("more", panels.streams(chosen, picture.reports, self._is_open))
+        self._text["head"].text = panels.head(self._name, picture, clock, self._slow)
+        self._text["list"].text = panels.vehicles(rows, self.chosen)
+        self._text["why"].text = panels.why(then, story, now, self.pinned is not None)
+        self._text["nums"].text = panels.numbers(chosen)
+        self._text["more"].text = panels.streams(chosen, picture.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
-        self._write("tool", panels.toolbar(self.view, long, self.pinned, picture.rows, projection))
-        asked = {"theme": "light"} if self._style is LIGHT else {}
-        if chosen is not None and self._is_choice:
-            asked["vehicle"] = chosen.vehicle
-        if self.view.focus != "all":
-            asked["view"] = self.view.focus
-        if self.pinned is not None or player is not None:
-            asked["time"] = self._world.address_of(now)
-        address = f"?{urlencode(asked)}"
-        if self._drawn.value and self._address.value != address:  # a browser that is not there yet would miss it
-            self._address.value = address
-
-    def _write(self, part: str, text: str) -> None:
-        if self._text[part].text != text:
-            self._text[part].text = text
+        self._text["tool"].text = panels.toolbar(self.view, long, self.pinned, picture.rows, projection)
+        asked = {
+            "theme": "light" if self._style is LIGHT else None,
+            "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
+            "view": self.view.focus if self.view.focus != "all" else None,
+            "time": self._world.address_of(now) if self.pinned is not None or player is not None else None,
+        }
+        if self._drawn.value:  # a browser that is not there yet would miss it
+            self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
 
     def _now(self, picture: Picture) -> float:
         """Return the moment that is shown [s]."""
@@ -224,7 +208,7 @@ class Viewer:
             kept = streams.get(chosen.main.address), streams.get(Address(vehicle, TRUTH))
             main, truth = (None if each is None else each.long if is_long else each.minute for each in kept)
         self._plots.update(main, truth)
-        begin, end = (0.0, self._player.length) if self._player else (picture.time - PAST, picture.time)
+        begin, end = (0.0, self._player.recording.length) if self._player else (picture.time - PAST, picture.time)
         if self.pinned is not None:
             move(self._plots.range, now - _AROUND, now + _AROUND)
         elif view.is_long:
@@ -239,7 +223,7 @@ class Viewer:
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
             move(self._timeline.range, begin, max(end, begin + 1.0))
         if self._player is not None:
-            self._write("marks", self._panels.strip(self._timeline.shown, self._player.length))
+            self._text["marks"].text = self._panels.strip(self._timeline.shown, self._player.recording.length)
         since = begin if view.is_long else now - _MINUTE
         self._map.mark([event for event in told if since < event.time <= now + 1.0], chosen, self._whole)
 
@@ -290,21 +274,16 @@ class Viewer:
                 player.jump(player.time + _STEPS.get(key, 0.0))
 
     def _choose_next(self, step: int) -> None:
-        """Choose the vehicle below or above in the list, which goes round."""
-        names = self._listed
-        if names:
+        if names := self._listed:  # which goes round
             self._choose(names[(names.index(self.chosen) + step if self.chosen in names else 0) % len(names)])
 
     def _show_next(self, *, is_later: bool) -> None:
-        """Show the next or the previous event of the chosen vehicle."""
-        told = self._events_of_chosen()
         now = self._player.time if self._player else self.pinned
-        if is_later:
-            found = next((event for event in told if now is not None and event.time > now + 0.05), None)
-        else:
-            found = next((event for event in reversed(told) if now is None or event.time < now - 0.05), None)
-        if found is not None:
-            self._show(found)
+        events = self._events_of_chosen()
+        later = [event for event in events if now is not None and event.time > now + 0.05]
+        earlier = [event for event in events if now is None or event.time < now - 0.05]
+        for event in later[:1] if is_later else earlier[-1:]:
+            self._show(event)
 
     def _on_tap(
         self, source: ColumnDataSource, shown: Callable[[], Sequence[Any]], show: Callable[[Any], object]
@@ -329,9 +308,9 @@ class Viewer:
                 control.stylesheets = sheets
             marked = column(slider, text["marks"], sizing_mode="stretch_width")
             parts.insert(1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"]))
-        page = GlobalInlineStyleSheet(css=self._style.page_css), InlineStyleSheet(css=read_asset("layout.css"))
-        hidden = [self._beat, self._drawn, self._said, self._address]
-        return column(*parts, *hidden, sizing_mode="stretch_width", stylesheets=[*page])
+        parts += [self._beat, self._drawn, self._said, self._address]
+        page: list[Any] = [GlobalInlineStyleSheet(css=self._style.page_css), read_asset("layout.css")]
+        return column(*parts, sizing_mode="stretch_width", stylesheets=page)
 
 
 def _arguments(document: Document) -> Mapping[str, str]:
