@@ -127,7 +127,7 @@ class Page(Shown):
 
     def __init__(self, recording: Recording, player: Player, **options: Any) -> None:
         super().__init__(
-            player.fleet, recording.chronicle, title=recording.name, whole=recording.whole, player=player, **options
+            player.fleet, recording.chronicle, title=recording.name, player=player, **options
         )  # fmt: skip
         self.player = player
         self.update()

@@ -56,13 +56,13 @@ class Tracks:
 
     def __init__(self) -> None:
         self.source = table("east", *NAMES)
-        self._tracks: Mapping[Address, Track] | None = None
+        self._tracks: Mapping[Address, Track] = {}
         self._seen: list[int] = []
         self._step = self._slots = 1
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
         """Send the new points of these."""
-        begins = tracks != self._tracks
+        begins = tracks != self._tracks  # as after a jump of the time, which makes other histories
         if begins:
             self._lay_out(tracks)
         cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
@@ -75,10 +75,6 @@ class Tracks:
             self.source.data = filled
         elif cells["east"]:
             self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
-
-    def clear(self) -> None:
-        """Forget all, so that the next update sends everything again."""
-        self._tracks = None
 
     def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
         """Choose the number of slots, and of points in each."""

@@ -8,7 +8,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from nedbus.client import Health, RejectionReport, Sample, StreamState, describe_stream, health_of_last, stream_state
 from nedbus.events import FIXES, MODES, State
@@ -16,8 +16,7 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .stream import LONG, Origin, Stream, is_position
 
-Grade = Literal["bad", "watch", "ok"]
-GRADES: Final[tuple[Grade, ...]] = ("bad", "watch", "ok")
+GRADES: Final = ("bad", "watch", "ok")
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
@@ -64,7 +63,7 @@ class Row:
     number: int
 
     @property
-    def grade(self) -> Grade:
+    def grade(self) -> str:
         """The severity of its state, "ok" where that is none."""
         return "ok" if self.state.severity == "info" else self.state.severity
 

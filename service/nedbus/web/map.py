@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -32,17 +31,11 @@ _LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label
 _MAX_EVENTS: Final = 60
 
 
-@dataclass(slots=True)
-class View:
-    """What of the map is shown: the focus, of FOCUSES, whether trails are long, and whether ground truth is drawn."""
-
-    focus: str = "all"
-    is_long: bool = False
-    truth: bool = True
-
-
 class Map:
-    """The map of one viewer; `marks` has a row for each of `shown`, `events` for each of `told`; both can be tapped."""
+    """The map of one viewer; `marks` has a row for each of `shown`, `events` for each of `told`; both can be tapped.
+
+    `focus`: one of FOCUSES; `is_long`: whether trails are longer than a minute; `truth`: whether it is drawn.
+    """
 
     def __init__(self, style: Style, background: Background | None) -> None:
         self.marks = table(
@@ -52,25 +45,26 @@ class Map:
         self.shown: list[str] = []
         self.told: list[Event] = []
         self.size = 600.0, 500.0  # pixels, until the browser has said how many
+        self.focus, self.is_long, self.truth = "all", False, True
         self._style, self._background = style, background
         self._tracks = Tracks()
         self._ring = table("east", "north", "radius")
         self._frame = table("east", "north")
         self.figure = self._draw()
 
-    def update(self, picture: Picture, whole: Fleet, row: Row | None, view: View) -> None:
+    def update(self, picture: Picture, whole: Fleet, row: Row | None) -> None:
         """Move the vehicles, and send the new points of their tracks; `row` is chosen, `whole` has the long tracks."""
         tracks: dict[Address, Track] = {}
         for each in sorted(picture.rows, key=lambda each: each.number):
             for line in each.lines:
-                if line is each.main or (view.truth and line.address.topic == TRUTH):
-                    kept = whole.streams.get(line.address) if view.is_long else None
+                if line is each.main or (self.truth and line.address.topic == TRUTH):
+                    kept = whole.streams.get(line.address) if self.is_long else None
                     tracks[line.address] = kept.long if kept is not None else line.stream.minute, each.number
         self._tracks.update(tracks)
         placed = [(each, place) for each in picture.rows if (place := each.main.stream.valid) is not None]
         chosen = [(each, place) for each, place in placed if each is row]
-        frame = self._frame_of(chosen or placed if view.focus == "vehicle" else placed, tracks)
-        if view.focus == "follow" and chosen:
+        frame = self._frame_of(chosen or placed if self.focus == "vehicle" else placed, tracks)
+        if self.focus == "follow" and chosen:
             half = _FOLLOWED_SIDE / 2
             frame = [[middle - half, middle + half] for middle in chosen[0][1][:2]]
         replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
@@ -100,10 +94,6 @@ class Map:
             for event, at in placed
         ]  # fmt: skip
         replace(self.events, marks)
-
-    def clear(self) -> None:
-        """Forget all, so that the next update sends everything again."""
-        self._tracks.clear()
 
     def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
         """Return from where to where the map is, east and north."""

@@ -91,9 +91,8 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
     def open_page(document: Document) -> None:
         player = Player(recording)
         viewer = Viewer(
-            document, player.fleet, recording.chronicle, title=recording.name, background=background,
-            whole=recording.whole, player=player,
-        )  # fmt: skip
+            document, player.fleet, recording.chronicle, title=recording.name, background=background, player=player
+        )
         document.add_periodic_callback(viewer.update, _TICK)
 
     server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
@@ -104,7 +103,7 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 class LiveFleet:
     """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop.
 
-    `pages`: metrics and health, as `nedbus export` serves them.
+    `run` reads until an event is set; `pages`: metrics and health, as `nedbus export` serves them.
     """
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
@@ -121,11 +120,7 @@ class LiveFleet:
             if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
         ]
         self.chronicle = Chronicle(self._exporter.account, before=remembered)
-        self.pages: Mapping[str, Callable[[], Page]] = self._exporter.pages
-
-    def run(self, stop: threading.Event) -> None:
-        """Read until `stop` is set."""
-        self._exporter.run(stop)
+        self.run, self.pages = self._exporter.run, self._exporter.pages
 
     def _look(self, sight: Sight) -> None:
         """Make the picture of now."""

@@ -153,7 +153,7 @@ def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None)
         return math.nan
     real = truth.last.message
     other = truth.origin.place(real)
-    seconds = (_moment(message) - _moment(real)) / 1e6
+    seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
     if other.common != place.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan
     offsets = [
@@ -162,7 +162,3 @@ def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None)
         other.altitude - real.vz * seconds - place.altitude,
     ]
     return math.hypot(*(offset for offset in offsets if math.isfinite(offset)))
-
-
-def _moment(message: VehicleLocalPosition) -> int:
-    return message.timestamp_sample or message.timestamp

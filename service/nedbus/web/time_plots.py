@@ -15,9 +15,7 @@ from .column_data import replace, table
 from .stream import COLUMNS, History
 from .style import MARKERS, Style
 
-NOTABLE: Final = frozenset({"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"})
-"""Kinds of events that are shown though they are only info."""
-
+_PHASES: Final = frozenset({"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"})  # of a flight
 _MAX_ROWS: Final = 7
 _MIN_ROWS: Final = 4  # bars of few vehicles are no walls
 _PLOTS: Final = {
@@ -32,7 +30,7 @@ _OF_TRUTH: Final = {"height", "speed"}
 
 def is_notable(event: Event) -> bool:
     """Return whether an event is shown: bad ones, those to be watched, and the phases of a flight."""
-    return event.severity != "info" or event.kind in NOTABLE
+    return event.severity != "info" or event.kind in _PHASES
 
 
 def move(axis: Range1d, begin: float, end: float) -> None:
@@ -142,12 +140,6 @@ class Plots:
             for begin, stop in _union([span for span in spans if span.severity == severity], end)
         ]
         replace(self._spans, held)
-
-    def clear(self) -> None:
-        """Forget all, so that the next update sends everything again."""
-        self._shown.clear()
-        for source in (self.chosen, self._truth):
-            source.data = {name: [] for name in COLUMNS}
 
     def _draw(self, title: str, names: tuple[str, ...]) -> figure:
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)

@@ -22,7 +22,7 @@ from nedbus_msgs import Address
 from .background import Background
 from .chronicle import PAST, Chronicle
 from .fleet import TRUTH, Fleet, Picture, Row
-from .map import FOCUSES, Map, View
+from .map import FOCUSES, Map
 from .playback import Player
 from .stream import is_position
 from .style import DARK, LIGHT, read_asset
@@ -43,30 +43,31 @@ _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s 
 class Viewer:
     """One page in one browser; `update` sends what is new of the fleet, ten times a second.
 
-    `world`: the events. `whole`: the fleet whose long histories are shown. `player`: of a recording.
+    `world`: the events. `player`: of a recording, of which long histories are whole.
     What the address of the page asks for is shown first, and the address follows what is shown, so that it can be sent.
     """
 
     def __init__(
         self, document: Document, fleet: Fleet, world: Chronicle, *, title: str = "nedbus",
-        background: Background | None = None, whole: Fleet | None = None, player: Player | None = None,
+        background: Background | None = None, player: Player | None = None,
     ) -> None:  # fmt: skip
         asked = _arguments(document)
         self.chosen: str | None = asked.get("vehicle")
         self.pinned: float | None = None  # a moment that is chosen, of live vehicles
-        self.view = View(asked["view"] if asked.get("view") in FOCUSES else "all")
         self._asked_time = asked.get("time")
         self._is_choice = self.chosen is not None
         self._event: Event | None = None  # that is chosen, of the chosen vehicle
         self._is_open = False  # the table of streams
         self._listed: list[str] = []
-        self._fleet, self._whole, self._world, self._player = fleet, whole or fleet, world, player
+        self._fleet, self._world, self._player = fleet, world, player
+        self._whole = player.recording.whole if player is not None else fleet
         self._style, self._name, self._document = LIGHT if asked.get("theme") == "light" else DARK, title, document
         self._ticks, self._sent, self._updated, self._slow = 0, 0, time.monotonic(), 0.0
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._map = Map(self._style, background)
+        self._map.focus = asked["view"] if asked.get("view") in FOCUSES else "all"
         self._panels = self._style.open_panels(world.moment)
         sheets: list[Any] = [read_asset("text.css")]
         names = "head", "list", "why", "nums", "tool", "more", "marks"
@@ -93,7 +94,7 @@ class Viewer:
         document.js_on_event(DocumentReady, CustomJS(args=args, code=read_asset("actions.js")))
         document.add_root(self._lay_out(sheets))
         if player is not None:
-            player.on_jump = self._restart
+            player.on_jump = self._show_now
 
     def update(self) -> None:
         """Send what is new, as soon as the browser has drawn the last: the map each time, the rest twice a second."""
@@ -111,19 +112,14 @@ class Viewer:
         if not self._is_choice and picture.rows:  # the worst, until somebody chooses
             self.chosen = picture.rows[0].vehicle
         chosen = picture.row(self.chosen)
-        self._map.update(picture, self._whole, chosen, self.view)
+        self._map.update(picture, self._whole, chosen)
         if self._ticks % _TEXT_TICKS == 0:
             self._go_to_asked()
-            self._write_all(picture, chosen)
-            self._plot(picture, chosen)
+            moment = picture.time if self.pinned is None else self.pinned
+            self._write_all(picture, chosen, moment)
+            self._plot(picture, chosen, moment)
         self._ticks += 1
         self._beat.value = str(self._sent)
-
-    def _restart(self) -> None:
-        """Send everything again: the time has jumped."""
-        self._map.clear()
-        self._plots.clear()
-        self._show_now()
 
     def _show_now(self) -> None:
         self._ticks = 0
@@ -162,7 +158,7 @@ class Viewer:
                 self._go_to(moment)
         self._asked_time = None
 
-    def _write_all(self, picture: Picture, chosen: Row | None) -> None:
+    def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
         """Write all text, the title and the address."""
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
@@ -172,7 +168,7 @@ class Viewer:
         wanted = str(self._search.value_input or "").strip().lower()
         rows = [each for each in picture.rows if wanted in each.vehicle.lower() or wanted in each.state.text.lower()]
         self._listed = [each.vehicle for each in rows]
-        now, story, then = self._now(picture), None, chosen
+        story, then = None, chosen
         if chosen is not None:
             at = self.pinned if self._event is None else self._event
             story = self._world.story(chosen.vehicle, now, at)
@@ -184,24 +180,20 @@ class Viewer:
         self._text["nums"].text = panels.numbers(chosen)
         self._text["more"].text = panels.streams(chosen, picture.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
-        self._text["tool"].text = panels.toolbar(self.view, long, self.pinned, picture.rows, projection)
+        self._text["tool"].text = panels.toolbar(self._map, long, self.pinned, picture.rows, projection)
         asked = {
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
-            "view": self.view.focus if self.view.focus != "all" else None,
+            "view": self._map.focus if self._map.focus != "all" else None,
             "time": self._world.address_of(now) if self.pinned is not None or player is not None else None,
         }
         if self._drawn.value:  # a browser that is not there yet would miss it
             self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
 
-    def _now(self, picture: Picture) -> float:
-        """Return the moment that is shown [s]."""
-        return picture.time if self.pinned is None else self.pinned
-
-    def _plot(self, picture: Picture, chosen: Row | None) -> None:
+    def _plot(self, picture: Picture, chosen: Row | None, now: float) -> None:
         """Send the points and events, and move the time axes."""
-        vehicle, now, view = self.chosen or "", self._now(picture), self.view
-        is_long = view.is_long or now < picture.time - _MINUTE
+        vehicle, is_long_trail = self.chosen or "", self._map.is_long
+        is_long = is_long_trail or now < picture.time - _MINUTE
         main = truth = None
         if chosen is not None and is_position(chosen.main.address):
             streams = self._whole.streams if is_long else self._fleet.streams
@@ -211,7 +203,7 @@ class Viewer:
         begin, end = (0.0, self._player.recording.length) if self._player else (picture.time - PAST, picture.time)
         if self.pinned is not None:
             move(self._plots.range, now - _AROUND, now + _AROUND)
-        elif view.is_long:
+        elif is_long_trail:
             move(self._plots.range, begin, end)
         else:
             first = max(begin, now - _MINUTE)
@@ -224,7 +216,7 @@ class Viewer:
             move(self._timeline.range, begin, max(end, begin + 1.0))
         if self._player is not None:
             self._text["marks"].text = self._panels.strip(self._timeline.shown, self._player.recording.length)
-        since = begin if view.is_long else now - _MINUTE
+        since = begin if is_long_trail else now - _MINUTE
         self._map.mark([event for event in told if since < event.time <= now + 1.0], chosen, self._whole)
 
     def _events_of_chosen(self) -> list[Event]:
@@ -243,11 +235,11 @@ class Viewer:
             case "event" if value.isdecimal() and int(value) < len(self._timeline.shown):
                 self._show(self._timeline.shown[int(value)])
             case "focus" if option in FOCUSES:
-                self.view.focus = option
+                self._map.focus = option
             case "trail":
-                self.view.is_long = not self.view.is_long
+                self._map.is_long = not self._map.is_long
             case "truth":
-                self.view.truth = not self.view.truth
+                self._map.truth = not self._map.truth
             case "streams":
                 self._is_open = not self._is_open
             case "size":
