@@ -39,7 +39,7 @@ class Chronicle:
 
     @property
     def spans(self) -> Mapping[str, Sequence[Span]]:
-        """What held from when to when, by vehicle."""
+        """The spans of all conditions, by vehicle."""
         self._read()
         return self._spans
 
@@ -49,19 +49,19 @@ class Chronicle:
 
     @property
     def has_utc(self) -> bool:
-        """Whether its times are known in UTC."""
+        """True where its times are known in UTC."""
         return self.times.is_live or self.start is not None
 
     def moment(self, seconds: float) -> str:
         """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
-        return self.address_of(seconds)[:-2] if self.has_utc else _elapsed(seconds)
+        return self.time_text(seconds)[:-2] if self.has_utc else _elapsed(seconds)
 
     def clock(self, seconds: float) -> str:
         """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
         utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
         return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
 
-    def address_of(self, seconds: float) -> str:
+    def time_text(self, seconds: float) -> str:
         """Return a time of the account as `Times.find` understands it: UTC, or seconds since boot."""
         if self.has_utc:
             return to_clock(seconds + (self.start or 0.0))

@@ -88,7 +88,7 @@ class Row:
 
     @property
     def is_here(self) -> bool:
-        """Whether its position is valid and arrives."""
+        """True while its position is valid and arrives."""
         last = self.main.stream.last
         fresh = self.main.state.name not in ("disconnected", "gone", "stale")
         return fresh and last is not None and is_position(self.main.address) and bool(last.message.xy_valid)

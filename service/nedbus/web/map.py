@@ -24,7 +24,7 @@ FOCUSES: Final = ("all", "follow", "vehicle")
 MIN_SIDE: Final = 20.0
 """Metres that a map shows at least: less is the noise of a vehicle at rest."""
 
-_MIN_ZOOM: Final = 0.01  # m that a browser shows where somebody has zoomed in
+_MIN_ZOOM: Final = 0.01  # m that a browser shows after zooming in
 _MARGIN: Final = 0.08  # of what is shown, around it
 _FOLLOWED_SIDE: Final = 60.0  # m around a vehicle that is followed
 _LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label

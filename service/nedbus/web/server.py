@@ -134,8 +134,8 @@ class LiveFleet:
 class WebServer:
     """Serve a page, and pages of text by their path, until it is told to stop.
 
-    A page of somebody else that is open in the same browser gets nothing, also where that has made its own name lead
-    here: browsers have to call this one by a name of this host or one of `where.origins`.
+    A foreign page that is open in the same browser gets nothing, also where its own name leads here (DNS rebinding):
+    browsers have to call this one by a name of this host or one of `where.origins`.
 
     Raises ListenError when it cannot listen there.
     """
@@ -195,7 +195,7 @@ class WebServer:
 class _Names(NullAuth):
     """Answer only browsers that ask for one of these names."""
 
-    login_url = "/"  # Bokeh demands it where users are checked; nobody is sent there
+    login_url = "/"  # Bokeh demands it where users are checked; no browser is sent there
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = names
@@ -203,7 +203,7 @@ class _Names(NullAuth):
 
     @property
     def get_user_async(self) -> Callable[[Any], Any]:
-        """Return what checks a request before anything is answered; everybody is the same user."""
+        """Return the check of a request, before any answer; all viewers are the same user."""
 
         async def check(handler: RequestHandler) -> str:
             _require_name(handler, self._names)

@@ -42,7 +42,7 @@ class Timeline:
     """The timeline of one viewer: `shown` has an event for each row of `marks`, whose selection was tapped."""
 
     def __init__(self, style: Style, clock: Any) -> None:
-        self.marks = table("time", "row", "marker", "colour", "words", "who")
+        self.marks = table("time", "row", "marker", "colour", "words", "vehicle")
         self.shown: list[Event] = []
         self._spans = table("begin", "end", "row", "colour")
         self._now = table("time")
@@ -59,7 +59,7 @@ class Timeline:
             nonselection_alpha=1.0,
         )  # fmt: skip
         self.figure.vspan(x="time", source=self._now, line_color=style.text, line_dash="dotted")
-        self.figure.add_tools(HoverTool(renderers=[marks], tooltips="@who: @words"), TapTool(renderers=[marks]))
+        self.figure.add_tools(HoverTool(renderers=[marks], tooltips="@vehicle: @words"), TapTool(renderers=[marks]))
 
     def update(
         self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
@@ -82,7 +82,7 @@ class Timeline:
         self.shown = [event for event in events if event.vehicle in rows]
         marks = [
             {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
-             "colour": colours[event.severity], "words": event.text[:100], "who": event.vehicle}
+             "colour": colours[event.severity], "words": event.text[:100], "vehicle": event.vehicle}
             for event in self.shown
         ]  # fmt: skip
         replace(self.marks, marks)

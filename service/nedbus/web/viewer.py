@@ -109,7 +109,7 @@ class Viewer:
         if self._drawn.value and not self._grid.children:  # map and list are there sooner without
             self._grid.children = [*self._plots.draw()]
         picture = self._fleet.picture
-        if not self._is_choice and picture.rows:  # the worst, until somebody chooses
+        if not self._is_choice and picture.rows:  # the worst, until one is chosen
             self.chosen = picture.rows[0].vehicle
         chosen = picture.row(self.chosen)
         self._map.update(picture, self._whole, chosen)
@@ -185,7 +185,7 @@ class Viewer:
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
             "view": self._map.focus if self._map.focus != "all" else None,
-            "time": self._world.address_of(now) if self.pinned is not None or player is not None else None,
+            "time": self._world.time_text(now) if self.pinned is not None or player is not None else None,
         }
         if self._drawn.value:  # a browser that is not there yet would miss it
             self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
