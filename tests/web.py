@@ -39,7 +39,7 @@ QUAD: Final = Address("quad", VLP)
 NOON: Final = 1_700_000_000.0
 """Seconds since the epoch: 22:13:20 UTC."""
 _ROW: Final = re.compile(
-    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)" aria-selected="(?P<chosen>\w+)">'
+    r'<div class="row" [^>]*data-with="(?P<vehicle>[^"]*)" title="(?P<title>[^"]*)"\s+aria-selected="(?P<chosen>\w+)">'
     r'<span class="(?P<grade>\w+)">.*?<span class="\w+">(?P<text>[^<]*)</span>'
     r'<span class="quiet">(?P<since>[^<]*)</span><span class="mode">(?P<mode>[^<]*)</span>'
     r'<span>(?P<battery>[^<]*)</span><span class="gps">(?P<gps>[^<]*)</span></div>'
@@ -212,7 +212,7 @@ class Shown:
     @property
     def moments(self) -> tuple[float, float]:
         """From when to when the plots are [s]."""
-        span: Any = self.viewer._plots_range
+        span: Any = self.viewer._plots.range
         return span.start / 1e3, span.end / 1e3
 
     def rows(self, column: str) -> list[dict[str, Any]]:

@@ -23,12 +23,12 @@ from hypothesis import strategies as st
 import nedbus
 from nedbus.client import RejectionReport
 from nedbus.transport import Session, open_router
+from nedbus.web.column_data import NAMES, Track, Tracks
 from nedbus.web.fleet import TRUTH
-from nedbus.web.live import LiveFleet
-from nedbus.web.map_plot import LEAST
+from nedbus.web.map import MIN_SIDE
+from nedbus.web.server import LiveFleet
 from nedbus.web.stream import COLUMNS, History
 from nedbus.web.style import DARK, LIGHT, Style
-from nedbus.web.tracks import NAMES, Track, Tracks
 from nedbus_msgs import Address, Selection
 from tests.messages import VALID, VLP
 from tests.ports import free_endpoint
@@ -81,8 +81,8 @@ def test_tracks_are_what_a_new_viewer_gets(
     """
     (limit, step), points = budget, 60
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"_BUDGET": limit, "_FEWEST": 6}.items():
-            patch.setattr(f"nedbus.web.tracks.{name}", value)
+        for name, value in {"_MAX_POINTS": limit, "_MIN_TRACK_POINTS": 6}.items():
+            patch.setattr(f"nedbus.web.column_data.{name}", value)
         kept: dict[Address, Track] = {
             Address(*name): (History(points, 0.1), number)
             for number, name in enumerate((("a", VLP), ("b", VLP), ("c", TRUTH)))
@@ -247,7 +247,7 @@ def test_other_messages_are_streams_without_a_place(sky: Sky) -> None:
     page.say("vehicle", "far")
     assert page.chosen == "far"
     assert page.part("nums").count("<b>-</b>") == 9
-    assert len(page.plotted["climb"]) == 0
+    assert len(page.plotted["speed"]) == 0
     page.say("vehicle", "wing")
     assert "▸ 2 streams of wing" in page.part("more")
     assert "vehicle_attitude" not in page.part("more")
@@ -255,7 +255,7 @@ def test_other_messages_are_streams_without_a_place(sky: Sky) -> None:
     rows = re.findall("<tr>(.*?)</tr>", page.part("more"))
     cells = {row[0]: row[1:] for each in rows[1:] if (row := re.findall("<td>(.*?)</td>", each))}
     assert cells == {"vehicle_attitude": ["10", "0", "0", "ok"], VLP: ["10", "0", "0", "ok"]}
-    assert len(page.plotted["climb"]) > 20
+    assert len(page.plotted["speed"]) > 20
 
 
 def test_facts_of_a_vehicle_are_in_its_row_and_tiles(sky: Sky) -> None:
@@ -381,8 +381,8 @@ def test_map_shows_all_or_one(sky: Sky) -> None:
     sky.fly(3, WING)
     page = Page(sky)
     east, north = frame_of(page)
-    assert east[1] - east[0] >= LEAST
-    assert north[1] - north[0] >= LEAST
+    assert east[1] - east[0] >= MIN_SIDE
+    assert north[1] - north[0] >= MIN_SIDE
     for number in range(30):
         sky.fly(0.1, WING, x=-2.0 * number)
         sky.fly(0.1, QUAD, x=300.0, y=-500.0)
@@ -434,13 +434,13 @@ def test_trails_are_a_minute_or_long(sky: Sky) -> None:
         sky.fly(10, rate=5)
     page = Page(sky)
     assert page.moments == pytest.approx((sky.time - 60, sky.time), abs=0.01)
-    minute = len(page.plotted["climb"])
+    minute = len(page.plotted["speed"])
     page.say("trail")
     assert "trail 15 min" in page.part("tool")
     assert page.moments == pytest.approx((sky.time - 600, sky.time), abs=0.01)
     assert page.plotted["time"][0] < (sky.time - 190) * 1e3
     page.say("trail")
-    assert len(page.plotted["climb"]) == minute
+    assert len(page.plotted["speed"]) == minute
     assert 'data-do="truth" aria-pressed="true"' in page.part("tool")
     page.say("truth")
     assert 'data-do="truth" aria-pressed="false"' in page.part("tool")

@@ -19,7 +19,7 @@ from bokeh.models.widgets import Div
 from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
-from nedbus.web.server import WebServer
+from nedbus.web.server import WebServer, Where
 from tests.ports import free_port
 from tests.processes import Start
 from tests.waits import DEADLINE, wait_for
@@ -34,10 +34,8 @@ def url() -> Iterator[str]:
 
     def serve(stop: threading.Event, tell: Callable[[str], object]) -> None:
         texts = {path: lambda: Page.text("a text") for path in PATHS[1:]}
-        origins = ["ground.example:8420"]
-        server = WebServer(
-            "127.0.0.1", 0, lambda document: document.add_root(Div(text="a word")), pages=texts, origins=origins
-        )
+        where = Where("127.0.0.1", 0, ("ground.example:8420",))
+        server = WebServer(where, lambda document: document.add_root(Div(text="a word")), texts)
         tell(server.url)
         server.run(stop)
 

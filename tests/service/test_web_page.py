@@ -362,6 +362,8 @@ def test_recording_is_played(web: Web, tab: Open, tmp_path: Path) -> None:
     for key, seconds in (("ArrowLeft", 59), ("Shift+ArrowLeft", 49), ("ArrowRight", 50), ("n", 60)):
         page.page.keyboard.press(key)
         until(lambda seconds=seconds: time() == pytest.approx(seconds, abs=0.1), key)  # type: ignore[misc]  # bound here
+    page.page.locator("[data-do='focus:follow']").press("Enter")
+    until(lambda: page.asked.get("view") == "follow", "a button to be pressed by a key")
     other = tab(width=1280, height=800)
     other.open(page.url)
     until(lambda: other.states == {"wing": "xy not valid"}, "the same moment, from which on it is played")

@@ -61,7 +61,7 @@ def shown(player: Player) -> object:
     end = picture.time * 1e3
     found = []
     for row in picture.rows:
-        found.append(repr((row.vehicle, row.grade, row.text, row.since, row.where, row.conditions)))
+        found.append(repr((row.vehicle, row.grade, row.state.text, row.state.since, row.where, row.state.conditions)))
         for line in row.lines:
             points = line.stream.minute.points(0, line.stream.minute.written)
             found.append(repr((line.address, line.words, points[points[:, 0] > end - 50_000].tolist())))
@@ -127,15 +127,10 @@ class Page(Shown):
 
     def __init__(self, recording: Recording, player: Player, **options: Any) -> None:
         super().__init__(
-            player.fleet, recording.chronicle, title=recording.name, whole=recording.whole, player=player, **options
+            player.fleet, recording.chronicle, title=recording.name, player=player, **options
         )  # fmt: skip
-        player.on_jump = self.viewer.restart
         self.player = player
         self.update()
-
-    def update(self) -> None:
-        self.player.tick()
-        super().update()
 
 
 def open_page(recording: Recording, asked: str = "") -> Page:
@@ -154,7 +149,7 @@ def test_event_is_jumped_to(recording: Recording) -> None:
     page = open_page(recording)
     assert page.grades == {"wing": "ok"}
     assert page.moments == (0.0, 60.0)
-    marks = re.findall(r'data-with="(\d+)" title="([^"]*)" class="(\w+)" style="left: ([\d.]+)%"', page.part("marks"))
+    marks = re.findall(r'data-with="(\d+)" title="([^"]*)" class="(\w+)"\s+style="left: ([\d.]+)%"', page.part("marks"))
     assert [(text, grade) for _, text, grade, _ in marks] == [
         ("xy not valid", "bad"), ("reset of xy by an unknown amount", "watch"),
     ]  # fmt: skip
@@ -268,7 +263,7 @@ def test_jump_keeps_vehicles_that_are_silent_by_then(tmp_path: Path, clock: Simp
     player.jump(119.0)
     rows = {row.vehicle: row for row in player.fleet.picture.rows}
     assert {name: row.grade for name, row in rows.items()} == {"here": "bad", "silent": "bad"}
-    assert rows["silent"].text.startswith("silent")
+    assert rows["silent"].state.text.startswith("silent")
     assert {row.where.partition(",")[0] for row in rows.values()} == {"7.0 m north"}
     silent = next(event for event in recording.chronicle.events if event.kind == "silent")
     assert 22.0 <= silent.time <= 24.0

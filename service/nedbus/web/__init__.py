@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
-    from .serve import Where, serve_live, serve_recording
+    from .server import Where, serve_live, serve_recording
 else:
-    __getattr__ = lazy_exports(__name__, dict.fromkeys(("Where", "serve_live", "serve_recording"), ("web", "serve")))
+    __getattr__ = lazy_exports(__name__, dict.fromkeys(("Where", "serve_live", "serve_recording"), ("web", "server")))
 
 __all__ = ["Where", "serve_live", "serve_recording"]

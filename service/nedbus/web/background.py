@@ -1,4 +1,4 @@
-"""What lies under the tracks: GeoJSON, or a picture with a world file beside it, both in WGS 84."""
+"""The background of the map: GeoJSON, or a picture with a world file beside it, both in WGS 84."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 from bokeh.models import ColumnDataSource
 from bokeh.plotting import figure
-from PIL import Image
 
 from nedbus.errors import ConfigError
 from nedbus_msgs import MapProjection
@@ -19,8 +18,7 @@ from nedbus_msgs import MapProjection
 from .style import Style
 
 _PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
-_SIDE: Final = 2000  # pixels of a picture at most
-_PLACES: Final = 200_000  # of GeoJSON at most
+_MAX_SIDE: Final = 2000  # pixels of a picture
 
 Ring = list[tuple[float, float]]
 
@@ -42,7 +40,7 @@ class Background:
                 self.rings = list(_rings(json.loads(path.read_text())))
         except OSError as exc:
             raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
-        except (ValueError, TypeError, LookupError, RecursionError, Image.DecompressionBombError) as exc:
+        except (ValueError, TypeError, LookupError, RecursionError) as exc:
             reason = f"{exc} is missing" if isinstance(exc, KeyError) else str(exc)
             wanted = "GeoJSON, or a picture with a world file, in WGS 84, is expected"
             raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {wanted}") from exc
@@ -51,20 +49,24 @@ class Background:
 
     def draw(self, plot: figure, style: Style, projection: MapProjection) -> None:
         """Draw it once on a map whose metres are from this origin."""
+
+        def place(longitude: float, latitude: float) -> tuple[float, float]:
+            north, east = projection.project(latitude, longitude)
+            return east, north
+
         if self.pixels is not None:
-            (west, south), (east, north) = (_place(projection, *corner) for corner in self._corners)
+            (west, south), (east, north) = (place(*corner) for corner in self._corners)
             plot.image_rgba([self.pixels], x=west, y=south, dw=east - west, dh=north - south, level="image")
-        lines = [[_place(projection, *point) for point in ring] for ring in self.rings]
-        source = ColumnDataSource(
-            {"east": [[x for x, _ in line] for line in lines], "north": [[y for _, y in line] for line in lines]}
-        )
+        lines = [list(zip(*(place(*point) for point in ring), strict=True)) for ring in self.rings]
+        source = ColumnDataSource({"east": [list(east) for east, _ in lines], "north": [list(y) for _, y in lines]})
         plot.multi_line("east", "north", source=source, color=style.quiet, line_width=1.5, level="underlay")
-        points = [line[0] for line in lines if len(line) == 1]
-        plot.scatter(
-            [x for x, _ in points], [y for _, y in points], marker="cross", color=style.quiet, level="underlay"
-        )
+        points = [line for line in lines if len(line[0]) == 1]
+        easts, norths = [east[0] for east, _ in points], [north[0] for _, north in points]
+        plot.scatter(easts, norths, marker="cross", color=style.quiet, level="underlay")
 
     def _read_picture(self, path: Path) -> None:
+        from PIL import Image
+
         worlds = [path.with_suffix(suffix) for suffix in (_PICTURES[path.suffix.lower()], ".wld")]  # GDAL's is .wld
         world = next((each for each in worlds if each.exists()), None)
         if world is None:
@@ -74,46 +76,38 @@ class Background:
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
             raise ValueError("the world file is not north up in degrees: gdalwarp -t_srs EPSG:4326 makes it so")
-        with Image.open(path) as picture:
-            columns, rows = picture.size
-            picture.thumbnail((_SIDE, _SIDE))
-            pixels = np.asarray(picture.convert("RGBA"))[::-1]
+        try:
+            with Image.open(path) as picture:
+                columns, rows = picture.size
+                picture.thumbnail((_MAX_SIDE, _MAX_SIDE))
+                pixels = np.asarray(picture.convert("RGBA"))[::-1]
+        except Image.DecompressionBombError as exc:
+            raise ValueError(str(exc)) from exc
         self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
         left, top = west - width / 2, north - height / 2  # the file names the centre of the first pixel
         self._corners = [(left, top + rows * height), (left + columns * width, top)]
 
 
-def _rings(shape: dict[str, Any]) -> Iterator[Ring]:
-    """Yield the lines of a GeoJSON object; a point is a line of one place."""
-    kind = shape["type"]
-    if kind in {"FeatureCollection", "GeometryCollection"}:
-        for each in shape["features" if kind == "FeatureCollection" else "geometries"]:
+def _rings(shape: Any) -> Iterator[Ring]:
+    """Yield the lines of a GeoJSON object, or of its coordinates, however deeply nested; a point is a line of one."""
+    if isinstance(shape, dict) and shape["type"] in {"FeatureCollection", "GeometryCollection"}:
+        for each in shape["features" if shape["type"] == "FeatureCollection" else "geometries"]:
             yield from _rings(each)
-    elif kind == "Feature":
-        if shape["geometry"] is not None:
-            yield from _rings(shape["geometry"])
+    elif isinstance(shape, dict) and shape["type"] == "Feature":
+        yield from _rings(shape["geometry"]) if shape["geometry"] is not None else ()
+    elif isinstance(shape, dict):
+        yield from _rings(shape["coordinates"])
+    elif isinstance(shape[0], int | float):
+        yield [_place(shape)]
+    elif isinstance(shape[0][0], int | float):
+        yield [_place(each) for each in shape]
     else:
-        yield from _lines(shape["coordinates"])
+        for each in shape:
+            yield from _rings(each)
 
 
-def _lines(coordinates: Sequence[Any]) -> Iterator[Ring]:
-    """Yield the lines in coordinates, however deeply they are nested."""
-    if isinstance(coordinates[0], int | float):
-        yield [_check(coordinates)]
-    elif isinstance(coordinates[0][0], int | float):
-        yield [_check(each) for each in coordinates]
-    else:
-        for each in coordinates:
-            yield from _lines(each)
-
-
-def _check(place: Sequence[Any]) -> tuple[float, float]:
-    longitude, latitude = float(place[0]), float(place[1])
+def _place(point: Sequence[Any]) -> tuple[float, float]:
+    longitude, latitude = float(point[0]), float(point[1])
     if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
-        raise ValueError(f"{place} is no longitude and latitude")
+        raise ValueError(f"{point} is no longitude and latitude")
     return longitude, latitude
-
-
-def _place(projection: MapProjection, longitude: float, latitude: float) -> tuple[float, float]:
-    north, east = projection.project(latitude, longitude)
-    return east, north

@@ -1,4 +1,4 @@
-"""What happened, as a page tells it: events in the order of their time, what held until when, and the answer to why."""
+"""The events of a page in the order of their time, and what they mean: spans, states, stories, moments in words."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from nedbus.events import Account, Event, Span, State, Story, Times, about, span
 PAST: Final = 600.0
 """Seconds of what is over that a live page shows."""
 
-_MOST: Final = 500  # events of a vehicle, the last ones, that stories are told of
+_MAX_EVENTS: Final = 500  # of a vehicle, the last ones, that stories are told of
 _TENTH: Final = 0.1  # s: an address names moments no more exactly
 
 
 class Chronicle:
-    """The account of a page, and what others remember of the time `before`; read anew only when more has happened.
+    """The account of a page, and the events `before` it; read anew only when more has happened.
 
     `times`: how times are told; `start`: when a recording began, s since the epoch, where that is known.
     """
@@ -29,40 +29,55 @@ class Chronicle:
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
-        self._stories: dict[tuple[str, object], list[Story]] = {}
+        self._stories: dict[tuple[str, Event | float | None], list[Story]] = {}
 
     @property
     def events(self) -> Sequence[Event]:
-        """What happened so far."""
+        """All events so far."""
         self._read()
         return self._events
 
     @property
     def spans(self) -> Mapping[str, Sequence[Span]]:
-        """What held from when to when, by vehicle."""
+        """The spans of all conditions, by vehicle."""
         self._read()
         return self._spans
 
+    def state(self, vehicle: str, time: float) -> State:
+        """Return the state of a vehicle at a time."""
+        return state_at(self.spans.get(vehicle, ()), time)
+
+    @property
+    def has_utc(self) -> bool:
+        """True where its times are known in UTC."""
+        return self.times.is_live or self.start is not None
+
     def moment(self, seconds: float) -> str:
-        """Return a time of the account in words: UTC live or where a recording tells it, else since its start."""
-        if self.times.is_live or self.start is not None:
-            return to_clock(seconds + (self.start or 0.0))[:-2]
-        return to_elapsed(seconds)
+        """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
+        return self.time_text(seconds)[:-2] if self.has_utc else _elapsed(seconds)
 
-    def story(self, vehicle: str, now: float, *, pinned: float | None, event: Event | None) -> Story | None:
-        """Return what is wrong with a vehicle now, or was in the last minutes, or what a chosen moment is about.
+    def clock(self, seconds: float) -> str:
+        """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
+        utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
+        return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
 
-        `pinned`: a moment that is chosen; `event`: the event that was.
+    def time_text(self, seconds: float) -> str:
+        """Return a time of the account as `Times.find` understands it: UTC, or seconds since boot."""
+        if self.has_utc:
+            return to_clock(seconds + (self.start or 0.0))
+        first = next(iter(self.events), None)
+        return f"{seconds if first is None or first.boot is None else seconds + first.boot - first.time:.1f}"
+
+    def story(self, vehicle: str, now: float, at: Event | float | None) -> Story | None:
+        """Return what is wrong with a vehicle now, or was in the last minutes, or what a chosen event or time is about.
+
+        `at`: the event or time that is chosen, None for now.
         """
         self._read()
-        if event is not None and event.vehicle == vehicle:
-            key: tuple[str, object] = vehicle, event
-            if key not in self._stories:
-                story = about(event, self._by_vehicle.get(vehicle, ()), topics=self.topics(vehicle))
-                self._stories[key] = [] if story is None else [story]
-            return next(iter(self._stories[key]), None)
-        if pinned is not None:
-            return next(iter(self._tell(vehicle, pinned + _TENTH)), None)
+        if isinstance(at, Event):
+            return next(iter(self._tell(vehicle, at)), None)
+        if at is not None:
+            return next(iter(self._tell(vehicle, at + _TENTH)), None)
         stories = [story for story in self._tell(vehicle, None) if story.since <= now]
         going = [story for story in stories if story.until is None or story.until > now]
         if going:
@@ -70,22 +85,18 @@ class Chronicle:
         recent = [story for story in stories if (story.until or 0.0) > now - PAST]
         return recent[-1] if recent else None
 
-    def state(self, vehicle: str, time: float) -> State:
-        """Return the state of a vehicle at a time."""
-        return state_at(self.spans.get(vehicle, ()), time)
-
-    def topics(self, vehicle: str) -> list[str]:
-        """Return the topics of the messages that a vehicle sends."""
-        known = self.account.vehicles.get(vehicle)
-        return list(known.messages.values()) if known is not None else []
-
-    def _tell(self, vehicle: str, at: float | None) -> list[Story]:
-        """Return its stories, told once for as long as nothing more happens: all viewers ask for them."""
+    def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
+        """Return the stories of an event, a time, or all times; told once for all viewers until more happens."""
         if (vehicle, at) not in self._stories:
             known = self.account.vehicles.get(vehicle)
-            events = self._by_vehicle.get(vehicle, [])[-_MOST:]
-            initial = list(known.initial) if known is not None else []
-            self._stories[vehicle, at] = tell(events, initial, topics=self.topics(vehicle), at=at)
+            topics = list(known.messages.values()) if known is not None else []
+            events = self._by_vehicle.get(vehicle, [])
+            if isinstance(at, Event):
+                story = about(at, events, topics=topics)
+                self._stories[vehicle, at] = [] if story is None else [story]
+            else:
+                initial = list(known.initial) if known is not None else []
+                self._stories[vehicle, at] = tell(events[-_MAX_EVENTS:], initial, topics=topics, at=at)
         return self._stories[vehicle, at]
 
     def _read(self) -> None:
@@ -94,15 +105,16 @@ class Chronicle:
         told, self._told = self.account.take(0)
         self._events = sorted([*self._before, *told], key=lambda event: event.time)
         self._stories.clear()
-        by_vehicle = self._by_vehicle = {name: [] for name in list(self.account.vehicles)}
+        vehicles = dict(self.account.vehicles)
+        self._by_vehicle = {name: [] for name in vehicles}
         for event in self._events:
-            by_vehicle.setdefault(event.vehicle, []).append(event)
-        vehicles = self.account.vehicles
-        initial = {name: list(vehicle.initial) for name, vehicle in list(vehicles.items())}
-        self._spans = {name: spans_of(events, initial.get(name, ())) for name, events in by_vehicle.items()}
+            self._by_vehicle.setdefault(event.vehicle, []).append(event)
+        self._spans = {
+            name: spans_of(events, list(vehicles[name].initial) if name in vehicles else ())
+            for name, events in self._by_vehicle.items()
+        }
 
 
-def to_elapsed(seconds: float) -> str:
-    """Return the minutes and seconds since the start of a recording."""
+def _elapsed(seconds: float) -> str:
     tenths = round(seconds * 10)
     return f"{tenths // 600}:{tenths % 600 / 10:04.1f}"

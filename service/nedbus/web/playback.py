@@ -1,4 +1,4 @@
-"""A recording on the page: the messages of a file, what happened in it, and a time that runs, is paused, and is set."""
+"""A recording on the page: the messages of a file, its events, and a time that runs, is paused, and is set."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import logging
 import threading
 import time
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, NamedTuple, cast
+from types import SimpleNamespace
+from typing import Any, Final, cast
 
 from bokeh.models.widgets import Select, Slider, Toggle
 
 from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
-from nedbus.events import Account, Times, state_at
+from nedbus.events import Account, Times
 from nedbus.log_event import about
 from nedbus.sources import (
     KEPT_OF_FILE,
@@ -27,8 +28,8 @@ from nedbus.sources import (
 )
 from nedbus_msgs import BY_TOPIC, Address, codec_of
 
-from .chronicle import Chronicle, to_elapsed
-from .fleet import Fleet, last_place
+from .chronicle import Chronicle
+from .fleet import Fleet
 from .stream import is_position
 
 _log = logging.getLogger(__name__)
@@ -36,16 +37,15 @@ _log = logging.getLogger(__name__)
 _MINUTE: Final = 60.0  # s that are shown before the time that is chosen
 _WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two of them
 _KEPT: Final = ("VehicleStatus", "SensorGps", "BatteryStatus")  # messages whose values the page shows
-_SPEEDS: Final[Mapping[str | tuple[Any, str], float]] = {
-    "0.5": 0.5, "1": 1.0, "2": 2.0, "5": 5.0, "10": 10.0, "50": 50.0,
-}  # fmt: skip
+_SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
     """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
 
     Of most other messages, which outnumber them, only PX4's time is kept. `whole`: the flight at two points a second;
-    `account`: what happened, whose clock is seconds since the first message; `chronicle`: how the page tells it.
+    `account`: its events, whose clock is seconds since the first message; `chronicle`: how the page tells them.
+    `entries`: of each message its address, and its payload, timestamp, or why it was rejected; `dues`: when [s].
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -60,7 +60,7 @@ class Recording:
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
         self._path = path
-        self._places: dict[Address, list[int]] = {}  # of each stream in `entries`
+        self._indices: dict[Address, list[int]] = {}  # of each stream in `entries`
         self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
         for warning in self._run.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
@@ -71,9 +71,13 @@ class Recording:
         """Seconds that have been read so far."""
         return self.dues[-1] if self.dues else 0.0
 
+    def has(self, seconds: float) -> bool:
+        """Return whether this time was read already, or will not come."""
+        return self.is_read or seconds <= self.length
+
     def before(self, index: int) -> list[int]:
         """Return the last entry of each stream before this one, in order."""
-        found = (places[at - 1] for places in list(self._places.values()) if (at := bisect_left(places, index)))
+        found = (known[at - 1] for known in list(self._indices.values()) if (at := bisect_left(known, index)))
         return sorted(found)
 
     def _read(self) -> None:
@@ -98,106 +102,89 @@ class Recording:
         offset = self.chronicle.times.offsets.get(address.vehicle)
         if self.chronicle.start is None and reason is None and offset is not None:
             self.chronicle.start = stamp / 1e6 + offset - message.due
-        self._places.setdefault(address, []).append(len(self.entries))
+        self._indices.setdefault(address, []).append(len(self.entries))
         self.entries.append((address, kept))
         self.dues.append(message.due)
 
 
-class _Unread(NamedTuple):
-    """A message of which only its time is known."""
-
-    timestamp: int
-
-
 class Player:
-    """One viewer's time in a recording; its fleet is as it was then."""
+    """One viewer's time in a recording; its fleet is as it was then.
+
+    `on_jump` is called when the time has jumped; `controls`: a button, the speed, and the slider, for the page.
+    """
 
     def __init__(self, recording: Recording) -> None:
-        self.fleet = Fleet(origin=recording.whole.origin)
+        self.fleet = Fleet(recording.whole.origin)
         self.on_jump: Callable[[], object] = lambda: None
         self.time = 0.0
-        self._recording = recording
+        self.recording = recording
         self._monitor = Monitor()
         self._next = 0
         self._ticked = time.monotonic()
-        self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
+        self._shown, self._is_dragged = 0.0, False
         self._play = Toggle(label="pause", active=True, width=80)
-        self._speed = Select(options=list(_SPEEDS), value="1", width=80)
+        self._speed = Select(options=_SPEEDS, value="1", width=80)
+        self._slider = Slider(start=0, end=1, value=0, step=0.1, sizing_mode="stretch_width", show_value=False)
+        self.controls = self._play, self._speed, self._slider
         self._play.on_change("active", lambda _, __, active: self._play.update(label="pause" if active else "play"))
-        self._shown, self._dragged = 0.0, False
         self._slider.on_change("value", lambda _, __, value: self._drag(value))
         self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
-        self.controls: Sequence[Any] = (self._play, self._speed, self._slider)
-
-    @property
-    def length(self) -> float:
-        """Seconds of the recording."""
-        return self._recording.length
 
     def tick(self) -> None:
         """Let the time run on."""
         now = time.monotonic()
         elapsed, self._ticked = now - self._ticked, now
         if self._play.active:
-            self.time = min(self.time + elapsed * _SPEEDS.get(str(self._speed.value), 1.0), self.length)
-        if not self._dragged:
+            speed = float(self._speed.value) if self._speed.value in _SPEEDS else 1.0
+            self.time = min(self.time + elapsed * speed, self.recording.length)
+        if not self._is_dragged:
             self._shown = round(self.time, 1)
-            self._slider.update(end=max(1.0, self.length), value=self._shown)
-        self._feed(self.time)
+            self._slider.update(end=max(1.0, self.recording.length), value=self._shown)
+        self._feed()
 
-    def clock(self, seconds: float) -> str:
-        """Return a time of the recording in words: UTC where the recording tells it, and since its start."""
-        elapsed = to_elapsed(seconds)
-        if self._recording.chronicle.start is None:
-            return elapsed
-        return f"{self._recording.chronicle.moment(seconds)} UTC, {elapsed}"
-
-    def pause(self) -> None:
-        """Stay at this time."""
-        self._play.active = False
-
-    def has(self, seconds: float) -> bool:
-        """Return whether this time was read already, or will not come."""
-        return self._recording.is_read or seconds <= self.length
-
-    def toggle(self) -> None:
+    def toggle(self, *, pause: bool = False) -> None:
         """Pause, or play on."""
-        self._play.active = not self._play.active
+        self._play.active = not (pause or self._play.active)
 
     def jump(self, seconds: float) -> None:
         """Set the time, as far as the recording has it, with the minute before it."""
-        self._dragged = False
+        self._is_dragged = False
         self.fleet.clear()
-        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.length)
-        self._next = bisect_left(self._recording.dues, self.time - _MINUTE)
-        for index in self._recording.before(self._next):  # what was known of streams that are silent by then
+        self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
+        self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
+        for index in self.recording.before(self._next):  # the last message of streams that are silent by then
             self._show(index)
         for address, stream in self.fleet.streams.items():
-            whole = self._recording.whole.streams.get(address)
+            whole = self.recording.whole.streams.get(address)
             if stream.valid is None and whole is not None:
-                stream.valid = last_place(whole, self.time)
-        self._feed(self.time)
+                (stream.valid,) = whole.places_at([self.time])
+        self._feed()
         self.on_jump()
 
     def _drag(self, seconds: float) -> None:
-        self._dragged = self._dragged or seconds != self._shown
+        self._is_dragged = self._is_dragged or seconds != self._shown
 
-    def _feed(self, seconds: float) -> None:
-        end = bisect_right(self._recording.dues, seconds)
+    def _feed(self) -> None:
+        """Show the messages up to this time."""
+        end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
-        states = {name: state_at(spans, seconds) for name, spans in self._recording.chronicle.spans.items()}
-        self.fleet.look(seconds, self._monitor.snapshot(round(seconds * 1e9)), states)
+        chronicle = self.recording.chronicle
+        states = {name: chronicle.state(name, self.time) for name in chronicle.spans}
+        self.fleet.look(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
 
     def _show(self, index: int) -> None:
-        due, (address, payload) = self._recording.dues[index], self._recording.entries[index]
-        if isinstance(payload, str):
-            self.fleet.reject([RejectionReport(address, payload, round(due * 1e9))])
+        due, (address, kept) = self.recording.dues[index], self.recording.entries[index]
+        received = round(due * 1e9)
+        if isinstance(kept, str):
+            self.fleet.reject([RejectionReport(address, kept, received)])
             return
-        message: Any = _Unread(payload) if isinstance(payload, int) else None
-        if isinstance(payload, bytes):
-            message = codec_of(BY_TOPIC[address.topic]).decode_row(payload)
-        sample = Sample(message, address, round(due * 1e9))
-        self._monitor.add(sample, received=sample.received)
+        message: Any
+        if isinstance(kept, bytes):
+            message = codec_of(BY_TOPIC[address.topic]).decode_row(kept)
+        else:
+            message = SimpleNamespace(timestamp=kept)
+        sample = Sample(message, address, received)
+        self._monitor.add(sample, received=received)
         self.fleet.add(sample, due)

@@ -1,55 +1,153 @@
-"""The server of the page: Bokeh's, which listens on this host alone unless it is told otherwise."""
+"""The server of the page, of live vehicles or of a recording: Bokeh's, on this host alone unless told otherwise."""
 
 from __future__ import annotations
 
 import logging
 import socket
 import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
-from bokeh.resources import Component, Resources
+from bokeh.resources import Resources
 from bokeh.server.auth_provider import NullAuth
 from bokeh.server.server import Server
 from bokeh.server.views.static_handler import StaticHandler
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
+from nedbus.client import Bus
 from nedbus.errors import ListenError
-from nedbus.monitoring import Page
+from nedbus.events import ALL
+from nedbus.monitoring import Exporter, Page, Sight
 from nedbus.settings import is_loopback
+from nedbus_msgs import Selection
+
+from .background import Background
+from .chronicle import PAST, Chronicle
+from .fleet import Fleet
+from .playback import Player, Recording
+from .viewer import Viewer
 
 MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
+_TICK: Final = 100  # ms between two moves of the map
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
-_PARTS: Final[list[Component]] = ["bokeh", "bokeh-widgets", "bokeh-tables"]
-_POLL: Final = 100  # ms until the end is noticed
-_MAX_BODY: Final = 2**16  # bytes of a request, which has none: Tornado keeps it before anybody looks at its Host
-_MAX_EVENT: Final = 2**20  # bytes of what a browser says of its page at a time
-_UNUSED: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+_STOP_POLL: Final = 100  # ms until the end is noticed
+_MAX_BODY_BYTES: Final = 2**16  # of a request, which has none: Tornado keeps it before its Host is checked
+_MAX_MESSAGE_BYTES: Final = 2**20  # of a browser about its page
+_UNUSED_LIFETIME: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+
+
+@dataclass(frozen=True, slots=True)
+class Where:
+    """The address of a page, further ORIGINs that browsers may call it by, and the file that is drawn under the map."""
+
+    host: str
+    port: int
+    origins: tuple[str, ...] = ()
+    background: Path | None = None
+
+
+def serve_live(
+    bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
+) -> None:
+    """Serve the page of what a selection matches until `stop` is set; `tell` gets its address when it is there.
+
+    Raises ConfigError for a bad background, ListenError if it cannot listen.
+    """
+    live = LiveFleet(bus, selection, version=version)
+    background = Background(where.background) if where.background is not None else None
+
+    def open_page(document: Document) -> None:
+        viewer = Viewer(document, live.fleet, live.chronicle, background=background)
+        document.add_periodic_callback(viewer.update, _TICK)
+
+    server = WebServer(where, open_page, live.pages)
+    with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
+        reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
+        tell(server.url)
+        server.run(stop)
+        reading.result()
+
+
+def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:
+    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has a time of its own.
+
+    Raises ConfigError and SourceError for a file that cannot be read, and as `serve_live`.
+    """
+    recording = Recording(path)
+    background = Background(where.background) if where.background is not None else None
+
+    def open_page(document: Document) -> None:
+        player = Player(recording)
+        viewer = Viewer(
+            document, player.fleet, recording.chronicle, title=recording.name, background=background, player=player
+        )
+        document.add_periodic_callback(viewer.update, _TICK)
+
+    server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
+    tell(server.url)
+    server.run(stop)
+
+
+class LiveFleet:
+    """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop.
+
+    `run` reads until an event is set; `pages`: metrics and health, as `nedbus export` serves them.
+    """
+
+    def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
+        self.fleet = Fleet()
+        self._exporter = Exporter(
+            bus, selection, version=version, on_look=self._look,
+            watch=lambda sample: self.fleet.add(sample, time.time()),
+        )  # fmt: skip
+        now = time.time()
+        remembered = [
+            event
+            for report in bus.accounts(within=PAST)
+            for event in report.events
+            if event.time < now and event.vehicle != ALL and selection.vehicle in ("*", event.vehicle)
+        ]
+        self.chronicle = Chronicle(self._exporter.account, before=remembered)
+        self.run, self.pages = self._exporter.run, self._exporter.pages
+
+    def _look(self, sight: Sight) -> None:
+        """Make the picture of now."""
+        account = self._exporter.account
+        self.fleet.reject(sight.rejected)
+        states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
+        own = sight.behind.replace("this reader", "this page")
+        self.fleet.look(sight.time, sight.healths, states, alive=sight.alive, link=sight.link, own=own)
 
 
 class WebServer:
-    """Serve a page on HOST:PORT, and pages of text by their path, until it is told to stop.
+    """Serve a page, and pages of text by their path, until it is told to stop.
 
-    `origins`: HOST:PORT that browsers may call it by, besides the names of this host: a page of anybody else that is
-    open in the same browser gets nothing, also where that has made its own name lead here.
+    A foreign page that is open in the same browser gets nothing, also where its own name leads here (DNS rebinding):
+    browsers have to call this one by a name of this host or one of `where.origins`.
 
     Raises ListenError when it cannot listen there.
     """
 
     def __init__(
-        self, host: str, port: int, open_page: Callable[[Document], object], *,
-        pages: Mapping[str, Callable[[], Page]], origins: Sequence[str] = (),
-    ) -> None:  # fmt: skip
+        self, where: Where, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
+    ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # each tab that is closed would be a warning
+        host = where.host
+        names = set(where.origins)
+        text_names = names if is_loopback(host) else None
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
@@ -58,37 +156,36 @@ class WebServer:
             else:
                 open_page(document)
 
-        names = set(origins)
-        texts = {"names": names if is_loopback(host) else None}
         try:
             self._server = Server(
-                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=port,
-                allow_websocket_origin=["*"], auth_provider=_Names(names),
-                unused_session_lifetime_milliseconds=_UNUSED, check_unused_sessions_milliseconds=_UNUSED // 3,
-                keep_alive_milliseconds=5000, websocket_max_message_size=_MAX_EVENT,
-                http_server_kwargs={"max_body_size": _MAX_BODY, "max_buffer_size": 2 * _MAX_EVENT},
-                extra_patterns=[(path, _Text, {"make": make, **texts}) for path, make in pages.items()],
+                {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=where.port,
+                allow_websocket_origin=["*"], auth_provider=_Names(names), keep_alive_milliseconds=5000,
+                unused_session_lifetime_milliseconds=_UNUSED_LIFETIME,
+                check_unused_sessions_milliseconds=_UNUSED_LIFETIME // 3,
+                websocket_max_message_size=_MAX_MESSAGE_BYTES,
+                http_server_kwargs={"max_body_size": _MAX_BODY_BYTES, "max_buffer_size": 2 * _MAX_MESSAGE_BYTES},
+                extra_patterns=[(path, _Text, {"make": make, "names": text_names}) for path, make in pages.items()],
             )  # fmt: skip
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
-            raise ListenError([f"http://{host}:{port}"], reason, hint=hint) from exc
+            raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
         # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
-        parts = Resources(mode="server", root_url="/", path_versioner=StaticHandler.append_version, components=_PARTS)
+        parts = Resources(
+            mode="server", root_url="/", path_versioner=StaticHandler.append_version,
+            components=["bokeh", "bokeh-widgets", "bokeh-tables"],
+        )  # fmt: skip
         self._server._tornado.resources = lambda *_: parts  # type: ignore[method-assign]  # noqa: SLF001
-        names |= _names_of(host, self._server.port or port)
+        port = self._server.port or where.port
+        names |= _names_of(host, port)
         shown = "127.0.0.1" if host in _ANY else host
-        self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{self._server.port}"
+        self.url = f"http://{_join(shown, port)}"
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set, in this thread."""
-        poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _POLL)
-
-        def begin() -> None:
-            poll.start()
-            self._server.start()
-
-        self._loop.add_callback(begin)
+        poll = PeriodicCallback(lambda: self._loop.stop() if stop.is_set() else None, _STOP_POLL)
+        self._loop.add_callback(poll.start)
+        self._loop.add_callback(self._server.start)
         self._loop.start()
         poll.stop()  # it would stop the loop once more, amid the end of the server
         self._server.stop()
@@ -98,7 +195,7 @@ class WebServer:
 class _Names(NullAuth):
     """Answer only browsers that ask for one of these names."""
 
-    login_url = "/"  # which Bokeh asks of whoever checks users; nobody is sent there
+    login_url = "/"  # Bokeh demands it where users are checked; no browser is sent there
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = names
@@ -106,21 +203,21 @@ class _Names(NullAuth):
 
     @property
     def get_user_async(self) -> Callable[[Any], Any]:
-        """Return what checks a request before anything is answered; everybody is the same user."""
+        """Return the check of a request, before any answer; all viewers are the same user."""
 
         async def check(handler: RequestHandler) -> str:
-            return _require_name(handler, self._names)
+            _require_name(handler, self._names)
+            return "viewer"
 
         return check
 
 
-def _require_name(handler: RequestHandler, names: Collection[str]) -> str:
+def _require_name(handler: RequestHandler, names: Collection[str]) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
     for name in (host, headers.get("Origin", f"//{host}").partition("//")[2]):  # Origin: null has no name
         if name not in names:
             raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
-    return "viewer"
 
 
 class _Text(RequestHandler):
@@ -138,10 +235,14 @@ class _Text(RequestHandler):
 
 
 def _names_of(host: str, port: int) -> set[str]:
-    """Return under which names a browser may ask for a page on this address."""
+    """Return the names by which a browser may ask for a page on this address."""
     names = {"localhost", "127.0.0.1", "::1", host}
     if host in _ANY:
         names |= {socket.gethostname(), socket.getfqdn()}
         with suppress(OSError):  # a host that does not find itself: --origin names it
             names |= {str(address[4][0]) for address in socket.getaddrinfo(socket.gethostname(), None)}
-    return {f"[{name}]:{port}" if ":" in name else f"{name}:{port}" for name in names}
+    return {_join(name, port) for name in names}
+
+
+def _join(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

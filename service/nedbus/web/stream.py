@@ -1,7 +1,4 @@
-"""What is kept of one stream for a page: the last minute at ten points a second, and longer at fewer; no I/O.
-
-Of other messages than positions only the last one is kept.
-"""
+"""One stream of a page: its last sample and, of positions, the last minute at 10 Hz and longer at 1 Hz; no I/O."""
 
 from __future__ import annotations
 
@@ -11,26 +8,24 @@ from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from nedbus.client import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, MapProjection, ResetTracker, VehicleLocalPosition, to_global
 
 POINTS: Final = 600
 """Points of the last minute."""
-
 LONG: Final = 900, 1.0
 """Points of the history beyond it, and seconds between two of them: a quarter of an hour."""
-
-COLUMNS: Final = ("time", "east", "north", "height", "speed", "climb", "eph", "epv", "error", "doubtful")
+COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Of a history: ms since the epoch, m, m/s, and 1 while dead reckoning; NaN where the message was not valid.
 
 `height` is above the vehicle's own origin, `speed` horizontal, `error` the distance to the ground truth of then.
 """
 
-_ERROR: Final = COLUMNS.index("error")
 _STEP: Final = 0.095  # s between two points
-_SAME: Final = 0.5  # s between an estimate and the ground truth that it is compared with
-_events = attrgetter(
+_MAX_TRUTH_AGE: Final = 0.5  # s between an estimate and the ground truth that it is compared with
+_state_of = attrgetter(
     "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "xy_global", "xy_valid", "z_valid",
     "dead_reckoning",
 )  # fmt: skip
@@ -42,9 +37,9 @@ def is_position(address: Address) -> bool:
 
 
 class Place(NamedTuple):
-    """Where a message is [m]: `altitude` is above mean sea level where that is known, `common`: from the common origin.
+    """The place of a message [m]; `altitude` is above mean sea level where that is known.
 
-    Without a common origin east, north and altitude are from the vehicle's own.
+    Without a common origin (`common`) east, north and altitude are from the vehicle's own.
     """
 
     east: float
@@ -61,8 +56,9 @@ class History:
         self.written = 0
         self._points = np.empty((size, len(COLUMNS)))  # no memory until it is written, as it never is for others
 
-    def points(self, begin: int, end: int) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
         """Return the points with these numbers that are still there, in order, shape (n, columns)."""
+        end = self.written if end is None else end
         return self._points[np.arange(max(begin, end - self.size, 0), end) % self.size]
 
     def write(self, values: list[float]) -> None:
@@ -78,7 +74,7 @@ class Origin:
     projection: MapProjection | None = None
 
     def place(self, message: VehicleLocalPosition) -> Place:
-        """Return where a message is; NaN where it is not valid."""
+        """Return the place of a message; NaN where it is not valid."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:
@@ -91,15 +87,15 @@ class Origin:
 
 
 class Stream:
-    """One stream: its last sample, and its histories: of the last minute, and a longer one.
+    """The histories of one stream, of the last minute and longer.
 
-    `last`: the last sample; `valid`: the last place that was valid, None if none was; `heading` [rad], NaN if unknown.
+    `last`: the last sample; `time`: when it came [s since the epoch]; `valid`: the last valid place, None without one.
     """
 
     def __init__(self, origin: Origin, long: tuple[int, float] = LONG) -> None:
         self.minute, self.long = History(POINTS, _STEP), History(*long)
         self.last: Sample[Any] | None = None
-        self.time = -math.inf  # of `last` [s since the epoch]
+        self.time = -math.inf
         self.valid: Place | None = None
         self.origin = origin
         self._tracker = ResetTracker()
@@ -111,7 +107,7 @@ class Stream:
         before, self.last, self.time = self.last, sample, time
         if not is_position(sample.address):
             return
-        state = _events(sample.message)
+        state = _state_of(sample.message)
         if state == self._state:
             if time - self._sampled < _STEP:
                 return
@@ -120,11 +116,16 @@ class Stream:
         self._state, self._sampled = state, time
         self._add_point(sample.message, time, truth)
 
-    @property
-    def error(self) -> float:
-        """The distance to the ground truth at the last point [m], NaN without one."""
-        last = self.minute.points(self.minute.written - 1, self.minute.written)
-        return float(last[0, _ERROR]) if len(last) else math.nan
+    def places_at(self, times: list[float]) -> list[Place | None]:
+        """Return the last valid places at these times [s]; None where the histories do not reach back."""
+        found: list[Place | None] = [None] * len(times)
+        for history in (self.long, self.minute):
+            points = history.points()
+            points = points[~np.isnan(points[:, 1])]
+            for index, after in enumerate(points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()):
+                if after > 0:
+                    found[index] = Place(float(points[after - 1, 1]), float(points[after - 1, 2]), math.nan, True)
+        return found
 
     def _add_point(self, message: VehicleLocalPosition, time: float, truth: Stream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)
@@ -135,19 +136,11 @@ class Stream:
             self._sampled_long = -math.inf
         if math.isfinite(place.north):
             self.valid = place
-        speed_north, speed_east = (message.vx, message.vy) if message.v_xy_valid else (math.nan, math.nan)
-        point = [
-            time * 1e3,
-            place.east,
-            place.north,
-            -message.z if message.z_valid else math.nan,
-            math.hypot(speed_north, speed_east),
-            -message.vz if message.v_z_valid else math.nan,
-            message.eph,
-            message.epv,
-            _distance(place, message, truth),
-            float(message.dead_reckoning),
-        ]
+        height = -message.z if message.z_valid else math.nan
+        speed = math.hypot(message.vx, message.vy) if message.v_xy_valid else math.nan
+        error = _distance(place, message, truth)
+        doubtful = float(message.dead_reckoning)
+        point = [time * 1e3, place.east, place.north, height, speed, message.eph, message.epv, error, doubtful]
         self.minute.write(point)
         if time - self._sampled_long >= self.long.step:
             self._sampled_long = time
@@ -160,8 +153,8 @@ def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None)
         return math.nan
     real = truth.last.message
     other = truth.origin.place(real)
-    seconds = (_moment(message) - _moment(real)) / 1e6
-    if other.common != place.common or abs(seconds) > _SAME:
+    seconds = ((message.timestamp_sample or message.timestamp) - (real.timestamp_sample or real.timestamp)) / 1e6
+    if other.common != place.common or abs(seconds) > _MAX_TRUTH_AGE:
         return math.nan
     offsets = [
         other.east + real.vy * seconds - place.east,
@@ -169,7 +162,3 @@ def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None)
         other.altitude - real.vz * seconds - place.altitude,
     ]
     return math.hypot(*(offset for offset in offsets if math.isfinite(offset)))
-
-
-def _moment(message: VehicleLocalPosition) -> int:
-    return message.timestamp_sample or message.timestamp

@@ -1,0 +1,113 @@
+"""Column data that a viewer is sent: only the points and cells that are new."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from bokeh.models import ColumnDataSource
+
+from nedbus_msgs import Address
+
+from .fleet import TRUTH
+from .stream import COLUMNS, History
+from .style import PALETTE
+
+_MAX_POINTS: Final = 6_000  # of all tracks together: what a browser draws ten times a second
+_MIN_TRACK_POINTS: Final = 60
+_EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
+_DOUBT, _TRUE = "doubtful", "truth"
+NAMES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBT, _TRUE)
+"""The kinds of lines: valid ones in the colours of vehicles, doubtful ones, and ground truth."""
+
+Track = tuple[History, int]  # with the number of its colour
+
+
+def table(*names: str) -> ColumnDataSource:
+    """Return a source with these columns, without rows."""
+    return ColumnDataSource({name: [] for name in names})
+
+
+def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Send the cells that are different, or all when the number of rows is."""
+    old = source.data
+    new = {name: [row[name] for row in rows] for name in old}
+    if any(len(column) != len(rows) for column in old.values()):
+        source.data = new
+        return
+    patches = {}
+    for name, values in new.items():
+        cells = enumerate(zip(old[name], values, strict=True))
+        patch = [(index, value) for index, (was, value) in cells if was != value and repr(was) != repr(value)]  # NaN
+        if patch:
+            patches[name] = patch
+    if patches:
+        source.patch(patches)
+
+
+class Tracks:
+    """The tracks of all streams: a column of east, and one of north for each kind of line, NaN where it does not go.
+
+    Each track has a ring of slots, with a gap that moves on before its newest point, and behind it a copy of its first
+    slot and a gap for good.
+    """
+
+    def __init__(self) -> None:
+        self.source = table("east", *NAMES)
+        self._tracks: Mapping[Address, Track] = {}
+        self._seen: list[int] = []
+        self._step = self._slots = 1
+
+    def update(self, tracks: Mapping[Address, Track]) -> None:
+        """Send the new points of these."""
+        begins = tracks != self._tracks  # as after a jump of the time, which makes other histories
+        if begins:
+            self._lay_out(tracks)
+        cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
+        for index, (address, track) in enumerate(tracks.items()):
+            self._add_points(cells, index, address, track)
+        if begins:
+            filled: dict[str, Any] = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in cells}
+            for name, column in filled.items():
+                column[list(cells[name])] = list(cells[name].values())
+            self.source.data = filled
+        elif cells["east"]:
+            self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
+
+    def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
+        """Choose the number of slots, and of points in each."""
+        self._tracks = dict(tracks)
+        self._seen = [0] * len(tracks)
+        longest = max((history.size for history, _ in tracks.values()), default=1)
+        points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
+        written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
+        self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
+        self._slots = longest // self._step + 2  # with the one that is not complete yet, and the gap
+
+    def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
+        """Add the cells that change, by column and slot."""
+        history, number = track
+        step, ring = self._step, self._slots
+        seen, end = self._seen[index], history.written  # once: another thread adds points
+        if end == seen:
+            return
+        self._seen[index] = end
+        names = (_TRUE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBT)
+        gap = dict.fromkeys(("east", *names), math.nan)
+        points = history.points(seen // step * step, end)
+        changed: dict[int, dict[str, float]] = {}
+        broken = False
+        for position, point in enumerate(points.tolist(), end - len(points)):
+            east, north, doubtful = point[_EAST], point[_NORTH], point[_DOUBTFUL]
+            broken = math.isnan(east) or (broken and position % step > 0)
+            values = {**gap, "east": round(east, 2)}
+            values[names[-1 if doubtful > 0 else 0]] = math.nan if broken else round(north, 2)
+            changed[position // step % ring] = values
+        changed[((end - 1) // step + 1) % ring] = gap
+        if 0 in changed:
+            changed[ring] = changed[0]  # so that the line goes on from the last slot to the first
+        for slot, values in changed.items():
+            for name, value in values.items():
+                cells[name][index * (ring + 2) + slot] = value

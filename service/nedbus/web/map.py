@@ -1,0 +1,192 @@
+"""The map: where every vehicle is, in metres, north up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from bokeh.models import HoverTool, TapTool
+from bokeh.models.annotations import ScaleBar
+from bokeh.plotting import figure
+
+from nedbus.events import Event
+from nedbus_msgs import Address
+
+from .background import Background
+from .column_data import NAMES, Track, Tracks, replace, table
+from .fleet import TRUTH, Fleet, Picture, Row
+from .stream import Place
+from .style import MARKERS, Style
+
+FOCUSES: Final = ("all", "follow", "vehicle")
+MIN_SIDE: Final = 20.0
+"""Metres that a map shows at least: less is the noise of a vehicle at rest."""
+
+_MIN_ZOOM: Final = 0.01  # m that a browser shows after zooming in
+_MARGIN: Final = 0.08  # of what is shown, around it
+_FOLLOWED_SIDE: Final = 60.0  # m around a vehicle that is followed
+_LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label
+_MAX_EVENTS: Final = 60
+
+
+class Map:
+    """The map of one viewer; `marks` has a row for each of `shown`, `events` for each of `told`; both can be tapped.
+
+    `focus`: one of FOCUSES; `is_long`: whether trails are longer than a minute; `truth`: whether it is drawn.
+    """
+
+    def __init__(self, style: Style, background: Background | None) -> None:
+        self.marks = table(
+            "east", "north", "angle", "shape", "colour", "edge", "fill", "label", "name", "words", "align", "offset"
+        )
+        self.events = table("east", "north", "marker", "colour", "words")
+        self.shown: list[str] = []
+        self.told: list[Event] = []
+        self.size = 600.0, 500.0  # pixels, until the browser has said how many
+        self.focus, self.is_long, self.truth = "all", False, True
+        self._style, self._background = style, background
+        self._tracks = Tracks()
+        self._ring = table("east", "north", "radius")
+        self._frame = table("east", "north")
+        self.figure = self._draw()
+
+    def update(self, picture: Picture, whole: Fleet, row: Row | None) -> None:
+        """Move the vehicles, and send the new points of their tracks; `row` is chosen, `whole` has the long tracks."""
+        tracks: dict[Address, Track] = {}
+        for each in sorted(picture.rows, key=lambda each: each.number):
+            for line in each.lines:
+                if line is each.main or (self.truth and line.address.topic == TRUTH):
+                    kept = whole.streams.get(line.address) if self.is_long else None
+                    tracks[line.address] = kept.long if kept is not None else line.stream.minute, each.number
+        self._tracks.update(tracks)
+        placed = [(each, place) for each in picture.rows if (place := each.main.stream.valid) is not None]
+        chosen = [(each, place) for each, place in placed if each is row]
+        frame = self._frame_of(chosen or placed if self.focus == "vehicle" else placed, tracks)
+        if self.focus == "follow" and chosen:
+            half = _FOLLOWED_SIDE / 2
+            frame = [[middle - half, middle + half] for middle in chosen[0][1][:2]]
+        replace(self._frame, [{"east": frame[0][side], "north": frame[1][side]} for side in (0, 1)])
+        labels = self._labels(placed, row, frame)
+        marks = [self._mark(each, place, *labels.get(each.vehicle, ("", False))) for each, place in placed]
+        replace(self.marks, marks)
+        self.shown = [each.vehicle for each, _ in placed]
+        ephs = [each.main.stream.last.message.eph for each, _ in chosen if each.main.stream.last is not None]
+        radius = round(ephs[0], 1) if ephs and 0 < ephs[0] < math.inf else 0.0
+        replace(self._ring, [{"east": place.east, "north": place.north, "radius": radius} for _, place in chosen])
+        if self._background is not None and whole.origin.projection is not None:
+            self._background.draw(self.figure, self._style, whole.origin.projection)
+            self._background = None
+
+    def mark(self, events: Sequence[Event], row: Row | None, whole: Fleet) -> None:
+        """Show where events of the chosen vehicle happened."""
+        placed: list[tuple[Event, Place]] = []
+        if row is not None:
+            stream = whole.streams.get(row.main.address, row.main.stream)
+            events = events[-_MAX_EVENTS:]
+            places = stream.places_at([event.time for event in events])
+            placed = [(event, place) for event, place in zip(events, places, strict=True) if place is not None]
+        self.told = [event for event, _ in placed]
+        marks = [
+            {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.text[:80],
+             "colour": self._style.grades[event.severity]}
+            for event, at in placed
+        ]  # fmt: skip
+        replace(self.events, marks)
+
+    def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
+        """Return from where to where the map is, east and north."""
+        points = [np.array([place[:2] for _, place in shown] or [(0.0, 0.0)])]
+        points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
+        found = np.concatenate(points)
+        sides = []
+        for low, high in zip(np.nanmin(found, axis=0).tolist(), np.nanmax(found, axis=0).tolist(), strict=True):
+            grow = max(MIN_SIDE - (high - low), 2 * _MARGIN * (high - low)) / 2
+            step = max(1.0, (high - low) / 20)  # the map does not creep
+            sides.append([math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step])
+        return sides
+
+    def _labels(
+        self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
+    ) -> dict[str, tuple[str, bool]]:
+        """Return the labels that do not lie on each other, the worst first, and which are on the left of their mark."""
+        (west, east), (south, north) = frame
+        width, height = self.size
+        scale, right = max((east - west) / width, (north - south) / height), east  # m a pixel
+        start, end = (getattr(self.figure.x_range, side) for side in ("start", "end"))
+        if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
+            scale, right = (end - start) / width, end
+        taken = [  # by marks that have to be seen
+            (each.vehicle, at.east / scale - _HEIGHT / 2, at.north / scale, _HEIGHT)
+            for each, at in placed
+            if each.grade == "bad" or each is row
+        ]
+        labels: dict[str, tuple[str, bool]] = {}
+        for each, place in sorted(placed, key=lambda known: known[0] is not row):
+            text = each.vehicle if each.grade == "ok" else f"{each.vehicle} {each.brief}"
+            x, y, size = place.east / scale, place.north / scale, len(text) * _LETTER + 14
+            is_left = x + size > right / scale  # it would leave the map
+            x -= size * is_left
+            if each is row or all(
+                abs(y - top) > _HEIGHT or x + size < left or left + wide < x or owner == each.vehicle
+                for owner, left, top, wide in taken
+            ):
+                taken.append(("", x, y, size))
+                labels[each.vehicle] = text, is_left
+        return labels
+
+    def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> dict[str, Any]:
+        """Return a marker: filled where the vehicle is now, or open where it was last; its shape is its grade."""
+        last = row.main.stream.last
+        heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
+        colour = self._style.vehicle(row.number)
+        return {
+            "east": round(place.east, 3), "north": round(place.north, 3), "angle": round(math.pi / 2 - heading, 3),
+            "shape": MARKERS[row.grade], "colour": colour, "fill": colour if row.is_here else self._style.ground,
+            "edge": colour if row.grade == "ok" else self._style.grades[row.grade],
+            "label": label, "align": "right" if is_left else "left", "offset": -11 if is_left else 11,
+            "name": row.vehicle, "words": row.state.text,
+        }  # fmt: skip
+
+    def _draw(self) -> figure:
+        style, tracks = self._style, self._tracks.source
+        plot = figure(
+            match_aspect=True, sizing_mode="stretch_both", x_axis_label="east [m]", y_axis_label="north [m]",
+            tools="pan,wheel_zoom,reset", active_scroll="wheel_zoom", height=100, css_classes=["map"],
+        )  # fmt: skip
+        plot.toolbar.update(logo=None, autohide=True)
+        frame = plot.scatter("east", "north", source=self._frame, size=0, alpha=0)
+        for axis in (plot.x_range, plot.y_range):
+            axis.update(renderers=[frame], range_padding=0)
+        *valid, doubtful, truth = NAMES
+        plot.line("east", truth, source=tracks, color=style.truth, line_dash="dotted", line_width=2)
+        for number, name in enumerate(valid):
+            plot.line("east", name, source=tracks, color=style.vehicle(number), line_width=1.5)
+        plot.line("east", doubtful, source=tracks, color=style.grades["watch"], line_dash="dashed", line_width=2)
+        plot.circle(
+            "east", "north", radius="radius", source=self._ring, fill_alpha=0.12, color=style.text, line_dash="dashed"
+        )
+        plot.scatter("east", "north", source=self._ring, size=30, fill_alpha=0, color=style.text, line_width=1.5)
+        marked = plot.scatter(
+            "east", "north", source=self.events, marker="marker", size=9, color="colour", nonselection_alpha=1.0
+        )
+        plot.ray(
+            "east", "north", source=self.marks, length=17, length_units="screen", angle="angle", color="edge",
+            line_width=2,
+        )  # fmt: skip
+        marks = plot.scatter(
+            "east", "north", source=self.marks, marker="shape", size=12, line_color="edge", fill_color="fill",
+            line_width=2, nonselection_alpha=1.0,
+        )  # fmt: skip
+        plot.text(
+            "east", "north", text="label", source=self.marks, x_offset="offset", y_offset=-5, text_align="align",
+            text_font_size="11px", text_color=style.text,
+        )  # fmt: skip
+        plot.add_layout(ScaleBar(range=plot.x_range, unit="m", location="bottom_left"))
+        plot.add_tools(
+            HoverTool(renderers=[marks], tooltips="@name: @words, @north{0.0} m north, @east{0.0} m east"),
+            HoverTool(renderers=[marked], tooltips="@words"),
+            TapTool(renderers=[marks, marked]),
+        )
+        return plot

@@ -1,0 +1,175 @@
+"""The plots over time: the timeline of events of all vehicles, and numbers of the chosen one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from bokeh.models import BasicTicker, ColumnDataSource, DatetimeTicker, FixedTicker, HoverTool, Range1d, TapTool
+from bokeh.plotting import figure
+
+from nedbus.events import ALL, Event, Span
+
+from .column_data import replace, table
+from .stream import COLUMNS, History
+from .style import MARKERS, Style
+
+_PHASES: Final = frozenset({"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"})  # of a flight
+_MAX_ROWS: Final = 7
+_MIN_ROWS: Final = 4  # bars of few vehicles are no walls
+_PLOTS: Final = {
+    "height above its origin [m]": ("height",),
+    "horizontal speed [m/s]": ("speed",),
+    "eph, epv, distance to the ground truth [m]": ("eph", "epv", "error"),
+}
+_LABELS: Final = {"error": "off truth"}
+_NO_POINTS: Final = np.empty((0, len(COLUMNS)))
+_OF_TRUTH: Final = {"height", "speed"}
+
+
+def is_notable(event: Event) -> bool:
+    """Return whether an event is shown: bad ones, those to be watched, and the phases of a flight."""
+    return event.severity != "info" or event.kind in _PHASES
+
+
+def move(axis: Range1d, begin: float, end: float) -> None:
+    """Move a time axis [s]."""
+    axis.update(start=begin * 1e3, end=end * 1e3)
+
+
+class Timeline:
+    """The timeline of one viewer: `shown` has an event for each row of `marks`, whose selection was tapped."""
+
+    def __init__(self, style: Style, clock: Any) -> None:
+        self.marks = table("time", "row", "marker", "colour", "words", "vehicle")
+        self.shown: list[Event] = []
+        self._spans = table("begin", "end", "row", "colour")
+        self._now = table("time")
+        self._style = style
+        self._names: list[str] = []
+        self.range = Range1d()
+        self.figure = _time_figure(self.range, clock, y_range=Range1d(), height=100, css_classes=["time"])
+        self.figure.ygrid.grid_line_color = None
+        self.figure.hbar(
+            y="row", left="begin", right="end", source=self._spans, height=0.28, color="colour", alpha=0.75
+        )
+        marks = self.figure.scatter(
+            "time", "row", source=self.marks, marker="marker", size=11, fill_color="colour", line_color=style.ground,
+            nonselection_alpha=1.0,
+        )  # fmt: skip
+        self.figure.vspan(x="time", source=self._now, line_color=style.text, line_dash="dotted")
+        self.figure.add_tools(HoverTool(renderers=[marks], tooltips="@vehicle: @words"), TapTool(renderers=[marks]))
+
+    def update(
+        self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
+        begin: float, end: float, now: float,
+    ) -> None:  # fmt: skip
+        """Show the events from `begin` to `end` [s]; `vehicles`: the most important first."""
+        events = [event for event in events if begin <= event.time <= end and is_notable(event)]
+        held = [  # watched ones first, so that bad ones lie on them
+            (name, span)
+            for severity in ("watch", "bad")
+            for name in vehicles
+            for span in spans.get(name, ())
+            if span.severity == severity and span.until != span.since and (span.until is None or span.until > begin)
+        ]
+        affected = {event.vehicle for event in events if event.severity != "info"} | {name for name, _ in held}
+        names = [name for index, name in enumerate(vehicles) if name and (index == 0 or name in affected)]
+        names = [*([ALL] if ALL in affected else []), *names][:_MAX_ROWS]
+        rows = {name: len(names) - index for index, name in enumerate(names)}
+        colours = self._style.grades
+        self.shown = [event for event in events if event.vehicle in rows]
+        marks = [
+            {"time": event.time * 1e3, "row": rows[event.vehicle], "marker": MARKERS[event.severity],
+             "colour": colours[event.severity], "words": event.text[:100], "vehicle": event.vehicle}
+            for event in self.shown
+        ]  # fmt: skip
+        replace(self.marks, marks)
+        bars = [
+            {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": colours[span.severity],
+             "end": min(end, now if span.until is None else span.until) * 1e3}
+            for name, span in held if name in rows
+        ]  # fmt: skip
+        replace(self._spans, bars)
+        replace(self._now, [{"time": now * 1e3}])
+        if names != self._names:
+            self._names = names
+            axis = self.figure.yaxis[0]
+            axis.ticker = FixedTicker(ticks=list(rows.values()))
+            axis.major_label_overrides = {row: "link, page" if name == ALL else name[:14] for name, row in rows.items()}
+            room = max(_MIN_ROWS - len(names), 0) / 2
+            self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
+
+
+class Plots:
+    """Three plots with one time axis; `chosen` has the points of the stream, beside those of its ground truth."""
+
+    def __init__(self, style: Style, clock: Any) -> None:
+        self.chosen, self._truth = table(*COLUMNS), table(*COLUMNS)
+        self.range = Range1d()
+        self._marks = table("time", "colour")
+        self._spans = table("begin", "end", "colour")
+        self._shown: dict[ColumnDataSource, tuple[History | None, int]] = {}
+        self._style, self._clock = style, clock
+
+    def draw(self) -> list[figure]:
+        """Return the plots: when the map is there, as they take as long as everything else of the page."""
+        return [self._draw(title, names) for title, names in _PLOTS.items()]
+
+    def update(self, chosen: History | None, truth: History | None) -> None:
+        """Send the points that are new."""
+        for source, history in ((self.chosen, chosen), (self._truth, truth if truth is not chosen else None)):
+            shown, seen = self._shown.get(source, (None, 0))
+            end = history.written if history is not None else 0  # once: another thread adds points
+            self._shown[source] = history, end
+            points = _NO_POINTS if history is None else history.points(seen if history is shown else 0, end)
+            columns: dict[str, Any] = dict(zip(COLUMNS, points.T, strict=True))
+            if history is not shown:
+                source.data = columns
+            elif history is not None and len(points):
+                source.stream(columns, rollover=history.size)
+
+    def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
+        """Show when events of the vehicle happened, and how long they held, up to `end` [s]."""
+        colours = self._style.grades
+        replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
+        held = [
+            {"begin": begin * 1e3, "end": stop * 1e3, "colour": colours[severity]}
+            for severity in ("watch", "bad")
+            for begin, stop in _union([span for span in spans if span.severity == severity], end)
+        ]
+        replace(self._spans, held)
+
+    def _draw(self, title: str, names: tuple[str, ...]) -> figure:
+        plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
+        plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
+        for name, colour in zip(names, self._style.lines, strict=False):
+            legend: dict[str, Any] = {"legend_label": _LABELS.get(name, name)} if len(names) > 1 else {}
+            plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
+            if name in _OF_TRUTH:
+                plot.line("time", name, source=self._truth, color=self._style.truth, line_dash="dotted", line_width=1.5)
+        plot.vspan(x="time", source=self._marks, line_color="colour", line_alpha=0.6, line_width=1)
+        plot.xaxis[0].ticker = DatetimeTicker(desired_num_ticks=3)
+        plot.yaxis[0].ticker = BasicTicker(desired_num_ticks=3)
+        return plot
+
+
+def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:
+    plot = figure(
+        x_range=span, x_axis_type="datetime", tools="", toolbar_location=None, sizing_mode="stretch_both", **options
+    )
+    plot.xaxis.formatter = clock
+    return plot
+
+
+def _union(spans: Sequence[Span], end: float) -> list[list[float]]:
+    """Return from when to when any of these held [s]: those that overlap are one."""
+    found: list[list[float]] = []
+    for span in spans:  # in the order of their beginnings
+        stop = end if span.until is None else span.until
+        if found and span.since <= found[-1][1]:
+            found[-1][1] = max(found[-1][1], stop)
+        elif stop > span.since:
+            found.append([span.since, stop])
+    return found
