@@ -33,7 +33,7 @@ ONLY_BY_FOLDER = {
         "nedbus/client/receiving": "receiver thinned_receiver decoder",
         "nedbus/client/publishing": "publisher publisher_registry writer flow_control heartbeats "
         "downsampler query_server",
-        "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",
+        "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "observation",
     },
     "msgpack": {"nedbus_msgs/codecs": "msgpack"},
     "xxhash": {"nedbus/transport": "rmw_zenoh"},

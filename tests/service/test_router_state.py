@@ -17,7 +17,8 @@ import zenoh
 import nedbus
 from nedbus.daemon import Daemon
 from nedbus.doctor import Finding
-from nedbus.doctor.network import check_network
+from nedbus.doctor.examination import check_network
+from nedbus.doctor.observation import Observation
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, router_watch, service_pages
 from nedbus.settings import load_settings
@@ -77,12 +78,12 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network([endpoint], None, prefix="nedbus", version="0", vehicle=None, listen=0.0)
+        findings = check_network(Observation("nedbus", "0", None, has_tls=False), endpoint, None, 0.0)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nedbus.doctor.observation._LEAST", 0.0)
+        patch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.0)
         wait_for(look, what=f"{seen}, not {found}")
     return found[0]
 

@@ -12,7 +12,8 @@ from typing import Annotated
 import typer
 
 from nedbus import __version__
-from nedbus.daemon import Daemon, check_service
+from nedbus.daemon import Daemon
+from nedbus.doctor import check_service
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.monitoring import service_pages
