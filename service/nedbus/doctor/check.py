@@ -7,7 +7,6 @@ import socket
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Final
 
 from nedbus.daemon import Planned, plan_sources
 from nedbus.errors import ConfigError, NedbusError
@@ -21,8 +20,6 @@ from .finding import Finding
 from .prober import check_pem_file, check_tls_files, reach_endpoint
 
 _log = logging.getLogger(__name__)
-
-_NETWORK_PROTOCOLS: Final = frozenset({"tcp", "tls", "udp", "ws", "quic"})  # those with HOST:PORT
 
 
 def check_service(
@@ -50,7 +47,7 @@ def check_service(
         *(("listen", finding) for finding in map(_try_listen, settings.listen)),
         ("http", _try_listen(f"tcp/{settings.http}") if settings.http else None),
     ]
-    return mistakes + [locate_setting(settings, name, reason) for name, each in found for reason in _reasons(each)]
+    return mistakes + [locate_setting(settings, name, reason) for name, each in found if (reason := _reason(each))]
 
 
 def check_router_file(
@@ -64,25 +61,23 @@ def check_router_file(
         config = read_router_config(path)
     except ConfigError as exc:
         return [exc]
+    if offline:
+        return []
     found: list[tuple[str, str]] = []  # a value of the file and the reason against it
     for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
-        for endpoint in endpoints if name not in replaced and not offline else ():
+        for endpoint in endpoints if name not in replaced else ():
             try:
-                if endpoint.partition("/")[0] in _NETWORK_PROTOCOLS:
+                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:  # others have no HOST:PORT
                     check_endpoints([endpoint], where=name)
-                    found += ((endpoint, reason) for reason in _reasons(probe(endpoint)))
+                found.append((endpoint, _reason(probe(endpoint))))
             except ConfigError as exc:
                 found.append((endpoint, exc.reason))
-    for name, file in config.tls_files.items() if not offline else ():
-        kind = "CERTIFICATE" if name.endswith("_certificate") else "PRIVATE KEY"
-        for finding in check_pem_file(file, kind, "it is"):
-            found += ((str(file), f"{name}: {reason}") for reason in _reasons(finding))
+    for name, file in config.tls_files.items():
+        reason = _reason(check_pem_file(name, file, "it is"))
+        found.append((str(file), reason and f"{name}: {reason}"))
     text = path.read_text(errors="replace")
-    places = [place_at(text, text.find(value)) for value, _ in found]
-    return [
-        ConfigError.in_file(path, reason, line=line, column=column)
-        for (_, reason), (line, column) in zip(found, places, strict=True)
-    ]
+    located = ((reason, place_at(text, text.find(value))) for value, reason in found if reason)
+    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
@@ -91,18 +86,16 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
     yield from mistakes
     publishers: dict[Address, Planned] = {}
     for planned in plan:
-        where = f"source {planned.text!r}"
         try:
-            addresses = _addresses(planned, offline=offline)
+            addresses, reason = _addresses(planned, offline=offline), ""
         except (NedbusError, OSError) as exc:
-            yield locate_source(settings, planned.index, ConfigError(where, str(exc)))
-            continue
+            addresses, reason = (), str(exc)
         same = next((address for address in addresses if address in publishers), None)
         if same is not None and "vehicle" not in settings.left_out:
-            reason = (
-                f"it publishes {same}, as source {publishers[same].text!r} does: give one of the two another vehicle"
-            )
-            yield locate_source(settings, planned.index, ConfigError(where, reason))
+            other = publishers[same].text
+            reason = f"it publishes {same}, as source {other!r} does: give one of the two another vehicle"
+        if reason:
+            yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
         for address in addresses:
             publishers.setdefault(address, planned)
 
@@ -134,13 +127,13 @@ def _try_listen(endpoint: str) -> Finding | None:
     return None
 
 
-def _reasons(finding: Finding | None) -> Iterator[str]:
-    """Yield the text of a finding that is a mistake in the settings; a missing package is none, and is logged."""
+def _reason(finding: Finding | None) -> str:
+    """Return the text of a mistake in the settings, "" for none; a missing package is none, and is logged."""
     if finding is None or finding.state == "ok":
-        return
+        return ""
     subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""
     text = f"{subject}{finding.seen}" + (f": {finding.advice}" if finding.advice else "")
     if finding.state == "unknown":
         _log.warning("%s", text, extra=about("notice"))
-    else:
-        yield text
+        return ""
+    return text

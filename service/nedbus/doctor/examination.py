@@ -78,9 +78,7 @@ def _describe_settings(settings: Settings) -> Iterator[Finding]:
     text = f"set by {setter}" if setter else "the default: nothing sets connect"
     advice = "" if setter else "a router on another host is named with --connect, NEDBUS_CONNECT or in nedbus.toml"
     yield Finding("settings", "connect", "ok", f"{' or '.join(settings.routers)}, {text}", advice)
-    setters.pop("connect", None)
-    if setters:
-        others = ", ".join(f"{name} by {setter}" for name, setter in setters.items())
+    if others := ", ".join(f"{name} by {setter}" for name, setter in setters.items() if name != "connect"):
         yield Finding("settings", "others", "ok", f"set: {others}")
 
 
@@ -98,7 +96,7 @@ def check_network(seen: Observation, router: str, tls: Tls | None, listen: float
                 seen.verdict = probe_writes(session, writer, [seen.vehicle], prefix=seen.prefix)[seen.vehicle]
         seen.observe(session, listen=listen)
     for check in NETWORK_CHECKS:
-        yield from limit_findings(list(check(seen)))
+        yield from limit_findings(check(seen))
 
 
 def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> list[Finding]:
@@ -122,6 +120,6 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
-    late = f"no answer within {seconds:g} s"
+    late = f"no result within {seconds:g} s"
     advice = "try again; if it stays so, the network or a name server drops what is sent to it"
     return [each for name in checks for each in found.get(name, [Finding(*name, "wrong", late, advice)])]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -39,13 +39,13 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: _STATES.index(finding.state))
 
 
-def limit_findings(findings: Sequence[Finding]) -> list[Finding]:
+def limit_findings(findings: Iterable[Finding]) -> list[Finding]:
     """Return the worst findings of a check, and one for the number of all others."""
-    if len(findings) <= _MAX_FINDINGS:
-        return list(findings)
-    kept = sort_findings(findings)[-_MAX_FINDINGS:]
-    rest = sort_findings(findings)[:-_MAX_FINDINGS]
-    return [Finding(kept[0].check, "", worst_state(rest), f"{len(rest)} more of the same kind"), *kept]
+    ordered = sort_findings(findings)
+    rest, kept = ordered[:-_MAX_FINDINGS], ordered[-_MAX_FINDINGS:]
+    if rest:
+        kept.insert(0, Finding(kept[0].check, "", worst_state(rest), f"{len(rest)} more of the same kind"))
+    return kept
 
 
 def brief(value: object) -> str:

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.errors import SourceError
 from nedbus.sources import Link, open_link
 
-from .finding import Finding, list_names
+from .finding import Finding, State, list_names
 
 _READ_TIMEOUT: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
@@ -31,12 +31,12 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         with closing(open_link(link, baud=_BAUD)) as opened:
             senders, systems = _listen(opened, listen)
     except SourceError as exc:
+        state: State = "wrong"
+        advice = "check the link: address, port or device, and permissions"
         if isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE:
-            advice = "'ss -ulpn' names it: if it is 'nedbus serve' all is well, else stop it or take another port"
-            yield Finding("mavlink", link, "warning", "its port is taken by a process that gets what arrives", advice)
-        else:
-            advice = "check the link: address, port or device, and permissions"
-            yield Finding("mavlink", link, "wrong", exc.reason, advice)
+            state = "warning"
+            advice = "if 'nedbus serve' has the port all is well, else stop what 'ss -ulpn' names, or take another port"
+        yield Finding("mavlink", link, state, exc.reason, advice)
         return
     except OSError as exc:
         reason = (exc.strerror or str(exc)).lower()
@@ -74,10 +74,12 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
             if not link.stream:
                 parser = _new_parser()
             for message in parser.parse_buffer(data) or []:
-                raw = bytes(message.get_msgbuf())
+                if message.get_type() == "BAD_DATA":
+                    continue
                 # Of a message that is not in the dialect only the header can be parsed.
+                raw = bytes(message.get_msgbuf())
                 system = raw[5] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[3]
-                if message.get_type() != "BAD_DATA" and (system in systems or len(systems) < _MAX_SYSTEMS):
+                if system in systems or len(systems) < _MAX_SYSTEMS:
                     systems.setdefault(system, Counter())[message.get_type()] += 1
             if time.monotonic() >= end:
                 break

@@ -26,14 +26,13 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
     if not seen.routers:
         yield Finding("router", "", "ok", "joined; who else is connected this client is not told")
     for router in seen.routers:
-        text = f"{router.sessions:,} of {router.max_sessions or 0:,} sessions"
-        if router.load is None:
-            yield Finding("router", router.zid, "ok", f"sessions that are connected: {router.sessions:,}")
-        elif router.load < _NEARLY_FULL:
-            yield Finding("router", router.zid, "ok", text)
-        else:
-            advice = "raise max_sessions and its limit of open files, or run a second router: docs/hosts.md"
-            yield Finding("router", router.zid, "warning", text, advice)
+        text = f"sessions that are connected: {router.sessions:,}"
+        if router.max_sessions is not None:
+            text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
+        is_nearly_full = router.load is not None and router.load >= _NEARLY_FULL
+        advice = "raise max_sessions and its limit of open files, or run a second router: docs/hosts.md"
+        state: State = "warning" if is_nearly_full else "ok"
+        yield Finding("router", router.zid, state, text, advice if is_nearly_full else "")
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
@@ -84,8 +83,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     for each in hidden if seen.streams or seen.ages else ():  # else nothing at all may be read
         advice = "may that service write this vehicle? a router drops what its rules do not allow: docs/security.md"
         yield Finding("vehicle", each, "wrong", "a service says that it publishes it, and nothing arrives", advice)
-    flowing = [address for address in known if address in arrived]
-    if flowing:
+    if flowing := [address for address in known if address in arrived]:
         vehicles = {address.vehicle for address in flowing}
         yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
     if not known and not hidden:

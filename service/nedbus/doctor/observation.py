@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final, TypeVar, cast
@@ -27,16 +27,7 @@ from nedbus.transport import (
     query,
     while_open,
 )
-from nedbus_msgs import (
-    BY_TOPIC,
-    DEFAULT_TOPIC,
-    Address,
-    AddressError,
-    DecodeError,
-    address_of_alive_key,
-    alive_key_expr,
-    codec_of,
-)
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, address_of_alive_key, alive_key_expr, codec_of
 
 T = TypeVar("T")
 
@@ -87,14 +78,13 @@ class Stream:
     publishers: set[str] = field(default_factory=set)
     error: str = ""
 
-    def add(self, sample: RawSample, now: float) -> None:
-        """Add a message that arrived now [s since the epoch]."""
-        stamp, info = sample.timestamp, sample.source_info
-        if stamp is not None:
-            delay = now - stamp.get_time_as_ntp64().as_nanos() / 1e9
-            self.delay = delay if self.delay is None else min(delay, self.delay)
-            if len(self.clocks) < _MAX_PUBLISHERS:
-                self.clocks.add(str(stamp.get_id()))
+    def add(self, sample: RawSample) -> None:
+        """Add a message that has just arrived."""
+        age, stamp, info = _age_of(sample), sample.timestamp, sample.source_info
+        if age is not None:
+            self.delay = age if self.delay is None else min(age, self.delay)
+        if stamp is not None and len(self.clocks) < _MAX_PUBLISHERS:
+            self.clocks.add(str(stamp.get_id()))
         if info is not None and len(self.publishers) < _MAX_PUBLISHERS:
             self.publishers.add(entity_name(info.source_id))
         definition = BY_TOPIC.get(self.address.topic) if self.address is not None else None
@@ -110,7 +100,6 @@ class Observation:
     """A network as this client sees it, and what the doctor was asked for.
 
     `version`: of this nedbus; `vehicle`: the one to look at, None for all; `verdict`: whether it may be written.
-    `has_tls`: this client shows a certificate, perhaps.
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
     `streams`: messages by key; `publishers`: those whose heartbeats came, by key; `listened`: for how long [s].
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
@@ -136,38 +125,35 @@ class Observation:
     def observe(self, session: Session, *, listen: float) -> None:
         """Listen and ask, for little more than `listen` seconds."""
         prefix, start = self.prefix, time.monotonic()
-        with ExitStack() as closing:
-            take_messages, end_messages = _subscribe(session, f"{prefix}/*/**")
-            closing.callback(end_messages)
-            take_others, end_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-            closing.callback(end_others)
-            take_heartbeats, end_heartbeats = follow_heartbeats(session, f"{prefix}/*/**")
-            closing.callback(end_heartbeats)
-            self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
-            self.services = _ask_services(session, prefix)
-            self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-            tokens = alive_keys(session, alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
-            self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
-            tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
-            of_ros2 = _parse_each(PublisherToken.parse, tokens)
-            self.ros2 = [token for token in of_ros2 if not token.node.startswith("nedbus_")]  # not our bridge
-            self.ages = _ask_ages(session, prefix)
-            tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
-            others = {key for key in tokens if not key.startswith("@")}
+        take_messages = _subscribe(session, f"{prefix}/*/**")
+        take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
+        take_heartbeats, _ = follow_heartbeats(session, f"{prefix}/*/**")
+        self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
+        self.services = _ask_services(session, prefix)
+        self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
+        tokens = alive_keys(session, alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
+        tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        publishers = _parse_each(PublisherToken.parse, tokens)
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
+        kept = query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT)
+        self.ages = {each: _age_of(sample) for sample in kept if (each := _address_of(str(sample.key_expr), prefix))}
+        tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+        others = {key for key in tokens if not key.startswith("@")}
+        self._add_messages(take_messages())
+        for stream in self.streams.values():
+            stream.delay = None  # these have waited for the queries above, and are older than they look
+        end = max(start + listen, time.monotonic() + _MIN_LISTEN)
+        while time.monotonic() < end:
+            time.sleep(_POLL)
             self._add_messages(take_messages())
-            for stream in self.streams.values():
-                stream.delay = None  # these have waited for the queries above, and are older than they look
-            end = max(start + listen, time.monotonic() + _MIN_LISTEN)
-            while time.monotonic() < end:
-                time.sleep(_POLL)
-                self._add_messages(take_messages())
-                for sample in take_others():
-                    key = str(sample.key_expr)
-                    if len(others) < _MAX_STREAMS and len(key) < _MAX_KEY_LENGTH and key.endswith(f"/{DEFAULT_TOPIC}"):
-                        others.add(key)
-                for key, publisher in take_heartbeats():
-                    if key in self.publishers or len(self.publishers) < _MAX_PUBLISHER_KEYS:
-                        self.publishers.setdefault(key, set()).add(publisher)
+            for sample in take_others():
+                key = str(sample.key_expr)
+                if len(others) < _MAX_STREAMS and len(key) < _MAX_KEY_LENGTH and key.endswith(f"/{DEFAULT_TOPIC}"):
+                    others.add(key)
+            for key, publisher in take_heartbeats():
+                if key in self.publishers or len(self.publishers) < _MAX_PUBLISHER_KEYS:
+                    self.publishers.setdefault(key, set()).add(publisher)
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
@@ -178,40 +164,34 @@ class Observation:
                 if len(self.streams) >= _MAX_STREAMS or len(key) > _MAX_KEY_LENGTH:
                     continue
                 self.streams[key] = Stream(_address_of(key, self.prefix))
-            self.streams[key].add(sample, time.time())
+            self.streams[key].add(sample)
 
 
-def _subscribe(session: Session, key_expr: str) -> tuple[Callable[[], Iterable[RawSample]], Callable[[], None]]:
-    """Return a function that takes what has arrived, at most a full ring, and one that ends the subscription."""
+def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
+    """Return a function that takes the samples that have arrived, at most a full ring; dropping it ends the stream."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
     with while_open():
         subscriber = session.declare_subscriber(key_expr, channel)
-    handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
-    return lambda: islice(iter(handler.try_recv, None), _RING), subscriber.undeclare
+    return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 
 
 def _ask_services(session: Session, prefix: str) -> list[Service]:
     """Return the services that answer; they read their clocks within the round trip."""
     before = time.time()
     statuses = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)
-    middle, error = (before + time.time()) / 2, (time.time() - before) / 2
+    error = (time.time() - before) / 2
     services = []
     for status in statuses[:_MAX_SERVICES]:
         now = status.get("now")
         is_time = isinstance(now, int | float) and abs(now) < _MAX_TIME  # NaN is not
-        services.append(Service(status, cast("float", now) - middle if is_time else None, error))
+        services.append(Service(status, cast("float", now) - before - error if is_time else None, error))
     return services
 
 
-def _ask_ages(session: Session, prefix: str) -> dict[Address, float | None]:
-    """Return the age of the last message of each address that a publisher answers with; None without a timestamp."""
-    ages: dict[Address, float | None] = {}
-    for answer in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
-        address = _address_of(str(answer.key_expr), prefix)
-        if address is not None:
-            stamp = answer.timestamp
-            ages[address] = None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
-    return ages
+def _age_of(sample: RawSample) -> float | None:
+    """Return the age of a sample by the clock of its publisher [s], None without a timestamp."""
+    stamp = sample.timestamp
+    return None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
 
 def _address_of(key: str, prefix: str) -> Address | None:
@@ -223,6 +203,6 @@ def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
     """Return what these keys are, without those that cannot be parsed."""
     parsed = []
     for key in keys:
-        with suppress(AddressError, DecodeError):
+        with suppress(ValueError):  # AddressError or DecodeError
             parsed.append(parse(key))
     return parsed

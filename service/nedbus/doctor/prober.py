@@ -20,11 +20,7 @@ _CONNECT_TIMEOUT: Final = 2.0  # s
 _HANDSHAKE_TIMEOUT: Final = 1.5  # s
 _ALERT_TIMEOUT: Final = 0.5  # s for the alert of a router that rejects our certificate; one that accepts it is silent
 _OPEN_TIMEOUT: Final = 1.5  # s
-_PEM_FILES: Final = {
-    "tls_ca": ("CERTIFICATE", "the authority is"),
-    "tls_certificate": ("CERTIFICATE", "this client is"),
-    "tls_key": ("PRIVATE KEY", ""),
-}
+_PEM_FILES: Final = {"tls_ca": "the authority is", "tls_certificate": "this client is", "tls_key": ""}
 _ALERTS: Final = {  # by a part of OpenSSL's names of TLS alerts
     "CERTIFICATE_REQUIRED": "it wants a certificate of this client, and none is given",
     "UNKNOWN_CA": "it does not know the authority that issued the certificate of this client",
@@ -39,8 +35,7 @@ _OTHER_HOST: Final = (62, 64)
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
     """Yield the findings on the way to one router, up to the first thing that is wrong."""
-    unreachable = reach_endpoint(endpoint)
-    if unreachable is not None:
+    if unreachable := reach_endpoint(endpoint):
         yield unreachable
         return
     protocol, host, port = split_endpoint(endpoint) or ("", "", 0)
@@ -112,11 +107,10 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
             issuer = f", but by {brief(certificate.issuer)}" if certificate else ""
             seen = f"the router's certificate is not signed by the authority in {tls.ca}{issuer}"
             advice = "give its authority as --tls-ca, or ask whose router it is"
-        elif validity.state == "wrong":  # it says the same
-            return
         else:
             seen, advice = f"the router's certificate cannot be trusted: {exc.verify_message}", ""
-        yield Finding("tls", endpoint, "wrong", seen, advice)
+        if advice or validity.state != "wrong":  # else it says the same
+            yield Finding("tls", endpoint, "wrong", seen, advice)
     except ssl.SSLError as exc:
         seen = next(text for name, text in _ALERTS.items() if name in (exc.reason or ""))
         advice = "give --tls-certificate and --tls-key of a certificate that the router's authority has signed"
@@ -125,10 +119,9 @@ def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | No
 
 def _read_certificate(host: str, port: int) -> str:
     """Return the certificate of a server in PEM, unverified; "" if it speaks no TLS."""
-    try:
+    with suppress(OSError):  # SSLError, too
         return ssl.get_server_certificate((host, port), timeout=_HANDSHAKE_TIMEOUT)
-    except OSError:  # SSLError, too
-        return ""
+    return ""
 
 
 def _shake_hands(host: str, port: int, tls: Tls) -> None:
@@ -149,7 +142,8 @@ def _shake_hands(host: str, port: int, tls: Tls) -> None:
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
     """Return the findings on the TLS files of these settings, each with its setting, and the files if they work."""
     given = {name: path for name in _PEM_FILES if (path := getattr(settings, name)) is not None}
-    findings = [(name, each) for name, path in given.items() for each in check_pem_file(path, *_PEM_FILES[name])]
+    found = ((name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items())
+    findings = [(name, finding) for name, finding in found if finding is not None]
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
     try:
         tls = settings.tls
@@ -167,15 +161,14 @@ def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls 
     return findings, tls
 
 
-def check_pem_file(path: Path, kind: str, whose: str) -> Iterator[Finding]:
-    """Yield whether a file holds a `CERTIFICATE` or a `PRIVATE KEY`, and until when the certificate is valid."""
+def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
+    """Return whether the certificate of a setting is valid, and until when; None for a private key without a fault."""
+    kind = "PRIVATE KEY" if name.endswith("_key") else "CERTIFICATE"
     try:
         check_pem(path, kind)
     except ConfigError as exc:
-        yield Finding("certificate", str(path), "wrong", exc.reason)
-    else:
-        if kind == "CERTIFICATE":
-            yield _judge_validity("certificate", str(path), whose, path.read_bytes())[0]
+        return Finding("certificate", str(path), "wrong", exc.reason)
+    return _judge_validity("certificate", str(path), whose, path.read_bytes())[0] if kind == "CERTIFICATE" else None
 
 
 def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[Finding, Certificate | None]:
@@ -189,14 +182,12 @@ def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[F
     now = dt.datetime.now(dt.UTC)
     days = certificate.days_left(now)
     state: State = "ok"
-    seen, advice = f"{whose} {brief(certificate)}", ""
+    note = advice = ""
     if days < 0:
-        until = f"{certificate.ends:%Y-%m-%d %H:%M} UTC"
-        seen = f"{whose} {brief(certificate.subject)}, which has expired: it was valid until {until}"
-        state, advice = "wrong", _RENEW
+        state, note, advice = "wrong", ": it has expired", _RENEW
     elif now < certificate.begins:
-        seen = f"{whose} {brief(certificate.subject)}, which is not valid yet"
-        state, advice = "wrong", f"is the clock of this host right? it says {now:%Y-%m-%d %H:%M} UTC"
+        state, note = "wrong", ": it is not valid yet"
+        advice = f"is the clock of this host right? it says {now:%Y-%m-%d %H:%M} UTC"
     elif certificate.is_due(now):
-        state, seen, advice = "warning", f"{seen}, {days:.0f} days from now", _RENEW
-    return Finding(check, subject, state, seen, advice), certificate
+        state, note, advice = "warning", f", {days:.0f} days from now", _RENEW
+    return Finding(check, subject, state, f"{whose} {brief(certificate)}{note}", advice), certificate
