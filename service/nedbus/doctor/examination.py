@@ -120,6 +120,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
-    late = f"no result within {seconds:g} s"
-    advice = "try again; if it stays so, the network or a name server drops what is sent to it"
-    return [each for name in checks for each in found.get(name, [Finding(*name, "wrong", late, advice)])]
+    late, advice = f"no result within {seconds:g} s", "try again; if it stays so, a name server may not answer"
+    for name in checks:
+        found.setdefault(name, [Finding(*name, "wrong" if name[0] == "endpoint" else "unknown", late, advice)])
+    return [each for name in checks for each in found[name]]
