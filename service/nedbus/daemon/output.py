@@ -110,7 +110,7 @@ class SourceOutput:
             return
         if self._registry.is_alive(address):
             text = f"{address} is published by another process too: readers get both"
-            log_source(self._name, logging.WARNING, "duplicate", text, address)
+            _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
@@ -159,7 +159,7 @@ class SourceOutput:
                 return
             self._live += not back
             event = "back" if back else "published"
-            log_source(self._name, logging.INFO, event, f"{address} is {event}", address)
+            _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
             self._bring_back(message)
         self._streams[address].heard, self._streams[address].last = self._now(), message
         self.publish(message)
@@ -180,7 +180,7 @@ class SourceOutput:
         for address in self.addresses:
             if address not in fresh:
                 text = f"{address} is stale: nothing arrived for {_STALE:.0f} s"
-                log_source(self._name, logging.WARNING, "stale", text, address)
+                _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         return bool(fresh)
 
@@ -191,7 +191,8 @@ class SourceOutput:
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
             text = f"{where}: rejected: {reason}"
-            log_source(self._name, logging.WARNING, "rejected", text, rejection.address, reason=reason)
+            extra = about("rejected", rejection.address, source=self._name, reason=reason)
+            _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
             self._account.reject(rejection.address, reason, time.time())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
@@ -202,7 +203,7 @@ class SourceOutput:
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
             text = f"announced, and nothing arrives: {', '.join(new)}; 'nedbus doctor' says more"
-            log_source(self._name, logging.WARNING, "silent", text)
+            _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
         """Publish again what has no rate of a vehicle that is back: it would not send it; not after a reboot."""
@@ -221,7 +222,7 @@ class SourceOutput:
                 continue
             with suppress(AddressInUseError):
                 self.claim(address, last.definition)
-                log_source(self._name, logging.INFO, "back", f"{address} is back", address)
+                _log.info("%s: %s is back", self._name, address, extra=about("back", address, source=self._name))
                 self.publish(replace(last, lost=0))
 
     def _now_ns(self) -> int:
@@ -237,17 +238,11 @@ class SourceOutput:
         if self._invalid <= _MAX_LOGGED:
             last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
             text = f"{message.address} rejected: {reason}{last}"
-            log_source(self._name, logging.WARNING, "rejected", text, message.address, reason=reason)
+            extra = about("rejected", message.address, source=self._name, reason=reason)
+            _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._account.reject(message.address, reason, time.time())
         self._registry.reject(message.address, report)
-
-
-def log_source(
-    name: str, level: int, event: str, text: str, address: Address | None = None, *, reason: str | None = None
-) -> None:
-    """Log an event of a source."""
-    _log.log(level, "%s: %s", name, text, extra=about(event, address, source=name, reason=reason))
 
 
 def _time_of(message: SourceMessage) -> int:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Final, Literal
+from typing import Final
 
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ClosedError, NedbusError
@@ -16,7 +16,7 @@ from nedbus.log_event import about
 from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source
 from nedbus.transport import Session
 
-from .output import SourceOutput, log_source
+from .output import SourceOutput
 from .status import SourceMeasures, SourceStatus, State, StreamStatus
 
 _log = logging.getLogger(__name__)
@@ -33,16 +33,15 @@ class Clock:
     """Monotonic time, and waiting that ends early when the worker is stopped; a test gives another one."""
 
     def __init__(self) -> None:
-        event = threading.Event()
+        self._event = threading.Event()
         self.now = time.monotonic
-        self.stop = event.set
-        self.wait = event.wait
-        self._is_set = event.is_set
+        self.stop = self._event.set
+        self.wait = self._event.wait
 
     @property
     def stopped(self) -> bool:
         """Whether the worker is to end."""
-        return self._is_set()
+        return self._event.is_set()
 
 
 class Worker:
@@ -178,9 +177,9 @@ class Worker:
         run = source.open()
         first = self._run is None
         if self._run is None or self._run.summary != run.summary:
-            log_source(self._name, logging.INFO, "opened", run.summary)
+            _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             for warning in run.warnings:
-                log_source(self._name, logging.WARNING, "damaged", warning, reason=warning)
+                _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
         self._run, self._done = run, 0
         if source.wait and first:
             self._wait_for_reader(run)
@@ -192,7 +191,8 @@ class Worker:
             if source.speed is not None:
                 early = start + message.due / source.speed - self._clock.now()
                 if early < -_MAX_DELAY:
-                    log_source(self._name, logging.WARNING, "late", f"{-early:.1f} s late, going on from here")
+                    extra = about("late", source=self._name)
+                    _log.warning("%s: %.1f s late, going on from here", self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:
                     self._clock.wait(early)
@@ -231,20 +231,21 @@ class Worker:
 
     def _wait_for_reader(self, run: ReplayRun) -> None:
         self._state = "waiting"
-        log_source(self._name, logging.INFO, "waiting", "waiting for a subscriber")
+        _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
         while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
             pass
 
     def _set_state(self, state: State) -> None:
         if state == "waiting" and self._state in {"starting", "retrying"}:
-            log_source(self._name, logging.INFO, "listening", "listening")
+            _log.info("%s: listening", self._name, extra=about("listening", source=self._name))
         self._state, self._error = state, None
 
-    def _end(self, state: Literal["done", "failed"]) -> None:
+    def _end(self, state: State) -> None:
         if not self._clock.stopped:
             self._state = state
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
-            log_source(self._name, logging.INFO, state, text, reason=self._error)
+            event = "failed" if state == "failed" else "done"
+            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=self._error))
 
     def _fail(self, reason: str) -> None:
         """Note why it failed, and release all addresses: another source may need them meanwhile."""
