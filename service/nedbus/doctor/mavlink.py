@@ -17,7 +17,6 @@ from nedbus.sources import Link, open_link
 from .finding import Finding, State, list_names
 
 _READ_TIMEOUT: Final = 0.25  # s
-_HEARTBEAT_INTERVAL: Final = 1.0  # s
 _MAX_SYSTEMS: Final = 20
 _MAX_SENDERS: Final = 5
 _POSITION: Final = "LOCAL_POSITION_NED"
@@ -65,7 +64,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
     )
     while (now := time.monotonic()) < end:
         if link.peer is not None and now >= next_heartbeat:  # a peer that does not know us sends nothing
-            next_heartbeat = now + _HEARTBEAT_INTERVAL
+            next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer in link.read(_READ_TIMEOUT):
             name = ":".join(map(str, peer[:2])) if isinstance(peer, tuple) else str(peer)
