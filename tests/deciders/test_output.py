@@ -6,7 +6,6 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from nedbus.client import PublisherRegistry
-from nedbus.daemon.clock import Clock
 from nedbus.daemon.output import SourceOutput
 from nedbus.events import Account
 from nedbus.sources import SourceMessage
@@ -23,9 +22,8 @@ class Sky:
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
         registry = SimpleNamespace(is_alive=lambda _: False, publisher=self._open)
-        clock = SimpleNamespace(now=lambda: self.now)
         self.output = SourceOutput(
-            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), cast("Clock", clock), Account()
+            "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, Account()
         )
 
     def hear(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:

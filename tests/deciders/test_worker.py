@@ -11,7 +11,7 @@ import pytest
 
 from nedbus.client import PublisherRegistry
 from nedbus.daemon.status import SourceStatus
-from nedbus.daemon.worker import Worker
+from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
@@ -38,9 +38,6 @@ class StandingClock:
 
     def now(self) -> float:
         return self.seconds
-
-    def time_ns(self) -> int:
-        return round(self.seconds * 1e9)
 
     def wait(self, seconds: float) -> bool:
         self.waits.append(round(seconds, 6))
@@ -144,7 +141,12 @@ class Ran:
         self.registry = FakeRegistry(clock)
         given = cast("Source", source), cast("PublisherRegistry", self.registry)
         self.worker = Worker(
-            "ulog:flight.ulg", *given, clock=clock, account=Account(), retry=retry, on_end=self._count_end
+            "ulog:flight.ulg",
+            *given,
+            clock=cast("Clock", clock),
+            account=Account(),
+            retry=retry,
+            on_end=self._count_end,
         )
 
     def _count_end(self) -> None:

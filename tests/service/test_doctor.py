@@ -45,8 +45,8 @@ HOUR = 3600.0
 @pytest.fixture(autouse=True)
 def _listen_shortly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Listen for a shorter time than a person would: `look` says how long."""
-    monkeypatch.setattr("nedbus.doctor.observation._LEAST", 0.1)
-    monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", 0.1)
+    monkeypatch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.1)
+    monkeypatch.setattr("nedbus.doctor.prober._ALERT_TIMEOUT", 0.1)
     monkeypatch.setattr("nedbus.cli.commands.doctor.examine", partial(examine, listen=0.5))
 
 
@@ -102,17 +102,17 @@ def test_nothing_listens(endpoint: str) -> None:
     refused = free_endpoint()
     findings = look(refused, "tcp/no-such-host.invalid:7447", "tcp/a..b:7447")
     assert "nedbus serve" in found(findings, "endpoint", "wrong", f"{refused}: nothing listens there").advice
-    found(findings, "endpoint", "wrong", "no-such-host.*(has no address|no name server answers)")
-    found(findings, "endpoint", "wrong", r"a\.\.b has no address")
+    found(findings, "endpoint", "wrong", "this host finds no address of no-such-host")
+    found(findings, "endpoint", "wrong", r"this host finds no address of a\.\.b")
     findings = look(refused, endpoint)
     found(findings, "endpoint", "warning", "nothing listens")
     found(findings, "endpoint", "ok", "a Zenoh router answers")
 
 
 def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An HTTP server is told from a router and from TLS; whoever never answers does not hold up the doctor."""
-    for name in ("doctor.endpoint._OPEN", "doctor.handshake._TIMEOUT", "doctor.speaker._TIMEOUT"):
-        monkeypatch.setattr(f"nedbus.{name}", 0.2)
+    """Another server is told from a router and from TLS; one that never answers does not hold up the doctor."""
+    for name in ("_OPEN_TIMEOUT", "_HANDSHAKE_TIMEOUT"):
+        monkeypatch.setattr(f"nedbus.doctor.prober.{name}", 0.2)
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         thread = threading.Thread(target=server.serve_forever, args=[0.01])
         thread.start()
@@ -122,9 +122,9 @@ def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
             findings = look(*(f"{protocol}/{where}" for protocol in ("tcp", "tls") for where in (http, mute)))
         server.shutdown()
         thread.join(DEADLINE)
-    for protocol, of_mute in (("tcp", "says nothing"), ("tls", "does not speak TLS")):
-        found(findings, "endpoint", "wrong", f"{protocol}/{http}: an HTTP server answers there")
-        found(findings, "endpoint", "wrong", f"{protocol}/{mute}.*{of_mute}")
+    for protocol, reason in (("tcp", "no Zenoh session opens there"), ("tls", "it does not speak TLS")):
+        for where in (http, mute):
+            found(findings, "endpoint", "wrong", f"{protocol}/{where}: {reason}")
 
 
 def test_all_is_well(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
@@ -142,7 +142,7 @@ def test_silent_vehicle(bus: nedbus.Bus, endpoint: str) -> None:
     bus.publisher(VLP, vehicle="asleep").publish(message(1))
     findings = look(endpoint)
     found(findings, "vehicle", "warning", r"mute/.*silent for \d+ s: it has sent nothing yet")
-    found(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ s old")
+    found(findings, "vehicle", "wrong", r"asleep/.*silent for \d+ s: its last message is \S+ m?s old")
     found(look(endpoint, vehicle="7"), "vehicle", "wrong", "7: it is not seen under nedbus/")
 
 
@@ -392,11 +392,14 @@ def test_certificates_are_shown(run_router: Run, pki: Path) -> None:
 @pytest.mark.parametrize(
     ("case", "told"),
     [
-        (("router-expired", "reader", "ca.crt"), {"tls": "the router shows router-expired, which has expired"}),
+        (("router-expired", "reader", "ca.crt"), {"tls": "the router shows router-expired .*has expired"}),
         (("router-elsewhere", "reader", "ca.crt"), {"tls": r"not for 127\.0\.0\.1, but for gcs\.local, 10\.0\.0\.7"}),
         (("router", "reader", "foreign/ca.crt"), {"tls": "is not signed by the authority in .*, but by nedbus CA"}),
         (("router", None, "ca.crt"), {"tls": "it wants a certificate of this client, and none is given"}),
-        (("router", "expired", "ca.crt"), {"certificate": "which has expired", "tls": "the router refuses: .*expired"}),
+        (
+            ("router", "expired", "ca.crt"),
+            {"certificate": "is expired, .*has expired", "tls": "refuses: .*expired"},
+        ),
         (("router", "foreign/reader", "ca.crt"), {"certificate": "not signed by .*tls_ca", "tls": "router refuses: "}),
     ],
 )
@@ -406,7 +409,7 @@ def test_certificate_that_is_wrong(
     """The reason is told, which Zenoh never does, and the router's certificate is shown though no session opens."""
     router, name, ca = case
     if name != "reader":  # it is rejected, perhaps slowly
-        monkeypatch.setattr("nedbus.doctor.handshake._VERDICT", DEADLINE)
+        monkeypatch.setattr("nedbus.doctor.prober._ALERT_TIMEOUT", DEADLINE)
     findings = look(run_router(router), tls=files_of(pki, name, ca))
     for check, text in told.items():
         found(findings, check, "wrong", text)
@@ -415,11 +418,11 @@ def test_certificate_that_is_wrong(
 
 def test_wrong_protocol_or_files(run_router: Run, pki: Path, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """TLS where there is none, none where there is, no authority at all, and a key of another certificate."""
-    monkeypatch.setattr("nedbus.doctor.endpoint._OPEN", 0.1)
+    monkeypatch.setattr("nedbus.doctor.prober._OPEN_TIMEOUT", 0.1)
     secure = run_router()
     findings = look(secure.replace("tls/", "tcp/"), endpoint.replace("tcp/", "tls/"), secure)
     found(findings, "endpoint", "wrong", "tcp/.*: it speaks TLS")
-    found(findings, "endpoint", "wrong", "tls/.*: a Zenoh router answers there, without TLS")
+    found(findings, "endpoint", "wrong", "tls/.*: it does not speak TLS")
     found(findings, "tls", "wrong", f"{secure}: no authority is given")
     for files, reason in (
         ({**files_of(pki, "reader"), "tls_key": pki / "vehicle-1.key"}, "is not the key of"),
@@ -473,7 +476,7 @@ import sys
 sys.modules["cryptography"] = None
 from nedbus.doctor import examine, observation
 from nedbus.settings import load_settings
-observation._LEAST = 0.1
+observation._MIN_LISTEN = 0.1
 for each in examine(load_settings(connect={tuple(endpoints)!r}, **{settings!r}), version="0", listen=0.1):
     if each.check in ("tls", "certificate"):
         print(each.subject, each.check, each.state, each.seen, each.advice, sep="|")
@@ -523,20 +526,19 @@ def packets_of(system: int, *messages: object) -> list[bytes]:
 
 
 def test_what_comes_on_a_mavlink_link() -> None:
-    """Nothing, what is no MAVLink, heartbeats only, and positions are told apart, by system id; who has the port is."""
+    """Nothing, what is no MAVLink, heartbeats only, positions, a port that is taken: told apart, by system id."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
     found(listen_to(), "mavlink", "wrong", "nothing arrives within")
     junk = listen_to(b"GET / HTTP/1.1")
     found(junk, "mavlink", "wrong", r"packets from 127\.0\.0\.1:\d+ that are not MAVLink")
-    findings = listen_to(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position), b"junk")
+    findings = listen_to(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
     assert "requests it" in found(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
     found(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
-    found(findings, "mavlink", "warning", "bytes that are not MAVLink")
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")
-    found(findings, "mavlink", "warning", r"its port is taken by .*\(pid \d+\)")
+    found(findings, "mavlink", "warning", r"address already in use")
 
 
 def test_settings_that_are_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -546,7 +548,7 @@ def test_settings_that_are_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
     findings = examine(load_settings(), version="0")
     found(findings, "settings", "ok", "connect: tcp/127.0.0.1:7447, the default: nothing sets connect")
     found(findings, "settings", "ok", "prefix by nedbus.toml, vehicle by NEDBUS_VEHICLE")
-    found(findings, "settings", "wrong", "there is no gone.ulg")
+    found(findings, "settings", "wrong", "gone.ulg: no such file")
     found(findings, "settings", "wrong", "there is no option 'nonsense'")
 
 
@@ -563,5 +565,5 @@ for each in examine(settings, version="0", mavlink="udpin:127.0.0.1:1"):
 """
     process = start("-c", program)
     assert process.wait() == 0, process.err
-    assert process.out.count("pymavlink is missing") >= 2, process.out
+    assert process.out.count("pymavlink") >= 2, process.out
     assert process.out.count("[mavlink]'") >= 2, process.out

@@ -68,7 +68,7 @@ def test_finished_replay_is_not_healthy(endpoint: str, health: Judge, monkeypatc
     """The newest message must be fresh, whatever the state of the source; --max-age says how fresh."""
     passed = [0.0]
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + passed[0], time_ns=time.time_ns)
-    monkeypatch.setattr("nedbus.daemon.clock.time", clock)
+    monkeypatch.setattr("nedbus.daemon.worker.time", clock)
     with serving(endpoint, "sim:?duration=0.1") as daemon:
         wait_for_state(daemon, "done")
         passed[0] = 100.0

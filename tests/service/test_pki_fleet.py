@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 import nedbus
-from nedbus.daemon import check_service
+from nedbus.doctor import check_service
 from nedbus.pki import (
     certificate_name,
     list_certificates,

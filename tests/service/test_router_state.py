@@ -17,8 +17,9 @@ import zenoh
 import nedbus
 from nedbus.daemon import Daemon
 from nedbus.doctor import Finding
-from nedbus.doctor.endpoint import check_endpoint
-from nedbus.doctor.network import check_network
+from nedbus.doctor.examination import check_network
+from nedbus.doctor.observation import Observation
+from nedbus.doctor.prober import check_endpoint
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
@@ -70,12 +71,12 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network([endpoint], None, prefix="nedbus", version="0", vehicle=None, listen=0.0)
+        findings = check_network(Observation("nedbus", "0", None, has_tls=False), endpoint, None, 0.0)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nedbus.doctor.observation._LEAST", 0.0)
+        patch.setattr("nedbus.doctor.observation._MIN_LISTEN", 0.0)
         wait_for(look, what=f"{seen}, not {found}")
     return found[0]
 

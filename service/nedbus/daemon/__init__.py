@@ -1,17 +1,16 @@
 """The service: a Daemon runs a Worker for each source, and answers with its status."""
 
-from .check import check_router_file, check_service, describe_mistakes
 from .daemon import Daemon
+from .plan import Planned, plan_sources
 from .status import STATES, ServiceStatus, SourceMeasures, SourceStatus, StreamStatus
 
 __all__ = [
     "STATES",
     "Daemon",
+    "Planned",
     "ServiceStatus",
     "SourceMeasures",
     "SourceStatus",
     "StreamStatus",
-    "check_router_file",
-    "check_service",
-    "describe_mistakes",
+    "plan_sources",
 ]

@@ -191,11 +191,16 @@ class Daemon:
             router = session if self.role == "router" else None
             with self._planning:
                 self._workers = Workers(
-                    registry,
-                    router=router,
-                    account=self.account,
-                    retry=not settings.until_done,
-                    on_end=self._changed.set,
+                    lambda planned, clock: Worker(
+                        planned.text,
+                        planned.source,
+                        registry,
+                        router=router,
+                        clock=clock,
+                        account=self.account,
+                        retry=not settings.until_done,
+                        on_end=self._changed.set,
+                    )
                 )
                 self._workers.apply(self._plan)
             self.ready.set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
@@ -17,7 +17,6 @@ from nedbus.log_event import about
 from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 
-from .clock import Clock
 from .status import StreamStatus
 
 _log = logging.getLogger(__name__)
@@ -43,9 +42,14 @@ class _Stream:
 
 
 class SourceOutput:
-    """Publish what a source delivers; `name` is how the log calls the source, `text` how the user wrote it."""
+    """Publish what a source delivers.
 
-    def __init__(self, name: str, text: str, registry: PublisherRegistry, clock: Clock, account: Account) -> None:
+    `name`: of the source in the log; `text`: as the user wrote it; `now`: a monotonic clock [s].
+    """
+
+    def __init__(
+        self, name: str, text: str, registry: PublisherRegistry, now: Callable[[], float], account: Account
+    ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
         """How many messages each rule rejected."""
@@ -57,7 +61,7 @@ class SourceOutput:
         self._text = text
         self._kind = text.partition(":")[0]
         self._registry = registry
-        self._clock = clock
+        self._now = now
         self._account = account
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
@@ -77,7 +81,7 @@ class SourceOutput:
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
         """Return the health of all streams, or of so many."""
-        streams, now = list(self._streams.items())[:limit], self._now()
+        streams, now = list(self._streams.items())[:limit], self._now_ns()
         return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 
     @property
@@ -105,12 +109,8 @@ class SourceOutput:
         if stream.publisher is not None:
             return
         if self._registry.is_alive(address):
-            _log.warning(
-                "%s: %s is published by another process too: readers get both",
-                self._name,
-                address,
-                extra=about("duplicate", address, source=self._name),
-            )
+            text = f"{address} is published by another process too: readers get both"
+            _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
@@ -138,7 +138,7 @@ class SourceOutput:
             return
         self.durations.add(time.perf_counter() - start)
         self.published += 1
-        stream.health.add(fields, received=self._now(), lost=message.lost)
+        stream.health.add(fields, received=self._now_ns(), lost=message.lost)
         self._account.add(message.address, fields, time.time(), lost=message.lost)
 
     def publish_live(self, message: SourceMessage) -> None:
@@ -161,7 +161,7 @@ class SourceOutput:
             event = "back" if back else "published"
             _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
             self._bring_back(message)
-        self._streams[address].heard, self._streams[address].last = self._clock.now(), message
+        self._streams[address].heard, self._streams[address].last = self._now(), message
         self.publish(message)
 
     def expire_stale(self) -> bool:
@@ -169,7 +169,7 @@ class SourceOutput:
 
         What has no rate is published for as long as anything else of its vehicle arrives.
         """
-        now = self._clock.now()
+        now = self._now()
         fresh = {
             address
             for address, stream in self._streams.items()
@@ -179,13 +179,8 @@ class SourceOutput:
         fresh |= {each for each in self._streams if each.vehicle in heard and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
-                _log.warning(
-                    "%s: %s is stale: nothing arrived for %.0f s",
-                    self._name,
-                    address,
-                    _STALE,
-                    extra=about("stale", address, source=self._name),
-                )
+                text = f"{address} is stale: nothing arrived for {_STALE:.0f} s"
+                _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         return bool(fresh)
 
@@ -195,13 +190,9 @@ class SourceOutput:
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
             self._warnings[where] = f"{where}: {reason}"
-            _log.warning(
-                "%s: %s: rejected: %s",
-                self._name,
-                where,
-                reason,
-                extra=about("rejected", rejection.address, source=self._name, reason=reason),
-            )
+            text = f"{where}: rejected: {reason}"
+            extra = about("rejected", rejection.address, source=self._name, reason=reason)
+            _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
             self._account.reject(rejection.address, reason, time.time())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
@@ -211,10 +202,8 @@ class SourceOutput:
         self.absence = absence
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
-            text = f"announced, and nothing arrives: {', '.join(new)}"
-            _log.warning(
-                "%s: %s; 'nedbus doctor' says more", self._name, text, extra=about("silent", source=self._name)
-            )
+            text = f"announced, and nothing arrives: {', '.join(new)}; 'nedbus doctor' says more"
+            _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
         """Publish again what has no rate of a vehicle that is back: it would not send it; not after a reboot."""
@@ -236,9 +225,8 @@ class SourceOutput:
                 _log.info("%s: %s is back", self._name, address, extra=about("back", address, source=self._name))
                 self.publish(replace(last, lost=0))
 
-    def _now(self) -> int:
-        """Return monotonic ns: rates and ages do not follow the wall clock."""
-        return round(self._clock.now() * 1e9)
+    def _now_ns(self) -> int:
+        return round(self._now() * 1e9)
 
     def _count_rejected(self, rule: str, count: int = 1) -> None:
         self.rejected += count
@@ -249,14 +237,9 @@ class SourceOutput:
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
             last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
-            _log.warning(
-                "%s: %s rejected: %s%s",
-                self._name,
-                message.address,
-                reason,
-                last,
-                extra=about("rejected", message.address, source=self._name, reason=reason),
-            )
+            text = f"{message.address} rejected: {reason}{last}"
+            extra = about("rejected", message.address, source=self._name, reason=reason)
+            _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
         self._account.reject(message.address, reason, time.time())
         self._registry.reject(message.address, report)

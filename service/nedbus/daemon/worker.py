@@ -1,30 +1,47 @@
-"""The states of one source: starting, waiting, running, retrying after a failure, done or failed."""
+"""A worker runs one source: replays messages when they are due, or listens to a vehicle, and retries after failures."""
 
 from __future__ import annotations
 
 import logging
+import threading
+import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Final
 
 from nedbus.client import PublisherRegistry
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import LiveSource, ReplayRun, ReplaySource, Source, SourceMessage
+from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source
 from nedbus.transport import Session
 
-from .clock import Clock
-from .live import listen
 from .output import SourceOutput
-from .replay import replay
 from .status import SourceMeasures, SourceStatus, State, StreamStatus
 
 _log = logging.getLogger(__name__)
 
 _BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a source that failed is started again
 _MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must not be read thousands of times a second
+_MAX_DELAY: Final = 1.0  # s: a replay that is later than this goes on from where it is, and does not hurry
+_STALE_POLL: Final = 0.5  # s between two checks for stale streams
+_READER_POLL: Final = 0.05  # s between two checks for a reader
 _MAX_STREAMS: Final = 100  # in a status: it must fit a message
-_POLL: Final = 0.05  # s between two checks for a reader
+
+
+class Clock:
+    """Monotonic time, and waiting that ends early when the worker is stopped; a test gives another one."""
+
+    def __init__(self) -> None:
+        self._event = threading.Event()
+        self.now = time.monotonic
+        self.stop = self._event.set
+        self.wait = self._event.wait
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the worker is to end."""
+        return self._event.is_set()
 
 
 class Worker:
@@ -54,12 +71,11 @@ class Worker:
         self._clock = clock
         self._retry = retry or isinstance(source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, clock, account)
+        self._output = SourceOutput(self._name, self.text, registry, clock.now, account)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._is_paced = isinstance(source, LiveSource) or source.speed is not None  # else it waits for its readers
         self._turn: float | None = None  # since when the loop is at one message; None while it may take any time
 
     @property
@@ -151,14 +167,7 @@ class Worker:
     def _run_once(self) -> None:
         try:
             if isinstance(self.source, LiveSource):
-                listen(
-                    self.source,
-                    self._output,
-                    router=self._router,
-                    on_state=self._set_state,
-                    on_turn=self._note_turn,
-                    clock=self._clock,
-                )
+                self._listen(self.source)
             else:
                 self._run_replay(self.source)
         finally:
@@ -177,23 +186,53 @@ class Worker:
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=source.speed is None)
         self._set_state("running")
-        replay(run, speed=source.speed, publish=self._publish, clock=self._clock, name=self._name)
+        start = self._clock.now()
+        for message in run.messages:
+            if source.speed is not None:
+                early = start + message.due / source.speed - self._clock.now()
+                if early < -_MAX_DELAY:
+                    extra = about("late", source=self._name)
+                    _log.warning("%s: %.1f s late, going on from here", self._name, -early, extra=extra)
+                    start -= early
+                elif early > 0:
+                    self._clock.wait(early)
+            if self._clock.stopped:
+                return
+            self._turn = None if source.speed is None else self._clock.now()  # else it waits for its readers
+            self._output.publish(message)
+            self._turn = None
+            self._done += 1
         self._error = run.damage
 
-    def _note_turn(self) -> None:
-        self._turn = self._clock.now()
-
-    def _publish(self, message: SourceMessage) -> None:
-        if self._is_paced:
-            self._note_turn()
-        self._output.publish(message)
-        self._turn = None
-        self._done += 1
+    def _listen(self, source: LiveSource) -> None:
+        """Publish what a live source delivers; it yields None several times a second while nothing arrives."""
+        with ExitStack() as closing:
+            items = source.listen(self._router)
+            closing.callback(getattr(items, "close", lambda: None))
+            next_poll = float("-inf")
+            for number, item in enumerate(items):
+                self._turn = self._clock.now()
+                if not number:
+                    self._set_state("waiting")
+                if self._clock.stopped:
+                    return
+                if isinstance(item, Rejection):
+                    self._output.reject(item)
+                elif isinstance(item, Absence):
+                    self._output.note(item)
+                elif item is not None:
+                    self._output.publish_live(item)
+                    self._set_state("running")
+                now = self._clock.now()
+                if now >= next_poll:
+                    next_poll = now + _STALE_POLL
+                    if not self._output.expire_stale():
+                        self._set_state("waiting")
 
     def _wait_for_reader(self, run: ReplayRun) -> None:
         self._state = "waiting"
         _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
-        while not self._registry.is_read(run.addresses) and not self._clock.wait(_POLL):
+        while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
             pass
 
     def _set_state(self, state: State) -> None:
@@ -204,15 +243,9 @@ class Worker:
     def _end(self, state: State) -> None:
         if not self._clock.stopped:
             self._state = state
-            output = self._output
-            _log.info(
-                "%s: %s, %d published, %d rejected",
-                self._name,
-                state,
-                output.published,
-                output.rejected,
-                extra=about("failed" if state == "failed" else "done", source=self._name, reason=self._error),
-            )
+            text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
+            event = "failed" if state == "failed" else "done"
+            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=self._error))
 
     def _fail(self, reason: str) -> None:
         """Note why it failed, and release all addresses: another source may need them meanwhile."""

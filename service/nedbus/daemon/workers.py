@@ -9,14 +9,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from nedbus.client import PublisherRegistry
-from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.transport import Session
 
-from .clock import SystemClock
 from .plan import Planned
-from .worker import Worker
+from .worker import Clock, Worker
 
 _log = logging.getLogger(__name__)
 
@@ -27,25 +23,18 @@ _GRACE: Final = 5.0  # s that a source which is gone from the configuration has 
 class _Running:
     planned: Planned
     worker: Worker
-    stop: threading.Event
+    clock: Clock
     thread: threading.Thread
 
 
 class Workers:
-    """Run what is planned; `router` is what the service's router lends, `on_end` is called when a worker has ended.
+    """Run the sources of a plan; `make_worker` makes the worker of one, stopped by a clock.
 
     Not thread-safe, but for reading `workers`.
     """
 
-    def __init__(
-        self, registry: PublisherRegistry, *, router: Session | None, account: Account, retry: bool,
-        on_end: Callable[[], object],
-    ) -> None:  # fmt: skip
-        self._registry = registry
-        self._router = router
-        self._account = account
-        self._retry = retry
-        self._on_end = on_end
+    def __init__(self, make_worker: Callable[[Planned, Clock], Worker]) -> None:
+        self._make_worker = make_worker
         self._running: tuple[_Running, ...] = ()
 
     @property
@@ -68,31 +57,22 @@ class Workers:
         return started, len(left), len(plan) - started
 
     def end(self, grace: float) -> None:
-        """Let all end, and wait for them for so many seconds."""
+        """Stop all workers and wait up to `grace` seconds."""
         for each in self._running:
-            each.stop.set()
+            each.clock.stop()
         deadline = time.monotonic() + grace
         for each in self._running:
             each.thread.join(max(0.0, deadline - time.monotonic()))
 
     def _start(self, planned: Planned) -> _Running:
-        stop = threading.Event()
-        worker = Worker(
-            planned.text,
-            planned.source,
-            self._registry,
-            router=self._router,
-            clock=SystemClock(stop),
-            account=self._account,
-            retry=self._retry,
-            on_end=self._on_end,
-        )
+        clock = Clock()
+        worker = self._make_worker(planned, clock)
         thread = threading.Thread(target=worker.run, name=worker.text, daemon=True)
         thread.start()
-        return _Running(planned, worker, stop, thread)
+        return _Running(planned, worker, clock, thread)
 
     def _stop(self, gone: Sequence[_Running]) -> None:
-        """Let these end, and wait a while: giving an address back may take as long as its slowest reader."""
+        """Stop these workers and wait a while: giving an address back may take as long as its slowest reader."""
         retiring = [threading.Thread(target=_retire, args=[each], name="nedbus-retire", daemon=True) for each in gone]
         for thread in retiring:
             thread.start()
@@ -100,16 +80,13 @@ class Workers:
         for each, thread in zip(gone, retiring, strict=True):
             thread.join(max(0.0, deadline - time.monotonic()))
             if thread.is_alive():
-                _log.warning(
-                    "%s: does not end, perhaps because of a slow reader; it goes on until then",
-                    each.worker.text,
-                    extra=about("reload"),
-                )
+                text = "%s: does not end, perhaps because of a slow reader; it goes on until then"
+                _log.warning(text, each.worker.text, extra=about("reload"))
 
 
 def _retire(running: _Running) -> None:
-    """Let a source end, and publish it no more."""
-    running.stop.set()
+    """Stop a source, and withdraw its addresses."""
+    running.clock.stop()
     running.thread.join()
     running.worker.withdraw()
     _log.info("%s: ended, as it is not configured any more", running.worker.text, extra=about("reload"))

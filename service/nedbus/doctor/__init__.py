@@ -1,6 +1,7 @@
-"""What a person asks when nothing arrives: checks of settings, routers, certificates, permissions, vehicles, clocks."""
+"""The doctor: checks of settings, routers, certificates, permissions, vehicles and clocks, when nothing arrives."""
 
+from .check import check_router_file, check_service
 from .examination import examine
-from .finding import STATES, Finding, State, worst_state
+from .finding import Finding, State, worst_state
 
-__all__ = ["STATES", "Finding", "State", "examine", "worst_state"]
+__all__ = ["Finding", "State", "check_router_file", "check_service", "examine", "worst_state"]

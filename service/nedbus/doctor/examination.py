@@ -1,86 +1,126 @@
-"""The examination: all checks, in an order in which each knows what it needs, with deadlines."""
+"""The examination: all checks, in an order in which each has what it needs, with a time limit for each."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from nedbus.errors import ConfigError
+from nedbus.errors import NedbusError
 from nedbus.extras import needs
 from nedbus.settings import Settings
 from nedbus.sources import check_link
-from nedbus.transport import Tls
+from nedbus.transport import Tls, open_client, probe_writes
 
-from .configuration import check_settings
-from .endpoint import answers, check_endpoint
-from .finding import Finding, sort_findings
-from .network import check_network
-from .observation import LISTEN
-from .parallel import run_together
-from .validity import check_own_files
+from .check import check_sources
+from .finding import Finding, limit_findings, sort_findings
+from .network import check_clocks, check_other_keys, check_permissions, check_routers, check_vehicles
+from .observation import Observation
+from .prober import check_endpoint, check_tls_files
+from .services import check_services
 
-_WAY: Final = 9.0  # s for the way to all routers, side by side
-_NETWORK: Final = 12.0  # s for what is found behind one
+Check = Callable[[], Iterable[Finding]]
+NETWORK_CHECKS: Final[tuple[Callable[[Observation], Iterable[Finding]], ...]] = (
+    check_routers,
+    check_permissions,
+    check_services,
+    check_vehicles,
+    check_clocks,
+    check_other_keys,
+)
+"""The checks of what is seen behind a router; those before it are called in `examine`."""
+
+_LISTEN: Final = 3.0  # s
+_ENDPOINTS_TIMEOUT: Final = 9.0  # s for all checks before a router is joined, side by side
+_NETWORK_TIMEOUT: Final = 12.0  # s
+_OPEN_TIMEOUT: Final = 1.5  # s
 _MAX_ROUTERS: Final = 8
 
 
 def examine(
-    settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None, listen: float = LISTEN
+    settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None, listen: float = _LISTEN
 ) -> list[Finding]:
-    """Return all that is found with these settings, the worst last; within 10 s where nothing answers.
+    """Return the findings of all checks with these settings, the worst last; within 10 s where nothing answers.
 
     `version` is that of this nedbus; `vehicle` is probed for whether it may be written; `mavlink` is a link to listen
-    to, such as `udpin:0.0.0.0:14550`; `listen`: for how many seconds messages and packets are awaited.
+    to, such as `udpin:0.0.0.0:14550`; `listen`: seconds for which messages and packets are awaited.
 
     Raises ConfigError for a link that is invalid.
     """
+    tls_findings, tls = check_tls_files(settings)
+    findings = [*_describe_settings(settings), *(finding for _, finding in tls_findings)]
+    checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
     if mavlink is not None:
         check_link(mavlink)
-    findings = list(check_settings(settings))
-    try:
-        tls, broken = settings.tls, False
-    except ConfigError as exc:
-        findings.append(Finding("certificate", "", "wrong", exc.reason, "see docs/security.md"))
-        tls, broken = None, True
-    if tls is not None:
-        own = list(check_own_files(tls))
-        findings += own
-        broken = any(each.state == "wrong" and not each.subject for each in own)
-    checks = {
-        "network": partial(
-            _examine_routers, settings, None if broken else tls, version=version, vehicle=vehicle, listen=listen
-        )
-    }
-    if mavlink is not None:
-        checks["mavlink"] = partial(_examine_link, mavlink, listen)
-    return sort_findings([*findings, *run_together(checks, _WAY + _NETWORK)])
+        checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink, listen)
+    for endpoint in settings.routers[:_MAX_ROUTERS]:
+        checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
+    findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
+    answering = [each.subject for each in findings if (each.check, each.state) == ("endpoint", "ok")]
+    if answering:
+        for index, each in enumerate(findings):  # one router is joined: no other one is a reason for silence
+            if each.check == "endpoint" and each.state == "wrong":
+                findings[index] = replace(each, state="warning")
+        seen = Observation(settings.prefix, version, vehicle, has_tls=tls is not None)
+        checks = {("network", ""): partial(check_network, seen, answering[0], tls, listen)}
+        findings += _run_together(checks, _NETWORK_TIMEOUT)
+    return sort_findings(findings)
 
 
-def _examine_routers(
-    settings: Settings, tls: Tls | None, *, version: str, vehicle: str | None, listen: float
-) -> Sequence[Finding]:
-    routers = settings.routers[:_MAX_ROUTERS]
-    findings = run_together({each: partial(check_endpoint, each, tls) for each in routers}, _WAY)
-    good = [endpoint for endpoint in routers if answers(endpoint, findings)]
-    if not good:
-        return findings
-    if len(routers) > 1:  # joined is one of them: that others do not answer is no reason for silence
-        findings = [_lessen(each) for each in findings]
-    check = partial(check_network, good, tls, prefix=settings.prefix, version=version, vehicle=vehicle, listen=listen)
-    return [*findings, *run_together({"network": check}, _NETWORK)]
+def _describe_settings(settings: Settings) -> Iterator[Finding]:
+    """Yield the routers to join and the other settings, with the flag, variable or file that sets each."""
+    set_by = {name: settings.set_by(name) for name in Settings.model_fields if settings.set_by(name)}
+    setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in set_by.items()}
+    setter = next((setters[name] for name in ("connect", "listen", "router_config") if name in setters), "")
+    text = f"set by {setter}" if setter else "the default: nothing sets connect"
+    advice = "" if setter else "a router on another host is named with --connect, NEDBUS_CONNECT or in nedbus.toml"
+    yield Finding("settings", "connect", "ok", f"{' or '.join(settings.routers)}, {text}", advice)
+    if others := ", ".join(f"{name} by {setter}" for name, setter in setters.items() if name != "connect"):
+        yield Finding("settings", "others", "ok", f"set: {others}")
 
 
-def _lessen(finding: Finding) -> Finding:
-    if finding.check != "endpoint" or finding.state != "wrong":
-        return finding
-    return Finding(finding.check, finding.subject, "warning", finding.seen, finding.advice)
+def _check_sources(settings: Settings) -> Iterator[Finding]:
+    """Yield the mistakes in the sources, in the words of `nedbus check`."""
+    for mistake in check_sources(settings, settings.routers) if settings.source else ():
+        yield Finding("settings", mistake.where, "wrong", mistake.reason, "correct it, then start the service again")
 
 
-def _examine_link(link: str, listen: float) -> Sequence[Finding]:
-    try:
-        module = needs("mavlink", "nedbus.doctor.mavlink")
-    except ConfigError as exc:
-        return [Finding("mavlink", link, "wrong", f"{exc.where} is missing", exc.reason)]
-    found: Sequence[Finding] = module.check_mavlink(link, listen=listen)
-    return found
+def check_network(seen: Observation, router: str, tls: Tls | None, listen: float) -> Iterator[Finding]:
+    """Join a router, observe the network behind it, and yield the findings of `NETWORK_CHECKS`."""
+    with open_client([router], timeout=_OPEN_TIMEOUT, tls=tls) as session:
+        if seen.vehicle is not None:
+            with open_client([router], timeout=_OPEN_TIMEOUT, tls=tls) as writer:
+                seen.verdict = probe_writes(session, writer, [seen.vehicle], prefix=seen.prefix)[seen.vehicle]
+        seen.observe(session, listen=listen)
+    for check in NETWORK_CHECKS:
+        yield from limit_findings(check(seen))
+
+
+def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> list[Finding]:
+    """Run checks, by name and subject, each in a thread, and return their findings, in the order of the checks.
+
+    A check that fails, or takes longer, is a finding itself; its thread ends with its own timeouts.
+    """
+    found: dict[tuple[str, str], list[Finding]] = {}
+
+    def run(name: tuple[str, str], check: Check) -> None:
+        try:
+            found[name] = list(check())
+        except (NedbusError, OSError) as exc:
+            found[name] = [Finding(*name, "wrong", f"could not be examined: {exc}")]
+
+    threads = [
+        threading.Thread(target=run, args=each, name=f"nedbus-{each[0][0]}", daemon=True) for each in checks.items()
+    ]
+    end = time.monotonic() + seconds
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(max(0.0, end - time.monotonic()))
+    late, advice = f"no result within {seconds:g} s", "try again; if it stays so, a name server may not answer"
+    for name in checks:
+        found.setdefault(name, [Finding(*name, "wrong" if name[0] == "endpoint" else "unknown", late, advice)])
+    return [each for name in checks for each in found[name]]

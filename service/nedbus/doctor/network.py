@@ -1,57 +1,186 @@
-"""What is found through a router that answers: permissions, services, vehicles, clocks, other keys."""
+"""Checks of the network behind a router: its sessions, permissions, vehicles, clocks, messages under other keys."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from typing import Final
 
-from nedbus.transport import RouterState, Tls, open_client, probe_writes
+from nedbus.events import merge_vehicles, to_age
+from nedbus_msgs import Address, get_topic
 
-from .clocks import check_clocks
-from .finding import Finding, limit_findings
-from .observation import Observation, observe
-from .other_keys import check_other_keys
-from .permissions import check_permissions
-from .services import check_services
-from .vehicles import check_vehicles
+from .finding import Finding, State, brief, list_names
+from .observation import Observation
+from .services import has_source, reported
 
-_OPEN = 1.5  # s
-_NEARLY_FULL = 0.8  # of the sessions that a router accepts
-
-
-def check_network(
-    routers: Sequence[str], tls: Tls | None, *, prefix: str, version: str, vehicle: str | None, listen: float
-) -> list[Finding]:
-    """Join the first of these routers, which all answer, and return what is found there."""
-    with open_client(routers[:1], timeout=_OPEN, tls=tls) as session:
-        verdict = None
-        if vehicle is not None:
-            with open_client(routers[:1], timeout=_OPEN, tls=tls) as writer:
-                verdict = probe_writes(session, writer, [vehicle], prefix=prefix)[vehicle]
-        seen = observe(session, prefix=prefix, listen=listen)
-    groups = (
-        _count(seen),
-        check_permissions(seen, vehicle, verdict),
-        check_services(seen, version=version),
-        check_vehicles(seen, vehicle, writes_only=verdict == "allowed" and tls is not None),
-        check_clocks(seen),
-        check_other_keys(seen),
-    )
-    return [finding for group in groups for finding in limit_findings(list(group))]
+_NEARLY_FULL: Final = 0.8  # of the sessions that a router accepts
+_ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
+_MAX_TEXT: Final = 300  # characters of a text from a peer
+_SILENT_PERIODS: Final = 3.0  # of a topic, without a message
+_CLOCK_WARNING: Final = 0.5  # s
+_CLOCK_WRONG: Final = 5.0  # s
+_SYNCHRONISE: Final = "run NTP or PTP on both hosts: 'timedatectl' says whether a clock is synchronised"
 
 
-def _count(seen: Observation) -> list[Finding]:
+def check_routers(seen: Observation) -> Iterator[Finding]:
+    """Yield the number of sessions of each router, and whether it is nearly full."""
     if not seen.routers:
-        return [Finding("router", "", "ok", "joined; who else is connected this client is not told")]
-    return [_judge(router) for router in seen.routers]
+        yield Finding("router", "", "ok", "joined; who else is connected this client is not told")
+    for router in seen.routers:
+        text = f"sessions that are connected: {router.sessions:,}"
+        if router.max_sessions is not None:
+            text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
+        is_nearly_full = router.load is not None and router.load >= _NEARLY_FULL
+        advice = "raise max_sessions and its limit of open files, or run a second router: docs/hosts.md"
+        state: State = "warning" if is_nearly_full else "ok"
+        yield Finding("router", router.zid, state, text, advice if is_nearly_full else "")
 
 
-def _judge(router: RouterState) -> Finding:
-    if router.load is None:
-        return Finding("router", router.zid, "ok", f"sessions that are connected: {router.sessions:,}")
-    seen = f"{router.sessions:,} of {router.max_sessions:,} sessions"
-    if router.load < _NEARLY_FULL:
-        return Finding("router", router.zid, "ok", seen)
-    advice = (
-        "raise max_sessions in its configuration, and how many files it may open, or run a second router: docs/hosts.md"
-    )
-    return Finding("router", router.zid, "warning", seen, advice)
+def check_permissions(seen: Observation) -> Iterator[Finding]:
+    """Yield whether this client may read, by the messages that arrive, and may write a vehicle, by a probe."""
+    reading = _check_reading(seen)
+    yield reading
+    vehicle = seen.vehicle
+    if vehicle is None:
+        advice = "with --vehicle it is: 'nedbus doctor --vehicle 1'"
+        yield Finding("write", "", "unknown", "whether a vehicle may be written is not probed", advice)
+    elif seen.verdict == "allowed":
+        yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe came back")
+    elif seen.verdict == "denied":  # no fault of a reader
+        state: State = "warning" if reading.state == "unknown" else "ok" if reading.state == "ok" else "wrong"
+        text = f"the router drops what this client publishes as vehicle {vehicle}, without an error"
+        advice = f"a reader needs no more; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
+        yield Finding("write", vehicle, state, text, advice)
+    else:
+        text = f"cannot be told: the router does not let this client read a probe of vehicle {vehicle}"
+        advice = f"allow {seen.prefix}/*/@doctor/* as config/router-secure.json5 does, or look from a reader"
+        yield Finding("write", vehicle, "unknown", text, advice)
+
+
+def _check_reading(seen: Observation) -> Finding:
+    if any(stream.address is not None for stream in seen.streams.values()) or seen.ages:
+        return Finding("read", "", "ok", "this client may read: messages arrive")
+    published = sorted({address for service in seen.services for address in reported(service)})
+    if not published:
+        return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
+    text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"
+    if seen.verdict == "allowed":
+        advice = "a vehicle's certificate is for writing: look with that of a reader"
+        return Finding("read", "", "warning", text, advice)
+    advice = f"may those services write these vehicles, and may this client read? {_ACCESS_RULES}"
+    return Finding("read", "", "wrong", text, advice)
+
+
+def check_vehicles(seen: Observation) -> Iterator[Finding]:
+    """Yield the findings on the addresses of all vehicles, or of one."""
+    vehicle = seen.vehicle
+    arrived = {stream.address for stream in seen.streams.values() if stream.address is not None}
+    known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
+    for address in known:
+        yield from _check_address(seen, address, flows=address in arrived)
+    yield from _check_states(seen)
+    hidden = sorted({each for service in seen.services for each in reported(service)} - set(map(str, known)))
+    hidden = [each for each in hidden if vehicle in (None, each.partition("/")[0])]
+    for each in hidden if seen.streams or seen.ages else ():  # else nothing at all may be read
+        advice = "may that service write this vehicle? a router drops what its rules do not allow: docs/security.md"
+        yield Finding("vehicle", each, "wrong", "a service says that it publishes it, and nothing arrives", advice)
+    if flowing := [address for address in known if address in arrived]:
+        vehicles = {address.vehicle for address in flowing}
+        yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
+    if not known and not hidden:
+        yield _explain_absence(seen)
+
+
+def _explain_absence(seen: Observation) -> Finding:
+    if seen.has_tls and seen.verdict == "allowed" and not (seen.alive or seen.streams or seen.ages):
+        advice = "a vehicle's certificate is for writing: look with that of a reader"
+        return Finding("vehicle", seen.vehicle or "", "unknown", "this client sees no vehicle at all", advice)
+    advice = "start its source: 'nedbus serve --source ...'"
+    if seen.services:
+        advice = "a service answers: what is said of its sources is the reason, or they publish other vehicles"
+    if seen.vehicle is None:
+        return Finding("vehicle", "", "warning", f"no vehicle is seen under {seen.prefix}/", advice)
+    return Finding("vehicle", seen.vehicle, "wrong", f"it is not seen under {seen.prefix}/", advice)
+
+
+def _check_states(seen: Observation) -> Iterator[Finding]:
+    """Yield the vehicles that services know to be bad, or to be watched."""
+    for name, (now, told) in sorted(merge_vehicles(seen.accounts).items()):
+        if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
+            continue
+        state: State = "wrong" if told.severity == "bad" else "warning"
+        advice = f"'nedbus why --vehicle {name}' says what preceded it"
+        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{told.since_text(now)}", advice)
+
+
+def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
+    name, key = str(address), address.key(prefix=seen.prefix)
+    stream = seen.streams.get(key)
+    age, rate = seen.ages.get(address), get_topic(address.topic).rate
+    if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
+        last = "it has sent nothing yet" if address not in seen.ages else "its last message has no timestamp"
+        if age is not None:
+            last = f"its last message is {to_age(age)} old"
+        advice = "its publisher runs: look at what it reads, the source of a service or the loop of a script"
+        state: State = "wrong" if address in seen.ages else "warning"  # of a replay some begin later
+        yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
+    if stream is not None and stream.error:
+        advice = "who publishes this key, and is it nedbus? a newer layout needs a newer nedbus here"
+        yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:_MAX_TEXT]}", advice)
+    beating = len(seen.publishers.get(key, ()))
+    sending = max(len(stream.publishers), len(stream.clocks)) if stream is not None else 0
+    if max(beating, sending) > 1:
+        advice = "their messages alternate for every reader: give one of the two another --vehicle, or stop it"
+        yield Finding("vehicle", name, "wrong", f"{max(beating, sending)} publishers of this address", advice)
+
+
+def check_clocks(seen: Observation) -> Iterator[Finding]:
+    """Yield the clocks that are off; where all others agree and this host's does not, it is this host's."""
+    clocks = {  # how far each is ahead of ours, and how well that is known [s]
+        f"service {brief(service.text('service'))} on {brief(service.text('host'))}": (service.offset, service.error)
+        for service in seen.services
+        if service.offset is not None
+    }
+    for stream in seen.streams.values():
+        if stream.address is not None and stream.delay is not None:
+            error = 0.0 if stream.delay < 0 else _CLOCK_WARNING  # the network delays messages, too
+            clocks[f"publisher of {stream.address}"] = (-stream.delay, error)
+    off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
+    if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:
+        middle = sorted(off.values())[len(off) // 2]
+        others = f"{len(off)} others, which agree with each other"
+        yield _judge_clock("this host", "this host's clock", -middle, others, _SYNCHRONISE)
+        return
+    blame = "the others agree with this host: set its clock."
+    if len(clocks) == len(off):
+        blame = "which of the two is off cannot be told from here."
+    for name, offset in off.items():
+        yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
+    if clocks and not off:
+        largest = max(abs(offset) for offset, _ in clocks.values())
+        yield Finding("clock", "", "ok", f"{len(clocks)} clocks agree with this host's to {to_age(largest)}")
+
+
+def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:
+    text = f"{clock} is {to_age(abs(offset))} {'ahead of' if offset > 0 else 'behind'} {reference}"
+    return Finding("clock", name, "wrong" if abs(offset) > _CLOCK_WRONG else "warning", text, advice)
+
+
+def check_other_keys(seen: Observation) -> Iterator[Finding]:
+    """Yield the prefixes and the topics of ROS 2 that readers of this prefix do not receive."""
+    prefixes = sorted({prefix for key in seen.elsewhere if (prefix := _prefix_of(key))})
+    for prefix in prefixes[:5]:
+        advice = f"to read them: --prefix {prefix}, or NEDBUS_PREFIX={prefix}; else give their publisher our prefix"
+        text = f"messages are published under {prefix}/, and this looks under {seen.prefix}/"
+        yield Finding("prefix", prefix, "warning", text, advice)
+    if seen.ros2 and not has_source(seen, "px4-zenoh"):
+        topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
+        advice = "'nedbus serve --source px4-zenoh:' bridges them"
+        yield Finding("ros2", "", "warning", f"ROS 2 or a PX4 publishes {topics}, and no service bridges it", advice)
+
+
+def _prefix_of(key: str) -> str:
+    """Return the prefix of a key of nedbus: the chunks before vehicle and topic."""
+    vehicle, alive, _ = key.partition("/@alive/")
+    before = vehicle.split("/")[: -1 if alive else -2]
+    # `<domain>/fmu/out/vehicle_local_position` and the like belong to ROS 2.
+    return "" if not before or before[0].isdecimal() else "/".join(before)

@@ -1,63 +1,55 @@
-"""What is seen of a network in a few seconds: services, tokens, streams, routers; judged elsewhere."""
+"""Observe a network for a few seconds: services, tokens, messages, routers; the checks judge it."""
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Final
+from typing import Final, TypeVar, cast
 
-from nedbus.client import find_accounts
+import zenoh
+
+from nedbus.client import find_accounts, find_services
 from nedbus.events import AccountReport
 from nedbus.transport import (
     PublisherToken,
     RawSample,
     RouterState,
     Session,
+    Verdict,
     alive_keys,
     ask_routers,
+    entity_name,
     follow_heartbeats,
     px4_publishers_key_expr,
     query,
+    while_open,
 )
-from nedbus_msgs import (
-    ANY,
-    DEFAULT_TOPIC,
-    Address,
-    AddressError,
-    DecodeError,
-    address_of_alive_key,
-    alive_key_expr,
-    status_key,
-)
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, address_of_alive_key, alive_key_expr, codec_of
 
-from .traffic import Stream, Traffic
+T = TypeVar("T")
 
-LISTEN: Final = 3.0
-"""Seconds for which the doctor listens, unless it is told otherwise."""
-
-_LEAST: Final = 1.0  # s of them after all questions, for what is measured at its arrival
-
-_TICK: Final = 0.02  # s until what arrived is looked at: it makes a message look that much older
-_TIMEOUT: Final = 1.0  # s of a query
-_MAX_ANSWER: Final = 2**18  # bytes of a status that is read
-_MAX_TIME: Final = 1e11  # s since the epoch that a service may say it is
-_CLOCKS: Final = 2.0  # s after which no further service is asked for its clock
-_MAX_KEYS: Final = 10_000  # whose publishers are told apart
-_MAX_SERVICES: Final = 20  # that are looked at: any peer may claim to be a service
+_MIN_LISTEN: Final = 1.0  # s after all queries, for the delay of messages
+_POLL: Final = 0.02  # s; it makes a message look that much older
+_QUERY_TIMEOUT: Final = 1.0  # s
+_MAX_TIME: Final = 1e11  # s since the epoch that a service may report
+_MAX_SERVICES: Final = 20  # any peer may claim to be a service
+_MAX_PUBLISHER_KEYS: Final = 10_000
+_MAX_STREAMS: Final = 2000
+_MAX_KEY_LENGTH: Final = 1024
+_MAX_PUBLISHERS: Final = 8  # of each key
+_RING: Final = 16_384  # samples of a subscription that wait
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """The status of a service as it reports it, and what its clock says: ahead of ours by `offset` +- `error` [s]."""
+    """The status of a service as it reports it, and its clock: ahead of ours by `offset` +- `error` [s]."""
 
-    key: str
     status: Mapping[str, object]
-    offset: float | None = None
-    error: float = 0.0
+    offset: float | None
+    error: float
 
     @property
     def sources(self) -> list[Mapping[str, object]]:
@@ -72,17 +64,53 @@ class Service:
 
 
 @dataclass(slots=True)
-class Observation:
-    """What was seen.
+class Stream:
+    """The messages on one key.
 
+    `delay`: the least time from sent to received, by the clocks of both hosts [s], None without timestamps.
+    `clocks`: the clocks that stamped them; `publishers`: their publishers, where they say so.
+    `error`: why the last one that cannot be decoded cannot.
+    """
+
+    address: Address | None
+    delay: float | None = None
+    clocks: set[str] = field(default_factory=set)
+    publishers: set[str] = field(default_factory=set)
+    error: str = ""
+
+    def add(self, sample: RawSample) -> None:
+        """Add a message that has just arrived."""
+        age, stamp, info = _age_of(sample), sample.timestamp, sample.source_info
+        if age is not None:
+            self.delay = age if self.delay is None else min(age, self.delay)
+        if stamp is not None and len(self.clocks) < _MAX_PUBLISHERS:
+            self.clocks.add(str(stamp.get_id()))
+        if info is not None and len(self.publishers) < _MAX_PUBLISHERS:
+            self.publishers.add(entity_name(info.source_id))
+        definition = BY_TOPIC.get(self.address.topic) if self.address is not None else None
+        if definition is not None and sample.kind == zenoh.SampleKind.PUT:
+            try:
+                codec_of(definition).decode(sample.payload.to_bytes())
+            except DecodeError as exc:
+                self.error = str(exc)
+
+
+@dataclass(slots=True)
+class Observation:
+    """A network as this client sees it, and what the doctor was asked for.
+
+    `version`: of this nedbus; `vehicle`: the one to look at, None for all; `verdict`: whether it may be written.
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
-    `streams`: what arrived, by key; `publishers`: those whose heartbeats came, by key.
+    `streams`: messages by key; `publishers`: those whose heartbeats came, by key; `listened`: for how long [s].
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
-    `routers`: those that tell this client of their sessions; `listened`: for how long streams were [s].
-    `accounts`: what services remember of vehicles.
+    `routers`: those that tell this client of their sessions; `accounts`: vehicles as services remember them.
     """
 
     prefix: str
+    version: str
+    vehicle: str | None
+    has_tls: bool
+    verdict: Verdict | None = None
     services: list[Service] = field(default_factory=list)
     accounts: list[AccountReport] = field(default_factory=list)
     alive: list[Address] = field(default_factory=list)
@@ -94,109 +122,87 @@ class Observation:
     routers: list[RouterState] = field(default_factory=list)
     listened: float = 0.0
 
-
-def observe(session: Session, *, prefix: str, listen: float) -> Observation:
-    """Listen and ask, for little more than `listen` seconds."""
-    seen = Observation(prefix)
-    start = time.monotonic()
-    end = start + listen
-    with ExitStack() as closing:
-        here, anywhere = (
-            Traffic(session, key_expr, prefix=prefix) for key_expr in (f"{prefix}/*/**", f"**/{DEFAULT_TOPIC}/**")
-        )
-        closing.callback(here.close)
-        closing.callback(anywhere.close)
-        take_heartbeats, end_heartbeats = follow_heartbeats(session, f"{prefix}/*/**")
-        closing.callback(end_heartbeats)
-        seen.routers = ask_routers(session, timeout=_TIMEOUT)
-        for service in _services(session, prefix):
-            in_time = time.monotonic() < start + _CLOCKS
-            seen.services.append(_with_clock(session, service) if in_time else service)
-        seen.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_TIMEOUT)
-        seen.alive = _alive(session, prefix)
-        seen.ros2 = _ros2_publishers(session)
-        seen.ages = _ages(session, prefix)
-        seen.elsewhere = {
-            key
-            for key in alive_keys(session, "**/@alive/**", timeout=_TIMEOUT)
-            if not key.startswith(f"{prefix}/") and not key.startswith("@")
-        }
-        here.take()
-        for stream in here.streams.values():
+    def observe(self, session: Session, *, listen: float) -> None:
+        """Listen and ask, for little more than `listen` seconds."""
+        prefix, start = self.prefix, time.monotonic()
+        take_messages = _subscribe(session, f"{prefix}/*/**")
+        take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
+        take_heartbeats, _ = follow_heartbeats(session, f"{prefix}/*/**")
+        self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
+        self.services = _ask_services(session, prefix)
+        self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
+        tokens = alive_keys(session, alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
+        tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
+        publishers = _parse_each(PublisherToken.parse, tokens)
+        self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
+        kept = query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT)
+        self.ages = {each: _age_of(sample) for sample in kept if (each := _address_of(str(sample.key_expr), prefix))}
+        tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
+        others = {key for key in tokens if not key.startswith("@")}
+        self._add_messages(take_messages())
+        for stream in self.streams.values():
             stream.delay = None  # these have waited for the queries above, and are older than they look
-        end = max(end, time.monotonic() + _LEAST)
+        end = max(start + listen, time.monotonic() + _MIN_LISTEN)
         while time.monotonic() < end:
-            time.sleep(_TICK)
-            here.take()
-            anywhere.take()
+            time.sleep(_POLL)
+            self._add_messages(take_messages())
+            for sample in take_others():
+                key = str(sample.key_expr)
+                if len(others) < _MAX_STREAMS and len(key) < _MAX_KEY_LENGTH and key.endswith(f"/{DEFAULT_TOPIC}"):
+                    others.add(key)
             for key, publisher in take_heartbeats():
-                if key in seen.publishers or len(seen.publishers) < _MAX_KEYS:
-                    seen.publishers.setdefault(key, set()).add(publisher)
-    seen.streams = here.streams
-    seen.listened = time.monotonic() - start
-    seen.elsewhere |= {
-        key for key in anywhere.streams if not key.startswith(f"{prefix}/") and key.endswith(f"/{DEFAULT_TOPIC}")
-    }
-    return seen
+                if key in self.publishers or len(self.publishers) < _MAX_PUBLISHER_KEYS:
+                    self.publishers.setdefault(key, set()).add(publisher)
+        self.listened = time.monotonic() - start
+        self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
+
+    def _add_messages(self, samples: Iterable[RawSample]) -> None:
+        for sample in samples:
+            key = str(sample.key_expr)
+            if key not in self.streams:
+                if len(self.streams) >= _MAX_STREAMS or len(key) > _MAX_KEY_LENGTH:
+                    continue
+                self.streams[key] = Stream(_address_of(key, self.prefix))
+            self.streams[key].add(sample)
 
 
-def _services(session: Session, prefix: str) -> list[Service]:
-    answers = query(session, status_key(ANY, prefix=prefix), timeout=_TIMEOUT)
-    return list(islice(filter(None, map(_service, answers)), _MAX_SERVICES))
+def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
+    """Return a function that takes the samples that have arrived, at most a full ring; dropping it ends the stream."""
+    channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
+    with while_open():
+        subscriber = session.declare_subscriber(key_expr, channel)
+    return lambda: islice(iter(subscriber.handler.try_recv, None), _RING)
 
 
-def _service(answer: RawSample) -> Service | None:
-    if len(answer.payload) > _MAX_ANSWER:
-        return None
-    try:
-        status = json.loads(answer.payload.to_bytes())
-    except (ValueError, RecursionError):
-        return None
-    return Service(str(answer.key_expr), status) if isinstance(status, dict) else None
-
-
-def _with_clock(session: Session, service: Service) -> Service:
-    """Ask a service alone, so that the round trip is its own; its clock was read in the middle of it."""
+def _ask_services(session: Session, prefix: str) -> list[Service]:
+    """Return the services that answer; they read their clocks within the round trip."""
     before = time.time()
-    answer = next(map(_service, query(session, service.key, timeout=_TIMEOUT)), None)
-    after = time.time()
-    now = answer.status.get("now") if answer is not None else None
-    if answer is None or not isinstance(now, int | float) or not abs(now) < _MAX_TIME:  # nor is NaN
-        return service
-    return Service(service.key, answer.status, now - (before + after) / 2, (after - before) / 2)
+    statuses = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)
+    error = (time.time() - before) / 2
+    services = []
+    for status in statuses[:_MAX_SERVICES]:
+        now = status.get("now")
+        is_time = isinstance(now, int | float) and abs(now) < _MAX_TIME  # NaN is not
+        services.append(Service(status, cast("float", now) - before - error if is_time else None, error))
+    return services
 
 
-def _alive(session: Session, prefix: str) -> list[Address]:
-    addresses = []
-    for key in alive_keys(session, alive_key_expr(prefix=prefix), timeout=_TIMEOUT):
-        try:
-            addresses.append(address_of_alive_key(key, prefix=prefix))
-        except AddressError:
-            continue
-    return addresses
+def _age_of(sample: RawSample) -> float | None:
+    """Return the age of a sample by the clock of its publisher [s], None without a timestamp."""
+    stamp = sample.timestamp
+    return None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
 
-def _ros2_publishers(session: Session) -> list[PublisherToken]:
-    """Return the publishers of ROS 2's keys with this message, other than our own bridge."""
-    found = []
-    for text in alive_keys(session, px4_publishers_key_expr(None), timeout=_TIMEOUT):
-        try:
-            token = PublisherToken.parse(text)
-        except DecodeError:
-            continue
-        if not token.node.startswith("nedbus_"):
-            found.append(token)
-    return found
+def _address_of(key: str, prefix: str) -> Address | None:
+    found = _parse_each(lambda key: Address.from_key(key, prefix=prefix), [key])
+    return found[0] if found else None
 
 
-def _ages(session: Session, prefix: str) -> dict[Address, float | None]:
-    """Return how old the last message of each address is that is still answered with; None without a timestamp."""
-    ages: dict[Address, float | None] = {}
-    for answer in query(session, f"{prefix}/*/**", timeout=_TIMEOUT):
-        try:
-            address = Address.from_key(str(answer.key_expr), prefix=prefix)
-        except AddressError:
-            continue
-        stamp = answer.timestamp
-        ages[address] = None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
-    return ages
+def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
+    """Return what these keys are, without those that cannot be parsed."""
+    parsed = []
+    for key in keys:
+        with suppress(ValueError):  # AddressError or DecodeError
+            parsed.append(parse(key))
+    return parsed

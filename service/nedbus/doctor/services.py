@@ -1,4 +1,4 @@
-"""What services report of themselves: sources that fail, that wait, that lost their vehicle, that reject messages."""
+"""Checks of services by their status: version, sources that fail, wait, lost their vehicle, or reject messages."""
 
 from __future__ import annotations
 
@@ -8,25 +8,23 @@ from typing import Final
 from .finding import Finding, brief, list_names
 from .observation import Observation, Service
 
-_MAX_REASON: Final = 300  # characters of an error that a peer reports
+_MAX_ERROR_LENGTH: Final = 300
 
 
-def check_services(seen: Observation, *, version: str) -> Iterator[Finding]:
-    """Yield what is found of each service, of its version and of its sources."""
+def check_services(seen: Observation) -> Iterator[Finding]:
+    """Yield the findings on the version and the sources of each service."""
     for service in seen.services:
         name = f"service {brief(service.text('service'))}"
         theirs = brief(service.text("version") or "unknown")
-        sources = service.sources
-        if theirs.split(".")[:2] != version.split(".")[:2]:
+        if theirs.split(".")[:2] != seen.version.split(".")[:2]:
             advice = "install the same version on both sides; docs and CHANGELOG say what changed on the wire"
-            yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {version}", advice)
-        findings = [finding for source in sources for finding in _source(source)]
+            yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {seen.version}", advice)
+        findings = [finding for source in service.sources for finding in _check_source(source)]
         yield from findings
         if all(finding.state == "ok" for finding in findings):
             host = brief(service.text("host") or "an unknown host")
-            yield Finding(
-                "service", name, "ok", f"nedbus {theirs} on {host}, its sources have no fault: {len(sources)}"
-            )
+            text = f"nedbus {theirs} on {host}, its sources have no fault: {len(service.sources)}"
+            yield Finding("service", name, "ok", text)
     if not seen.services:
         advice = "'nedbus serve' is one; a script that publishes by itself is none"
         yield Finding("service", "", "unknown", "no nedbus service answers", advice)
@@ -40,21 +38,20 @@ def reported(service: Service) -> Iterator[str]:
 
 def has_source(seen: Observation, kind: str) -> bool:
     """Return whether any service has a source of this kind."""
-    return any(
-        str(source.get("source")).startswith(f"{kind}:") for service in seen.services for source in service.sources
-    )
+    sources = [source for service in seen.services for source in service.sources]
+    return any(str(source.get("source")).startswith(f"{kind}:") for source in sources)
 
 
-def _source(source: Mapping[str, object]) -> Iterator[Finding]:
+def _check_source(source: Mapping[str, object]) -> Iterator[Finding]:
     name, state = brief(source.get("source")), str(source.get("state"))
-    error = str(source.get("error") or "it does not say why")[:_MAX_REASON]
+    error = str(source.get("error") or "it does not say why")[:_MAX_ERROR_LENGTH]
     if state in {"failed", "retrying"}:
         ends = "it has ended" if state == "failed" else "it is tried again"
         yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; the log of its service says more")
     elif state in {"waiting", "starting"}:
         advice = "is its vehicle on, does it send here? for MAVLink see 'nedbus doctor --mavlink LINK' on its host"
         yield Finding("source", name, "warning", f"{state}: nothing has arrived yet", advice)
-    stale, silent, not_carried = (_list(source, what) for what in ("stale", "silent", "not_carried"))
+    stale, silent, not_carried = (_list(source, field) for field in ("stale", "silent", "not_carried"))
     if silent:
         advice = "if the vehicle has them, its PX4 loses them: no line of its zenoh/pub.csv may have rel=: docs/live.md"
         seen = f"announced, and nothing arrives while other topics do: {list_names(silent, 20)}"

@@ -1,4 +1,4 @@
-"""The command for a person to whom nothing arrives: doctor."""
+"""The command for when nothing arrives: doctor."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ from nedbus.doctor import Finding, examine, worst_state
 from nedbus.settings import load_settings
 from nedbus_msgs import check_vehicle
 
-_WIDTH: Final = 80  # columns, at most
-_INDENT: Final = " " * 9
+_MAX_WIDTH: Final = 80  # columns
 
 
 @command
@@ -55,37 +54,27 @@ def doctor(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    settings = load_settings(
-        config,
-        connect=connect and tuple(connect),
-        prefix=prefix,
-        tls_ca=tls_ca,
-        tls_certificate=tls_certificate,
-        tls_key=tls_key,
-    )
+    own_files = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
+    settings = load_settings(config, connect=connect and tuple(connect), prefix=prefix, **own_files)
     findings = examine(settings, version=__version__, vehicle=vehicle, mavlink=mavlink)
     state = worst_state(findings)
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
     else:
-        write(_to_report(findings, min(terminal_width() or _WIDTH, _WIDTH)))
+        write(_to_report(findings))
     if state == "wrong":
         raise typer.Exit(1)
 
 
-def _to_report(findings: Sequence[Finding], width: int) -> str:
-    """Return all findings as lines, and how many there are of each state."""
+def _to_report(findings: Sequence[Finding]) -> str:
+    """Return the findings as lines, and the number of each state."""
+    width = min(terminal_width() or _MAX_WIDTH, _MAX_WIDTH)
     lines = []
     for each in findings:
         name = f"{each.check} {each.subject}".strip()
-        lines += _fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT), width)
-        if each.advice:
-            lines += _fold(f"{_INDENT}-> ", to_text(each.advice, MAX_TEXT), width)
+        texts = {f"{each.state:<8} ": f"{name}: {each.seen}", f"{'':<8} -> ": each.advice}
+        for head, text in texts.items():
+            indent, line = " " * len(head), to_text(text, MAX_TEXT)
+            lines += textwrap.wrap(line, width, initial_indent=head, subsequent_indent=indent, break_on_hyphens=False)
     counts = Counter(each.state for each in findings)
-    summary = ", ".join(f"{counts[state]} {state}" for state in dict.fromkeys(each.state for each in findings))
-    return "\n".join([*lines, "", summary])
-
-
-def _fold(head: str, text: str, width: int) -> list[str]:
-    indent = " " * max(len(head), len(_INDENT))
-    return textwrap.wrap(text, width, initial_indent=head, subsequent_indent=indent, break_on_hyphens=False)
+    return "\n".join([*lines, "", ", ".join(f"{count} {state}" for state, count in counts.items())])

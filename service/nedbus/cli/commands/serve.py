@@ -16,7 +16,8 @@ from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCerti
 from nedbus.cli.output.progress import Display
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
-from nedbus.daemon import Daemon, check_service
+from nedbus.daemon import Daemon
+from nedbus.doctor import check_service
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 from nedbus.monitoring import service_pages

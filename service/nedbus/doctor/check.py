@@ -1,0 +1,139 @@
+"""Mistakes in settings and router files, with file, line and column: for `nedbus check` and `nedbus serve --check`."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+
+from nedbus.daemon import Planned, plan_sources
+from nedbus.errors import ConfigError, NedbusError
+from nedbus.log_event import about
+from nedbus.settings import Settings, find_mistakes, locate_setting, locate_source, place_at
+from nedbus.sources import SOURCE_KINDS, LiveSource, parse_source
+from nedbus.transport import check_endpoints, read_router_config, router_endpoints, split_endpoint
+from nedbus_msgs import DEFAULT_TOPIC, Address
+
+from .finding import Finding
+from .prober import check_pem_file, check_tls_files, reach_endpoint
+
+_log = logging.getLogger(__name__)
+
+
+def check_service(
+    file: str | Path | None = None, given: Mapping[str, object] | None = None, *, offline: bool = False
+) -> list[ConfigError]:
+    """Return all mistakes in the settings of a service, as `load_settings` would read them with what is given.
+
+    `offline`: check the text only, without the files, certificates and endpoints of this host.
+    """
+    settings, mistakes = find_mistakes(file, **(given or {}))
+    endpoints = settings.connect if settings.is_client else settings.listen
+    if settings.router_config is not None:
+        replaced = {name for name in ("listen", "connect") if getattr(settings, name)}
+        mistakes += check_router_file(settings.router_config, offline=offline, replaced=replaced)
+        try:
+            endpoints = endpoints or router_endpoints((), settings.router_config)
+        except ConfigError as exc:
+            mistakes.append(exc)
+    mistakes += check_sources(settings, endpoints or router_endpoints(), offline=offline)
+    if offline:
+        return mistakes
+    found = [
+        *check_tls_files(settings)[0],
+        *(("connect", finding) for finding in map(reach_endpoint, settings.connect)),
+        *(("listen", finding) for finding in map(_try_listen, settings.listen)),
+        ("http", _try_listen(f"tcp/{settings.http}") if settings.http else None),
+    ]
+    return mistakes + [locate_setting(settings, name, reason) for name, each in found if (reason := _reason(each))]
+
+
+def check_router_file(
+    path: Path, *, offline: bool = False, replaced: Collection[str] = frozenset()
+) -> list[ConfigError]:
+    """Return all mistakes in a router's configuration file; `offline` as in `check_service`.
+
+    `replaced`: of `listen` and `connect` those that are given elsewhere, in place of the file's.
+    """
+    try:
+        config = read_router_config(path)
+    except ConfigError as exc:
+        return [exc]
+    if offline:
+        return []
+    found: list[tuple[str, str]] = []  # a value of the file and the reason against it
+    for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
+        for endpoint in endpoints if name not in replaced else ():
+            try:
+                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:  # others have no HOST:PORT
+                    check_endpoints([endpoint], where=name)
+                found.append((endpoint, _reason(probe(endpoint))))
+            except ConfigError as exc:
+                found.append((endpoint, exc.reason))
+    for name, file in config.tls_files.items():
+        reason = _reason(check_pem_file(name, file, "it is"))
+        found.append((str(file), reason and f"{name}: {reason}"))
+    text = path.read_text(errors="replace")
+    located = ((reason, place_at(text, text.find(value))) for value, reason in found if reason)
+    return [ConfigError.in_file(path, reason, line=line, column=column) for reason, (line, column) in located]
+
+
+def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
+    """Yield each source that cannot be opened by a service with these endpoints, or publishes what another one does."""
+    plan, mistakes = plan_sources(settings, tuple(endpoints))
+    yield from mistakes
+    publishers: dict[Address, Planned] = {}
+    for planned in plan:
+        try:
+            addresses, reason = _addresses(planned, offline=offline), ""
+        except (NedbusError, OSError) as exc:
+            addresses, reason = (), str(exc)
+        same = next((address for address in addresses if address in publishers), None)
+        if same is not None and "vehicle" not in settings.left_out:
+            other = publishers[same].text
+            reason = f"it publishes {same}, as source {other!r} does: give one of the two another vehicle"
+        if reason:
+            yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
+        for address in addresses:
+            publishers.setdefault(address, planned)
+
+
+def _addresses(planned: Planned, *, offline: bool) -> Collection[Address]:
+    """Return the addresses of a replay, or of the vehicles that a live source names."""
+    spec = parse_source(planned.text)
+    if isinstance(planned.source, LiveSource):
+        named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
+        return [Address(vehicle, DEFAULT_TOPIC) for vehicle in named if vehicle is not None]
+    if offline and SOURCE_KINDS[spec.kind].target == "FILE":
+        return ()
+    run = planned.source.open()
+    with closing(run.messages):  # type: ignore[type-var] # each is a generator
+        return run.addresses
+
+
+def _try_listen(endpoint: str) -> Finding | None:
+    """Return a finding if the address is none of this host; its port may be taken by the service to be replaced."""
+    parts = split_endpoint(endpoint)
+    if parts is None:  # a socket in the file system
+        return None
+    _, host, _ = parts
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.bind((host, 0))
+    except (OSError, UnicodeError):
+        return Finding("endpoint", endpoint, "wrong", f"{host} is no address of this host")
+    return None
+
+
+def _reason(finding: Finding | None) -> str:
+    """Return the text of a mistake in the settings, "" for none; a missing package is none, and is logged."""
+    if finding is None or finding.state == "ok":
+        return ""
+    subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""
+    text = f"{subject}{finding.seen}" + (f": {finding.advice}" if finding.advice else "")
+    if finding.state == "unknown":
+        _log.warning("%s", text, extra=about("notice"))
+        return ""
+    return text
