@@ -47,12 +47,12 @@ ONLY_BY_FOLDER = {
     "pydantic": {
         "nedbus_msgs": "message px4_types validation other", "nedbus_msgs/codecs": "msgpack",
         "nedbus_msgs/messages": " ".join(MESSAGE_FILES), "nedbus/settings": "model load",
-        "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays", "nedbus/cli": "status",
-        "nedbus/events": "report",
+        "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays",
+        "nedbus/client/discovery": "service_status", "nedbus/events": "report",
     },
     "pydantic_core": {
         "nedbus_msgs": "px4_types message validation", "nedbus_msgs/codecs": "msgpack",
-        "nedbus/client/publishing": "publisher_registry",
+        "nedbus/client/publishing": "publisher_registry", "nedbus/client/discovery": "service_status",
         "nedbus/settings": "load",
     },
     "pydantic_settings": {"nedbus/settings": "model load"},

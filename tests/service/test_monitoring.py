@@ -21,11 +21,11 @@ from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 import nedbus
-from nedbus import StreamHealth
+from nedbus import SourceStatus, StreamHealth, StreamStatus
 from nedbus.cli.http import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
-from nedbus.daemon.status import SourceStatus, State, StreamStatus
+from nedbus.daemon.status import State
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, families, service_pages
 from nedbus.monitoring.exposition import build_info, metrics_page

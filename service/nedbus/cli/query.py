@@ -5,12 +5,21 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from difflib import get_close_matches
 from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
+from nedbus.client import (
+    Bus,
+    SourceStatus,
+    StreamStatus,
+    describe_stream,
+    health_of_last,
+    stream_state,
+    to_age,
+)
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
     ANY,
@@ -43,7 +52,6 @@ from .options import (
     write,
     write_stderr,
 )
-from .status import list_of, refused_of, sources_of, streams_of
 from .table import terminal_width, to_table
 
 _SOURCE_HEAD: Final = ("SOURCE", "STATE", "PUBLISHED", "REJECTED", "LOST", "REBOOTS", "RETRIES", "REMARK")
@@ -123,22 +131,22 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     vehicles = bus.vehicles()
     if json_output:
         for service in services:
-            write(json.dumps(service))
+            write(json.dumps(asdict(service)))
         return
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
     width = terminal_width()
     for service in services[:_MAX_ROWS]:
-        name, version, role = (to_text(service.get(key)) for key in ("service", "version", "role"))
+        name, version, role = map(to_text, (service.service, service.version, service.role))
         write(f"\nservice {name}, nedbus {version}, as {role}")
-        rows = [_source_row(source) for source in sources_of(service)]
+        rows = [_source_row(source) for source in service.sources]
         _write_rows(to_table(_SOURCE_HEAD, rows[:_MAX_ROWS], width=width, optional=_SOURCE_OPTIONAL), rows)
         for what, head in _ABSENT.items():
-            if absent := [str(each) for source in sources_of(service) for each in list_of(source, what)]:
+            if absent := [each for source in service.sources for each in getattr(source, what)]:
                 write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
-        if refused := refused_of(service):
+        if refused := service.refused:
             write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
-        streams = [_stream_row(source, refused, *each) for source in sources_of(service) for each in streams_of(source)]
+        streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         _write_rows("\n" + to_table(_STREAM_HEAD, streams[:_MAX_ROWS], width=width, optional=_STREAM_OPTIONAL), streams)
     if len(services) > _MAX_ROWS:
         write(f"{len(services) - _MAX_ROWS} services more")
@@ -194,13 +202,18 @@ def _write_rows(table: str, rows: Sequence[object]) -> None:
         write(f"{len(rows) - _MAX_ROWS} more")
 
 
-def _source_row(source: dict[str, object]) -> list[str]:
-    keys = ("source", "state", "published", "rejected", "lost", "reboots", "retries")
-    gone = len(list_of(source, "stale"))
-    return [
-        *(to_text(source.get(key, "-")) for key in keys),
-        to_text(source.get("error") or (f"{gone} gone" if gone else "-")),
-    ]
+def _source_row(source: SourceStatus) -> list[str]:
+    cells = (
+        source.source,
+        source.state,
+        source.published,
+        source.rejected,
+        source.lost,
+        source.reboots,
+        source.retries,
+    )
+    gone = len(source.stale)
+    return [*map(to_text, cells), to_text(source.error or (f"{gone} gone" if gone else "-"))]
 
 
 def _fold_list(head: str, text: str, width: int | None) -> str:
@@ -209,9 +222,9 @@ def _fold_list(head: str, text: str, width: int | None) -> str:
     return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
-def _stream_row(source: dict[str, object], refused: Sequence[str], address: str, health: Health) -> list[str]:
-    addresses = source.get("addresses")
-    alive = address in addresses if isinstance(addresses, list) else None
+def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:
+    address, health = stream.address, stream.health
+    alive = address in source.addresses
     is_refused = address.partition("/")[0] in refused
     suffix = ", by PX4's definition" if TOPICS.keys().isdisjoint(address.split("/")) else ""
     return [

@@ -7,7 +7,8 @@ from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
-from .discovery.services import RejectionReport, Rejections, find_accounts
+from .discovery.service_status import ServiceStatus, SourceStatus, StreamStatus
+from .discovery.services import RejectionReport, Rejections, find_accounts, find_services
 from .health.histogram import Histogram
 from .health.stream_health import Health, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
@@ -44,8 +45,11 @@ __all__ = [
     "RejectionReport",
     "Rejections",
     "Sample",
+    "ServiceStatus",
+    "SourceStatus",
     "StreamHealth",
     "StreamState",
+    "StreamStatus",
     "Subscription",
     "check_max_rate",
     "connect",
@@ -53,6 +57,7 @@ __all__ = [
     "connect_with",
     "describe_stream",
     "find_accounts",
+    "find_services",
     "health_of_last",
     "stream_state",
     "to_age",

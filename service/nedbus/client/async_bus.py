@@ -16,6 +16,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Message, Selection, vehicle
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
+from .discovery.service_status import ServiceStatus
 from .discovery.services import Rejections
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import Mode, Sample
@@ -88,7 +89,7 @@ class AsyncBus:
         """Return the vehicles that are published now as `Bus.vehicles` does."""
         return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
 
-    async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+    async def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service as `Bus.services` does."""
         return await asyncio.to_thread(self._opened().services, timeout=timeout)
 

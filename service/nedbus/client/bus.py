@@ -18,6 +18,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
+from .discovery.service_status import ServiceStatus
 from .discovery.services import Rejections, find_accounts, find_schemas, find_services
 from .discovery.vehicle_directory import VehicleDirectory
 from .housekeeping import Housekeeping
@@ -126,7 +127,7 @@ class Bus:
         self._require_open()
         return self._directory.vehicles(timeout=timeout)
 
-    def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+    def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service on this network, as it reports it."""
         self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)

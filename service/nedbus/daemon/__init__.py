@@ -2,15 +2,12 @@
 
 from .check import check_router_file, check_service, describe_mistakes
 from .daemon import Daemon
-from .status import STATES, ServiceStatus, SourceMeasures, SourceStatus, StreamStatus
+from .status import STATES, SourceMeasures
 
 __all__ = [
     "STATES",
     "Daemon",
-    "ServiceStatus",
     "SourceMeasures",
-    "SourceStatus",
-    "StreamStatus",
     "check_router_file",
     "check_service",
     "describe_mistakes",

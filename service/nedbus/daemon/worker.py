@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from nedbus.client import PublisherRegistry
+from nedbus.client import PublisherRegistry, SourceStatus, StreamStatus
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
@@ -17,7 +17,7 @@ from .clock import Clock
 from .live import listen
 from .output import SourceOutput
 from .replay import replay
-from .status import SourceMeasures, SourceStatus, State, StreamStatus
+from .status import SourceMeasures, State
 
 _log = logging.getLogger(__name__)
 

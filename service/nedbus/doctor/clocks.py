@@ -35,7 +35,7 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
 def _services(seen: Observation) -> dict[str, tuple[float, float]]:
     """Return how far the clocks of services are ahead of ours, and how well that is known [s]."""
     return {
-        f"service {brief(service.text('service'))} on {brief(service.text('host'))}": (service.offset, service.error)
+        f"service {brief(service.status.service)} on {brief(service.status.host)}": (service.offset, service.error)
         for service in seen.services
         if service.offset is not None
     }

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Final
 
-from nedbus.client import find_accounts
+from nedbus.client import ServiceStatus, find_accounts, find_services
 from nedbus.events import AccountReport
 from nedbus.transport import (
     PublisherToken,
-    RawSample,
     RouterState,
     Session,
     alive_keys,
@@ -24,14 +20,12 @@ from nedbus.transport import (
     query,
 )
 from nedbus_msgs import (
-    ANY,
     DEFAULT_TOPIC,
     Address,
     AddressError,
     DecodeError,
     address_of_alive_key,
     alive_key_expr,
-    status_key,
 )
 
 from .traffic import Stream, Traffic
@@ -43,7 +37,6 @@ _LEAST: Final = 1.0  # s of them after all questions, for what is measured at it
 
 _TICK: Final = 0.02  # s until what arrived is looked at: it makes a message look that much older
 _TIMEOUT: Final = 1.0  # s of a query
-_MAX_ANSWER: Final = 2**18  # bytes of a status that is read
 _MAX_TIME: Final = 1e11  # s since the epoch that a service may say it is
 _CLOCKS: Final = 2.0  # s after which no further service is asked for its clock
 _MAX_KEYS: Final = 10_000  # whose publishers are told apart
@@ -54,21 +47,9 @@ _MAX_SERVICES: Final = 20  # that are looked at: any peer may claim to be a serv
 class Service:
     """The status of a service as it reports it, and what its clock says: ahead of ours by `offset` +- `error` [s]."""
 
-    key: str
-    status: Mapping[str, object]
+    status: ServiceStatus
     offset: float | None = None
     error: float = 0.0
-
-    @property
-    def sources(self) -> list[Mapping[str, object]]:
-        """The status of its sources."""
-        sources = self.status.get("sources")
-        return [each for each in sources if isinstance(each, dict)] if isinstance(sources, list) else []
-
-    def text(self, name: str) -> str:
-        """Return a value of the status as text, "" if it has none."""
-        value = self.status.get(name)
-        return "" if value is None else str(value)
 
 
 @dataclass(slots=True)
@@ -109,9 +90,9 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
         take_heartbeats, end_heartbeats = follow_heartbeats(session, f"{prefix}/*/**")
         closing.callback(end_heartbeats)
         seen.routers = ask_routers(session, timeout=_TIMEOUT)
-        for service in _services(session, prefix):
+        for status in find_services(session, prefix=prefix, timeout=_TIMEOUT)[:_MAX_SERVICES]:
             in_time = time.monotonic() < start + _CLOCKS
-            seen.services.append(_with_clock(session, service) if in_time else service)
+            seen.services.append(_with_clock(session, prefix, status) if in_time else Service(status))
         seen.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_TIMEOUT)
         seen.alive = _alive(session, prefix)
         seen.ros2 = _ros2_publishers(session)
@@ -140,30 +121,15 @@ def observe(session: Session, *, prefix: str, listen: float) -> Observation:
     return seen
 
 
-def _services(session: Session, prefix: str) -> list[Service]:
-    answers = query(session, status_key(ANY, prefix=prefix), timeout=_TIMEOUT)
-    return list(islice(filter(None, map(_service, answers)), _MAX_SERVICES))
-
-
-def _service(answer: RawSample) -> Service | None:
-    if len(answer.payload) > _MAX_ANSWER:
-        return None
-    try:
-        status = json.loads(answer.payload.to_bytes())
-    except (ValueError, RecursionError):
-        return None
-    return Service(str(answer.key_expr), status) if isinstance(status, dict) else None
-
-
-def _with_clock(session: Session, service: Service) -> Service:
+def _with_clock(session: Session, prefix: str, status: ServiceStatus) -> Service:
     """Ask a service alone, so that the round trip is its own; its clock was read in the middle of it."""
     before = time.time()
-    answer = next(map(_service, query(session, service.key, timeout=_TIMEOUT)), None)
+    answers = find_services(session, prefix=prefix, timeout=_TIMEOUT, service=status.service)
     after = time.time()
-    now = answer.status.get("now") if answer is not None else None
-    if answer is None or not isinstance(now, int | float) or not abs(now) < _MAX_TIME:  # nor is NaN
-        return service
-    return Service(service.key, answer.status, now - (before + after) / 2, (after - before) / 2)
+    now = answers[0].now if answers else None
+    if now is None or not abs(now) < _MAX_TIME:  # nor is NaN
+        return Service(status)
+    return Service(answers[0], now - (before + after) / 2, (after - before) / 2)
 
 
 def _alive(session: Session, prefix: str) -> list[Address]:

@@ -38,7 +38,7 @@ def check_permissions(seen: Observation, vehicle: str | None, verdict: Verdict |
 def _reading(seen: Observation, verdict: Verdict | None) -> Finding:
     if any(stream.address is not None for stream in seen.streams.values()) or seen.ages:
         return Finding("read", "", "ok", "this client may read: messages arrive")
-    published = sorted({address for service in seen.services for address in reported(service)})
+    published = sorted({address for service in seen.services for address in reported(service.status)})
     if not published:
         return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
     seen_text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"

@@ -29,7 +29,7 @@ def check_vehicles(seen: Observation, vehicle: str | None, *, writes_only: bool)
     for address in known:
         yield from _judge(seen, address, flows=address in arrived)
     yield from _check_states(seen, vehicle)
-    hidden = sorted({each for service in seen.services for each in reported(service)} - set(map(str, known)))
+    hidden = sorted({each for service in seen.services for each in reported(service.status)} - set(map(str, known)))
     if vehicle is not None:
         hidden = [each for each in hidden if each.partition("/")[0] == vehicle]
     for each in hidden if seen.streams or seen.ages else ():  # else nothing at all may be read

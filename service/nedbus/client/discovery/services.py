@@ -7,7 +7,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import zenoh
@@ -18,6 +18,8 @@ from nedbus.events import QUESTION, AccountReport, from_json
 from nedbus.log_event import about
 from nedbus.transport import RawSample, Session, query, while_open
 from nedbus_msgs import ANY, Address, AddressError, address_of_rejected_key, rejected_key_expr, schema_key, status_key
+
+from .service_status import ServiceStatus, parse_status
 
 _log = logging.getLogger(__name__)
 
@@ -33,10 +35,11 @@ _CHANNEL: Final = 1000  # reports that wait; beyond, the oldest are dropped
 _MAX_REPORT: Final = 2**16  # bytes of a report that is read
 
 
-def find_services(session: Session, *, prefix: str, timeout: float) -> list[dict[str, object]]:
-    """Return the status of every nedbus service, as it reports it; what would fill the memory is left out."""
-    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
-    return [status for _, status in _parse(_accept(answers)) if isinstance(status, dict)]
+def find_services(session: Session, *, prefix: str, timeout: float, service: str = ANY) -> list[ServiceStatus]:
+    """Return the status of every nedbus service, or of one; answers that would fill the memory are left out."""
+    answers = query(session, status_key(service, prefix=prefix), timeout=timeout)
+    found = [(str(raw.key_expr), parse_status(content)) for raw, content in _parse(_accept(answers))]
+    return [replace(status, service=key.split("/")[-2]) for key, status in found if status is not None]
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
