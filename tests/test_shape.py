@@ -29,9 +29,9 @@ MESSAGE_FILES = sorted(path.stem for path in ROOT.glob("schemas/nedbus_msgs/mess
 ONLY_BY_FOLDER = {
     "zenoh": {
         "nedbus/transport": "session router queries zenoh_ext refusals write_probe",
-        "nedbus/client": "sample qos", "nedbus/client/discovery": "services",
-        "nedbus/client/receiving": "receiver thinned_receiver decoder",
-        "nedbus/client/publishing": "publisher publisher_registry writer flow_control heartbeats "
+        "nedbus/client": "sample", "nedbus/client/discovery": "services",
+        "nedbus/client/receiving": "receiver max_rate decoder",
+        "nedbus/client/publishing": "publisher publisher_registry writer flow_control "
         "downsampler query_server",
         "nedbus/sources": "px4_zenoh px4_node", "nedbus/bridges": "ros2", "nedbus/doctor": "traffic",
     },

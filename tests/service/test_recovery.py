@@ -18,7 +18,7 @@ from nedbus import Counts
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
-from nedbus.client.receiving.receiver import take_all
+from nedbus.client.receiving.receiver import drain
 from nedbus.transport import KeptAnswers, Session, ask_kept, open_client, open_router
 from nedbus_msgs import encode
 from tests.first_message import encoding_of
@@ -156,7 +156,7 @@ def test_newest_message_is_recovered_by_heartbeat(
     assert lossy.subscription.counts == Counts(received=3)
     assert lossless.counts == Counts()
     elsewhere: list[zenoh.Sample] = []
-    wait_for(lambda: len(take_all(foreign.handler, elsewhere)) == 3, what="the messages in another session")
+    wait_for(lambda: len(drain(foreign.handler, elsewhere)) == 3, what="the messages in another session")
     assert WAKE_UP not in {str(sample.encoding) for sample in elsewhere}
     foreign.undeclare()
 

@@ -26,7 +26,7 @@ from .protocol import LIVE
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, LayoutLookup, PendingQueue, Receiver, ThinnedQueue, ThinnedReceiver
+from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
 from .sample import Mode, Sample
 from .subscription import Subscription
 
@@ -77,9 +77,9 @@ class Bus:
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
         Either way `counts` has what was lost, dropped or invalid, and nobody else has to wait.
-        `max_rate`: at most so many messages a second of each stream, thinned by its publisher, for links that carry no
-        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is thinned
-        here. What is left out is neither lost nor dropped.
+        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for links that carry no
+        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is left
+        out here. What is left out is neither lost nor dropped.
 
         Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
@@ -198,15 +198,15 @@ class Bus:
         decoder, name = Decoder(self._layouts, prefix=self.prefix), selection.key_expr(prefix=self.prefix)
         if max_rate is None:
             return PendingQueue(mode, decoder, name=name)
-        return ThinnedQueue(mode, decoder, max_rate=max_rate, name=name)
+        return MaxRateQueue(mode, decoder, max_rate=max_rate, name=name)
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
         self._require_open()
         session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
         receiver: Receiver
-        if isinstance(pending_queue, ThinnedQueue):
-            receiver = ThinnedReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
+        if isinstance(pending_queue, MaxRateQueue):
+            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
         else:
             receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue, housekeeping=housekeeping)
         self._receivers.add(receiver)

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import Final, cast
 
 from nedbus.client.sample import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
-
-from .histogram import Histogram
 
 _REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
 _GAP: Final = 3.0  # times the usual step of PX4's time
@@ -93,6 +92,25 @@ class _Window:
         deviation = seconds - self.mean
         self.mean += deviation / self.intervals
         self.spread += deviation * (seconds - self.mean)
+
+
+class Histogram:
+    """Count measurements by size; `limits` are the largest of each bucket but the last, which has no limit."""
+
+    def __init__(self, limits: Sequence[float]) -> None:
+        self.limits = tuple(limits)
+        self.sum = 0.0
+        self._counts = [0] * (len(self.limits) + 1)
+
+    def add(self, value: float) -> None:
+        """Count one measurement."""
+        self._counts[bisect_left(self.limits, value)] += 1
+        self.sum += value
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many measurements each bucket has, the one without a limit last."""
+        return tuple(self._counts)
 
 
 class StreamHealth:

@@ -14,13 +14,11 @@ from typing import Final
 
 import zenoh
 
-from nedbus.client.qos import RATES, priority_of
-from nedbus.client.rate_gate import RateGate
+from nedbus.client.rate_gate import RATES, RateGate
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ANY, Address, get_topic
 
-from .heartbeats import Heartbeats
-from .writer import Writer
+from .writer import Heartbeats, Writer, priority_of
 
 _CACHE: Final = 20  # s of messages that are kept for readers that missed some
 _LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come back, and get what they missed

@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 import zenoh
 
-from nedbus.client.qos import priority_of
 from nedbus.errors import NedbusError
 from nedbus.transport import require_unforked, translate_error, while_open
 from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, encoding_of, get_topic
 
 from .downsampler import Downsampler, MatchingListener
 from .flow_control import KEPT, FlowControl, SharedWindow
-from .heartbeats import Heartbeats
-from .writer import Writer
+from .writer import Heartbeats, Writer, priority_of
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray

@@ -22,9 +22,9 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
-from .heartbeats import Heartbeats
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
+from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 

@@ -43,10 +43,10 @@ _MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
 
 
 @dataclass(slots=True, eq=False)
-class Stream:
+class KeyState:
     """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
 
-    `key`: that of the whole stream. `heard`: that on which messages come. `thinned`: these are those of a thinned copy.
+    `key`: that of the stream at full rate; `heard`: that on which messages come, perhaps downsampled.
     `codec`: that of its messages, None while it is not known what a `message` is; `size`: bytes of a payload of ours.
     `writers`: its publishers, by name; `writer` is that of the last message.
     `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
@@ -56,7 +56,6 @@ class Stream:
     key: str
     heard: str
     address: Address
-    thinned: bool = False
     codec: Codec[Any] | None = None
     size: int = -1
     message: str = ""
@@ -79,7 +78,7 @@ class Kept(NamedTuple):
     provenance: Provenance
 
 
-Arrival = tuple[Stream, bytes, RawSample | Kept, int]  # the last: how many messages were lost before it
+Arrival = tuple[KeyState, bytes, RawSample | Kept, int]  # the last: how many messages were lost before it
 
 
 class Decoder:
@@ -89,17 +88,17 @@ class Decoder:
         self.invalid = 0
         self._layouts = layouts
         self._prefix = prefix
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, KeyState] = {}
         self._warned: set[int] = set()  # hashes of keys, which may be long
         self._counting = threading.Lock()  # whoever receives and whoever reads both reject
 
-    def stream(self, key: str) -> Stream:
+    def stream(self, key: str) -> KeyState:
         """Return what is known of a key; raise AddressError for one that is none of ours."""
         stream = self._streams.get(key)
         if stream is None:
-            thinned = "/@" in key  # only who asks for thinned streams gets such keys
-            address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
-            stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
+            from_key = Address.from_rate_key if "/@" in key else Address.from_key  # only with a max_rate
+            address = from_key(key, prefix=self._prefix)
+            stream = KeyState(address.key(prefix=self._prefix), key, address)
             if address.topic in BY_TOPIC:
                 stream.carry(codec_of(BY_TOPIC[address.topic]))
             if len(self._streams) < MAX_KEYS:
@@ -185,7 +184,7 @@ class Decoder:
                 return None
         return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
 
-    def resolve(self, stream: Stream) -> Codec[Any] | None:
+    def resolve(self, stream: KeyState) -> Codec[Any] | None:
         """Return the codec of a stream whose message has no file here, None if nobody says what it is.
 
         A script that reads waits for an answer that is on its way, once; whoever receives does not.
@@ -216,7 +215,7 @@ class Decoder:
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
-    def _inspect(self, stream: Stream, payload: bytes, raw: RawSample) -> None:
+    def _inspect(self, stream: KeyState, payload: bytes, raw: RawSample) -> None:
         if len(payload) > PAYLOAD_LIMIT:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
         if raw.kind == zenoh.SampleKind.DELETE:

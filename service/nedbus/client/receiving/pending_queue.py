@@ -50,7 +50,6 @@ class PendingQueue:
         decoder: Decoder,
         *,
         name: str = "",
-        thinned: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if mode not in get_args(Mode):
@@ -72,7 +71,7 @@ class PendingQueue:
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
         self._groups: deque[list[Arrival]] = deque()  # of batches that were taken, and not returned yet
-        self._reader = StatefulReader(decoder, recovers=not self.newest_only, thinned=thinned, clock=clock)
+        self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
         self._acknowledgements = Acknowledgements(self._reader)
         self._arrived = self._dropped = self._received = 0
 

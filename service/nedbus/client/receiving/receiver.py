@@ -16,9 +16,8 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.housekeeping import Housekeeping, Wakeup
 from nedbus.client.protocol import CLOSED, read_parameters
-from nedbus.client.wakeup import Wakeup
 from nedbus.log_event import about
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
 from nedbus_msgs import ack_key
@@ -47,8 +46,8 @@ class Receiver:
     """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
 
     A subscriber of mode `every` asks publishers for what is missing, and answers those that ask whether it has what
-    they sent. One of `thinned` streams does not answer, as these do not wait for it, and begins with what is published
-    from now on.
+    they sent. One of `downsampled` streams does not answer, as these do not wait for it, and begins with what is
+    published from now on.
     """
 
     def __init__(
@@ -58,13 +57,13 @@ class Receiver:
         pending_queue: PendingQueue,
         *,
         housekeeping: Housekeeping,
-        thinned: bool = False,
+        downsampled: bool = False,
     ) -> None:
         every = not pending_queue.newest_only
         self._session = session
         self._queue = pending_queue
         self._name = key_expr
-        self._thinned = thinned
+        self._downsampled = downsampled
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # whoever has it empties the ring; a reader may keep it by a Ctrl-C
@@ -76,18 +75,18 @@ class Receiver:
         self._pump: threading.Thread | None = None
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
-        history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
+        history = None if downsampled else zenoh.ext.HistoryConfig(max_samples=1)
         asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
         links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
-            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not thinned else None
+            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not downsampled else None
             self._links = session.info.declare_transport_events_listener(links, history=False) if every else None
         self._take_query = None if self._asked is None else self._asked.handler.try_recv
         self._take_link = None if self._links is None else self._links.handler.try_recv
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
-        self._heartbeats = {key_expr: follow_heartbeats(session, key_expr)} if every else {}
+        self._heartbeats = follow_heartbeats(session, key_expr) if every else None  # how to take, and to end them
         self._late: Heartbeats = {}  # what the heartbeats of the last look told of
         self._next_look = 0.0
         self._drains = 0  # of the queue, then
@@ -101,7 +100,7 @@ class Receiver:
         if not self._receiving.acquire(blocking=False):
             return False
         try:
-            if batch := take_all(self._handler, []):
+            if batch := drain(self._handler, []):
                 self._put(batch)
         finally:
             self._receiving.release()
@@ -109,7 +108,7 @@ class Receiver:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something in the queue; return False after `timeout` seconds."""
-        if timeout is not None or self._thinned:  # not all of the thinned comes through the ring
+        if timeout is not None or self._downsampled:  # what comes at full rate does not come through the ring
             self.pump()
             return self._queue.wait(timeout)
         self._by_reader = True
@@ -152,8 +151,8 @@ class Receiver:
 
     def _undeclare(self) -> None:
         with suppress(zenoh.ZError):  # closed already with the session
-            for _, undeclare in self._heartbeats.values():
-                undeclare()
+            if self._heartbeats is not None:
+                self._heartbeats[1]()
             if self._asked is not None:
                 self._asked.undeclare()
             if self._links is not None:
@@ -185,7 +184,7 @@ class Receiver:
             pending.idle = False
             if (item := handler.try_recv()) is not None:
                 batch.append(item)
-                take_all(handler, batch)
+                drain(handler, batch)
         except zenoh.ZError:
             pending.idle = False
             pending.end()
@@ -193,12 +192,12 @@ class Receiver:
         self._busy = len(batch) >= _BUSY
         self._put(batch)
 
-    def _put(self, batch: list[zenoh.Sample], *, full: int = RING) -> None:
+    def _put(self, batch: list[zenoh.Sample]) -> None:
         if self._queue.ended:
             return
         self._listen()
         try:
-            self._queue.put(batch, overflowed=len(batch) >= full)
+            self._queue.put(batch, overflowed=len(batch) >= RING)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             extra = about("bug")
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
@@ -226,10 +225,8 @@ class Receiver:
         if self._late and not drained:
             return  # what they tell of may be in the ring still
         for (key, publisher), number in self._late.items():
-            self._queue.on_heartbeat(key, publisher, number, begins=not self._thinned)
-        self._late = {}
-        for take, _ in self._heartbeats.values():
-            self._late |= take()
+            self._queue.on_heartbeat(key, publisher, number, begins=not self._downsampled)
+        self._late = {} if self._heartbeats is None else self._heartbeats[0]()
         self._drains = self._queue.drains
 
     def _wake(self, key: str) -> None:
@@ -262,7 +259,7 @@ class Receiver:
             self._queue.add(AckRequest(key.removesuffix(ack_key("")), *parameters, reply))
 
 
-def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
     """Add all that is there to a batch, up to a full ring, and return it."""
     try:
         while len(batch) < RING and (item := handler.try_recv()) is not None:

@@ -11,7 +11,7 @@ from typing import Final
 from nedbus.transport import SourceInfo, entity_name
 from nedbus_msgs import AddressError
 
-from .decoder import Arrival, Decoder, Stream
+from .decoder import Arrival, Decoder, KeyState
 from .writer_proxy import NUMBERS, Account, WriterProxy
 
 _WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
@@ -24,18 +24,14 @@ class StatefulReader:
     """Follow what arrives, publisher by publisher: `requesting` are those of which something is missing.
 
     With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
-    Of `thinned` streams only those that publishers thin are followed from their beginning after a link came back.
     Not thread-safe.
     """
 
-    def __init__(
-        self, decoder: Decoder, *, recovers: bool, thinned: bool, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, decoder: Decoder, *, recovers: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self.account = Account()
         self.requesting: dict[WriterProxy, None] = {}
         self.recovers = recovers
         self._decoder = decoder
-        self._thinned = thinned
         self._clock = clock
         self._unsettled_until = float("-inf")
 
@@ -87,10 +83,9 @@ class StatefulReader:
             return False
         writer = stream.writers.get(name)
         if writer is None:
-            began = self._may_have_begun(stream)
-            if not (began or begins):
+            if not (self.unsettled or begins):
                 return False
-            writer = self._meet(stream, name, 0 if began else number, uncertain=number + 1)
+            writer = self._meet(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
         if writer is None:
             return False
         writer.on_heartbeat(number)
@@ -128,13 +123,14 @@ class StatefulReader:
             return None
         return None if writer is None else writer.has(number)
 
-    def _writer_of(self, stream: Stream, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
+    def _writer_of(self, stream: KeyState, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
         """Return the publisher of a sample; None if it is not remembered."""
         name = entity_name(info.source_id)
         writer = stream.writers.get(name)
         if writer is None:
-            late = asks and self._may_have_begun(stream)
-            writer = self._meet(stream, name, 0 if late else info.source_sn, uncertain=info.source_sn)
+            writer = self._meet(
+                stream, name, 0 if asks and self.unsettled else info.source_sn, uncertain=info.source_sn
+            )
         stream.writer = writer
         if writer is not None:
             writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
@@ -156,10 +152,7 @@ class StatefulReader:
         writer.expected = stop
         return True
 
-    def _may_have_begun(self, stream: Stream) -> bool:
-        return self.unsettled and (stream.thinned or not self._thinned)
-
-    def _meet(self, stream: Stream, name: str, expected: int, *, uncertain: int) -> WriterProxy | None:
+    def _meet(self, stream: KeyState, name: str, expected: int, *, uncertain: int) -> WriterProxy | None:
         """Remember a publisher; None if there are too many on its key of which something is missing."""
         if len(stream.writers) >= _WRITERS_OF_KEY:
             writers = stream.writers.values()

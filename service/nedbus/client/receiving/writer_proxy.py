@@ -11,7 +11,7 @@ from typing import Final
 
 from nedbus.transport import MAX_ANSWERS
 
-from .decoder import Arrival, Decoder, Stream
+from .decoder import Arrival, Decoder, KeyState
 
 NUMBERS: Final = 2**32
 """Zenoh's sequence numbers wrap here."""
@@ -68,7 +68,7 @@ class WriterProxy:
     in vain, and is asked only once from then on. Not thread-safe.
     """
 
-    stream: Stream
+    stream: KeyState
     name: str
     expected: int
     account: Account
