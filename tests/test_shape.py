@@ -48,7 +48,7 @@ ONLY_BY_FOLDER = {
         "nedbus_msgs": "message px4_types validation other", "nedbus_msgs/codecs": "msgpack",
         "nedbus_msgs/messages": " ".join(MESSAGE_FILES), "nedbus/settings": "model load",
         "nedbus/sources": "options spec", "nedbus/recording": "conversion arrays",
-        "nedbus/client/discovery": "service_status", "nedbus/events": "report",
+        "nedbus/client/discovery": "service_status services", "nedbus/events": "report",
     },
     "pydantic_core": {
         "nedbus_msgs": "px4_types message validation", "nedbus_msgs/codecs": "msgpack",

@@ -208,7 +208,7 @@ def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout
 def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
     """Return a queue of mode `every` for 10 samples, of which 4 are kept as they are."""
     monkeypatch.setattr(module, "CAPACITY", 10)
-    monkeypatch.setattr(module, "_FRESH", 4)
+    monkeypatch.setattr(module, "_MAX_FRESH", 4)
     return make_queue("every")
 
 

@@ -278,7 +278,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
 
 def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(pending_queue, "_HELD_OF_KEY", 50)
+    monkeypatch.setattr(pending_queue, "_MAX_HELD_OF_KEY", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]

@@ -22,9 +22,8 @@ from nedbus.log_event import about
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
 from nedbus_msgs import ack_key
 
-from .acknowledgements import MAX_PENDING, AckRequest
 from .decoder import WAKE_UP
-from .pending_queue import PendingQueue
+from .pending_queue import MAX_ACK_REQUESTS, AckRequest, PendingQueue
 from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
@@ -76,7 +75,7 @@ class Receiver:
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
         history = None if downsampled else zenoh.ext.HistoryConfig(max_samples=1)
-        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
+        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
         links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
