@@ -47,7 +47,7 @@ class KeyState:
     """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
 
     `key`: that of the stream at full rate; `heard`: that on which messages come, perhaps downsampled.
-    `codec`: that of its messages, None while it is not known what a `message` is; `size`: bytes of a payload of ours.
+    `codec`: that of its messages, None while nothing defines `message`; `size`: bytes of a payload of ours.
     `writers`: its publishers, by name; `writer` is that of the last message.
     `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
     dropped or invalid; they are reported with the next sample that is read.
@@ -67,7 +67,7 @@ class KeyState:
 
     def carry(self, codec: Codec[Any]) -> None:
         """Take note of which messages these are."""
-        self.codec, self.size = codec, codec.size
+        self.codec, self.size, self.message = codec, codec.size, codec.definition.name
 
 
 class Kept(NamedTuple):

@@ -88,7 +88,6 @@ class PendingQueue:
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
-        self._groups: deque[list[Arrival]] = deque()  # of batches that were taken, and not returned yet
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
         self._arrived = self._dropped = self._received = 0
@@ -104,7 +103,7 @@ class PendingQueue:
     @property
     def waiting(self) -> int:
         """How many messages wait to be read."""
-        return sum(map(len, self._groups)) + (len(self._every) or len(self._newest))
+        return len(self._every) or len(self._newest)
 
     @property
     def held(self) -> int:
@@ -230,11 +229,7 @@ class PendingQueue:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take
-                if self._groups:
-                    arrival = self._groups[0].pop(0)
-                    if not self._groups[0]:
-                        self._groups.popleft()
-                elif self._every:
+                if self._every:
                     arrival = self._every.popleft()
                 elif self._newest:
                     arrival = self._newest.pop(next(iter(self._newest)))
@@ -252,21 +247,12 @@ class PendingQueue:
             stream.unreported += lost
 
     def pop_batch(self) -> Batch | None:
-        """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
-        from nedbus.client.batch import by_message, make_batch
+        """Return all messages of one kind that are queued, up to 4096, None if there are none; count the invalid."""
+        from nedbus.client.batch import make_batch
 
         while True:
             with self._lock:
-                arrived: list[Arrival] = []
-                if not self._groups:
-                    arrived = [*self._newest.values()] or [
-                        self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))
-                    ]
-                    self._newest.clear()
-            groups = by_message(arrived, self._decoder)  # without the lock: it waits for what a message is, perhaps
-            with self._lock:
-                self._groups.extend(groups)
-                taken = self._groups.popleft() if self._groups else []
+                taken = self._take_batch()
                 lost = sum(lost for _, _, _, lost in taken)
                 for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
                     lost, stream.unreported = lost + stream.unreported, 0
@@ -279,6 +265,18 @@ class PendingQueue:
                 self._received += len(batch)
                 return batch
             taken[0][0].unreported += lost
+
+    def _take_batch(self) -> list[Arrival]:
+        """Take the messages that are of the kind of the first one; the others still wait, in order."""
+        every, newest = self._every, self._newest
+        waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
+        taken = [arrival for arrival in waiting if arrival[0].message == waiting[0][0].message]
+        rest = [arrival for arrival in waiting if arrival[0].message != waiting[0][0].message]
+        if self.newest_only:
+            self._newest = {arrival[0].key: arrival for arrival in rest}
+        else:
+            every.extendleft(reversed(rest))
+        return taken
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
         if request.until is None:
