@@ -337,7 +337,7 @@ def test_batch_goes_past_what_is_invalid() -> None:
 
 def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever reads asks what a message is, and waits; what arrives meanwhile is queued at once."""
-    monkeypatch.setattr(layout_lookup, "_JOIN", DEADLINE)
+    monkeypatch.setattr(layout_lookup, "_JOIN_TIMEOUT", DEADLINE)
     asked, answered = threading.Event(), threading.Event()
 
     def find(_: Collection[str]) -> Schemas:

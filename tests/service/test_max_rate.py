@@ -146,7 +146,7 @@ def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock
                 wait_for_demand(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._downsampled  # as nobody else could see
+            assert not bus._publishers._matched  # as nobody else could see
         assert subscription.counts == nedbus.Counts(received=11)
 
 

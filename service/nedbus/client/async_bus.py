@@ -126,7 +126,7 @@ class AsyncBus:
             self._bus = opening.result()
         except asyncio.CancelledError:
             cancelled.set()  # the thread would try on, and Python waits for it
-            opening.cancel()  # nobody is to hear that it gave up
+            opening.cancel()  # its result is not needed
             raise
         return self
 
@@ -168,7 +168,7 @@ class AsyncPublisher:
 
     @property
     def published(self) -> int:
-        """How many messages it has published."""
+        """Messages published so far."""
         return self._publisher.published
 
     async def publish(self, message: Message | Mapping[str, object]) -> None:

@@ -76,7 +76,7 @@ class Bus:
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
-        Either way `counts` has what was lost, dropped or invalid, and nobody else has to wait.
+        Either way `counts` has what was lost, dropped or invalid, and no other reader has to wait.
         `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for links that carry no
         more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is left
         out here. What is left out is neither lost nor dropped.
@@ -122,7 +122,7 @@ class Bus:
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
         """Return the vehicles that are published now, and the addresses of each; `latest` has their messages.
 
-        The first call asks, and waits at most `timeout` seconds; from then on the bus follows who comes and goes.
+        The first call asks, and waits at most `timeout` seconds; from then on the bus follows their liveliness tokens.
         """
         self._require_open()
         return self._directory.vehicles(timeout=timeout)
@@ -153,7 +153,7 @@ class Bus:
     ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
-        The router knows it then: whoever subscribes from now on gets the last message, be there only one.
+        The router knows it then: a reader that subscribes from now on gets the last message, be there only one.
         `lossless` is for replays as fast as readers take them: while a reader of mode "every" has more than 2,000
         messages to read, `publish` waits for it, and sends 10 a second meanwhile; `close` waits until they have all.
         `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
@@ -161,7 +161,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # what was declared before an answer came is known to whoever gave it
+        self._publishers.is_alive(address)  # the router that answers knows what was declared before
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

@@ -1,4 +1,4 @@
-"""Closing what a script forgot: never in the thread that collects garbage, and in any case before the process ends."""
+"""Finalizers: close what a script forgot, never in the thread that collects garbage, and before the process ends."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ _FAILED: Final = 1.0  # s until a job that failed is called again
 _JOIN_TIMEOUT: Final = 10.0  # s that a turn has to get out of Zenoh
 
 Job = Callable[[float], float]
-"""Do what is due at this time, in monotonic seconds; return how many seconds later to be called again, at the latest.
+"""Do what is due at this time, in monotonic seconds; return the seconds until the next call, at the latest.
 
 It is called earlier where others are, and must never wait.
 """
@@ -83,8 +83,8 @@ class Housekeeping:
 class Wakeup:
     """Wake one thread that waits, as an Event does that each wait clears.
 
-    The methods of an Event are Python: KeyboardInterrupt amid one leaves its lock taken, and whoever uses it next
-    waits for ever. A SimpleQueue is C; it has one item, or none.
+    The methods of an Event are Python: KeyboardInterrupt amid one leaves its lock taken, and the next user waits
+    for ever. A SimpleQueue is C; it has one item, or none.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Which addresses are published: asked once, then followed by their liveliness tokens."""
+"""The addresses that are published: queried once, then followed by their liveliness tokens."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _CONTRADICTED: Final = 0.2  # s after one that looks complete, and lacks what is
 
 
 class VehicleDirectory:
-    """Know the addresses that are published, from the first question on.
+    """The addresses that are published, from the first query on.
 
-    Asking a router for all tokens costs everybody who shares it; following them costs nothing while nothing changes.
+    Asking a router for all tokens costs all its clients; following them costs nothing while nothing changes.
     Zenoh 1.10 can leave out of an answer, on a busy host, any of the tokens that this session was told of before, and
     it looks complete: so all tokens are followed from the first, and what is known has to be in an answer.
-    At most 10,000 tokens are kept, whoever declares them; that there are more, or that the router was too slow to list
+    At most 10,000 tokens are kept of all peers; that there are more, or that the router was too slow to list
     them, is logged.
     """
 

@@ -67,7 +67,7 @@ class Writer:
 
 @dataclass(slots=True)
 class _Silence:
-    """The silence of a writer since it had `published` so many messages; it begins with the first."""
+    """The silence of a writer since its last message, of the number `published`; it begins with the first."""
 
     publisher: zenoh.Publisher
     published: int = 0

@@ -44,7 +44,7 @@ _MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
 
 @dataclass(slots=True, eq=False)
 class KeyState:
-    """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
+    """State of a key: its address, codec and publishers, and the losses to be reported of it.
 
     `key`: that of the stream at full rate; `heard`: that on which messages come, perhaps downsampled.
     `codec`: that of its messages, None while nothing defines `message`; `size`: bytes of a payload of ours.
@@ -66,19 +66,19 @@ class KeyState:
     unreported: int = 0
 
     def carry(self, codec: Codec[Any]) -> None:
-        """Take note of which messages these are."""
+        """Note the codec of these messages."""
         self.codec, self.size, self.message = codec, codec.size, codec.definition.name
 
 
 class Kept(NamedTuple):
-    """What is kept of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
+    """The parts of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
 
     timestamp: zenoh.Timestamp | None
     source_info: zenoh.SourceInfo | None
     provenance: Provenance
 
 
-Arrival = tuple[KeyState, bytes, RawSample | Kept, int]  # the last: how many messages were lost before it
+Arrival = tuple[KeyState, bytes, RawSample | Kept, int]  # the last: number of messages lost before it
 
 
 class Decoder:
@@ -90,10 +90,10 @@ class Decoder:
         self._prefix = prefix
         self._streams: dict[str, KeyState] = {}
         self._warned: set[int] = set()  # hashes of keys, which may be long
-        self._counting = threading.Lock()  # whoever receives and whoever reads both reject
+        self._counting = threading.Lock()  # the receiving and the reading thread both reject
 
     def stream(self, key: str) -> KeyState:
-        """Return what is known of a key; raise AddressError for one that is none of ours."""
+        """Return the state of a key; raise AddressError for one that is none of ours."""
         stream = self._streams.get(key)
         if stream is None:
             from_key = Address.from_rate_key if "/@" in key else Address.from_key  # only with a max_rate
@@ -106,7 +106,7 @@ class Decoder:
         return stream
 
     def learn(self, batch: Iterable[RawSample]) -> None:
-        """Ask for what is not known of these, and wait for the answer: for a thread on which nothing arrives."""
+        """Ask for unknown messages and layouts of these, and wait for the answer: not for a thread that receives."""
         for raw in batch:
             with suppress(AddressError, DecodeError):
                 stream, payload = self.stream(str(raw.key_expr)), raw.payload.to_bytes()
@@ -115,7 +115,7 @@ class Decoder:
         self._layouts.wait()
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
-        """Return what is worth queueing, with no losses so far; what is rejected, without its payload, for its number.
+        """Return arrivals to queue, with no losses so far; rejected ones without a payload, for their number.
 
         A payload of the size that `encode` writes is decoded when it is read; any other already here, as it must
         neither displace a valid sample nor take up much memory.
@@ -170,24 +170,21 @@ class Decoder:
             if payload:
                 self.reject(stream.key, DecodeError("no publisher has said what it is", stream.message))
             return None
+        decode = codec.decode_row if rows else codec.decode
         try:
-            message = codec.decode_row(payload) if rows else codec.decode(payload)
-        except DecodeError as exc:
-            newer = self._layouts.newer(codec.definition)
-            if not (isinstance(exc, UnknownLayoutError) and exc.layout in newer):
-                self.reject(stream.key, exc)
-                return None
             try:
-                message = (codec.decode_row if rows else codec.decode)(payload, newer=newer)
-            except DecodeError as again:
-                self.reject(stream.key, again)
-                return None
+                message = decode(payload)
+            except UnknownLayoutError:
+                message = decode(payload, newer=self._layouts.newer(codec.definition))
+        except DecodeError as exc:
+            self.reject(stream.key, exc)
+            return None
         return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
 
     def resolve(self, stream: KeyState) -> Codec[Any] | None:
-        """Return the codec of a stream whose message has no file here, None if nobody says what it is.
+        """Return the codec of a stream whose message has no file here, None if no publisher describes it.
 
-        A script that reads waits for an answer that is on its way, once; whoever receives does not.
+        A script that reads waits for an answer that is on its way, once; a thread that receives does not.
         """
         if stream.codec is None and stream.message:
             for _ in range(2):

@@ -94,7 +94,7 @@ class PendingQueue:
 
     @property
     def counts(self) -> Counts:
-        """What became of the messages so far."""
+        """Received, lost, dropped, invalid and discarded messages so far."""
         with self._lock:
             account = self._reader.account
             dropped = self._dropped + account.dropped
@@ -102,12 +102,12 @@ class PendingQueue:
 
     @property
     def waiting(self) -> int:
-        """How many messages wait to be read."""
+        """Messages that wait to be read."""
         return len(self._every) or len(self._newest)
 
     @property
     def held(self) -> int:
-        """How many messages wait for those before them."""
+        """Messages that are held back behind a gap."""
         return self._reader.account.held
 
     @property
@@ -121,7 +121,7 @@ class PendingQueue:
         self._decoder.count_invalid(count)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        """Queue all that has arrived, in its order, wake the reader, and reject what is not worth queueing.
+        """Queue all that has arrived, in its order, wake the reader, and reject what is invalid.
 
         `overflowed`: it comes from a ring that was full, and perhaps dropped something: nothing is asked for.
         """
