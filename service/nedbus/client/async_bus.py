@@ -41,7 +41,7 @@ class AsyncBus:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a link to a router at this moment."""
+        """True while there is a link to a router."""
         return self._opened().connected
 
     @property

@@ -56,7 +56,7 @@ class Bus:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a link to a router at this moment."""
+        """True while there is a link to a router."""
         self._require_open()
         return bool(self._session.info.routers_zid())
 

@@ -42,7 +42,7 @@ class Finalizer:
 
     @property
     def alive(self) -> bool:
-        """Whether it has not been called yet."""
+        """True until it has been called."""
         return self._finalize.alive
 
     def close_now(self) -> None:

@@ -75,7 +75,7 @@ class SourceStatus(_FromPeer):
 
     @property
     def ended(self) -> bool:
-        """Whether it will publish no more."""
+        """True once it will publish no more."""
         return self.state in {"done", "failed"}
 
 

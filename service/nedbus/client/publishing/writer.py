@@ -53,7 +53,7 @@ class Writer:
 
     @property
     def closed(self) -> bool:
-        """Whether nothing can be put any more."""
+        """True once nothing can be put any more."""
         return self._publisher is None
 
     def close(self) -> None:
