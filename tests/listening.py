@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator
-from typing import Any, Self, cast
+from typing import Self, cast
 
 import nedbus
 from nedbus.sources import Absence, LiveSource, Rejection, SourceMessage, parse_source
@@ -60,7 +60,7 @@ class Listener:
         self._events.close()
 
 
-def status_of_source(bus: nedbus.Bus) -> dict[str, Any]:
-    """Return the status of the service's only source, or nothing before there is one."""
-    services = cast("list[dict[str, Any]]", bus.services())
-    return services[0]["sources"][0] if services else {}
+def status_of_source(bus: nedbus.Bus) -> nedbus.SourceStatus:
+    """Return the status of the service's only source, or an empty one before there is one."""
+    services = bus.services()
+    return services[0].sources[0] if services else nedbus.SourceStatus()

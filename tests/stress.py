@@ -141,7 +141,7 @@ def _stress(endpoint: str, seconds: float) -> dict[str, float]:
             "latest": lambda: bus.latest(timeout=1.0),
             "subscribed": take_some,
             "every": lambda: take_some("every"),
-            "thinned": lambda: take_some(max_rate=5.0),
+            "downsampled": lambda: take_some(max_rate=5.0),
         }
         threads = [threading.Thread(target=repeat, args=each, name=each[0], daemon=True) for each in actions.items()]
         for thread in threads:

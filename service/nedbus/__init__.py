@@ -59,7 +59,10 @@ if TYPE_CHECKING:
         RejectionReport,
         Rejections,
         Sample,
+        ServiceStatus,
+        SourceStatus,
         StreamHealth,
+        StreamStatus,
         Subscription,
         connect,
         connect_async,
@@ -91,16 +94,16 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ANY", "DTYPE", "TOPICS", "AccountReport", "Address", "AddressError", "AddressInUseError", "AsyncBus",
-    "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError",
-    "ConnectError", "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition",
-    "Health", "Histogram", "InvalidMessageError", "LayoutError", "ListenError", "MapProjection", "Message",
-    "MessageArray", "Mode", "Monitor", "NedbusError", "NoDataError", "NoOrigin", "OutputError", "PkiError",
-    "Provenance", "Publisher", "Quantity", "RejectionReport", "Rejections", "ResetTracker", "Row", "Sample",
-    "Selection", "Session", "SourceError", "StreamHealth", "Subscription", "Tls", "Topic", "UnknownLayoutError",
-    "UtcOffset", "Vector", "VehicleLocalPosition", "VehicleReport", "addresses_of", "align", "connect",
-    "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "read",
-    "to_array", "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned", "variances_ned_to_enu",
-    "yaw_enu_to_ned", "yaw_ned_to_enu",
+    "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "ClosedError", "Condition", "ConfigError", "ConnectError",
+    "Continuous", "Counts", "DecodeError", "EncodeError", "Event", "ForkError", "GlobalPosition", "Health",
+    "Histogram", "InvalidMessageError", "LayoutError", "ListenError", "MapProjection", "Message", "MessageArray",
+    "Mode", "Monitor", "NedbusError", "NoDataError", "NoOrigin", "OutputError", "PkiError", "Provenance", "Publisher",
+    "Quantity", "RejectionReport", "Rejections", "ResetTracker", "Row", "Sample", "Selection", "ServiceStatus",
+    "Session", "SourceError", "SourceStatus", "StreamHealth", "StreamStatus", "Subscription", "Tls", "Topic",
+    "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition", "VehicleReport", "addresses_of", "align",
+    "connect", "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu",
+    "read", "to_array", "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned",
+    "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
 # `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.

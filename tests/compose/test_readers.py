@@ -71,7 +71,7 @@ def test_late_joiner_gets_the_last_value(make_stack: StartStack) -> None:
     stack = make_stack("late", NEDBUS_SOURCE="sim:?duration=2")
     stack.up()
     with nedbus.connect(stack.endpoint, timeout=DEADLINE) as bus:
-        wait_for(lambda: "'state': 'done'" in str(bus.services()), what="the end of the flight")
+        wait_for(lambda: "state='done'" in str(bus.services()), what="the end of the flight")
         last = Flight("sim:?duration=2").last(Address("1", VLP))
         modes: tuple[Mode, ...] = ("latest", "every")
         for mode in modes:

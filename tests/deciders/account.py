@@ -70,7 +70,7 @@ class QueueAccount(PendingQueue):
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # steps take no time
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
-        self._patience = mock.patch.object(writer_proxy, "_PATIENCE", 1e6)
+        self._patience = mock.patch.object(writer_proxy, "RETRANSMIT_TIMEOUT", 1e6)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         with self._capacity:

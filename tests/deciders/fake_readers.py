@@ -97,7 +97,7 @@ class World:
             self.advance(1 / rate)
             self.published += 1
             self.sent.append(self.now)
-            control.pace(self.published)
+            control.wait_for_credit(self.published)
 
     def plan(self, seconds: float, action: Callable[[], object]) -> None:
         """Let something happen after a number of seconds."""

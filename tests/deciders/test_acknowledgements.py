@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from nedbus.client.receiving.acknowledgements import MAX_PENDING, AckRequest
+from nedbus.client.receiving.pending_queue import MAX_ACK_REQUESTS, AckRequest
 from nedbus.transport import RawSample
 
 from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, raw
@@ -79,9 +79,9 @@ def test_publishers_are_answered_apart(asked: Asked) -> None:
 def test_of_too_many_requests_the_oldest_is_forgotten(asked: Asked) -> None:
     """No peer can make a reader remember more: an honest one asks again."""
     asked.put(raw(0))
-    for number in range(1, MAX_PENDING + 3):
+    for number in range(1, MAX_ACK_REQUESTS + 3):
         asked.ask(number)
-    assert len(asked.put(*map(raw, range(1, MAX_PENDING + 3)))) == MAX_PENDING
+    assert len(asked.put(*map(raw, range(1, MAX_ACK_REQUESTS + 3)))) == MAX_ACK_REQUESTS
 
 
 def test_queue_answers_when_the_message_is_put(asked: Asked) -> None:

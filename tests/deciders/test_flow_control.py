@@ -8,9 +8,9 @@ from itertools import pairwise
 
 import pytest
 
-from nedbus.client.publishing.flow_control import KEPT, WINDOW, FlowControl, SharedWindow
+from nedbus.client.publishing.flow_control import CACHE, WINDOW, FlowControl, SharedWindow
 from nedbus.client.receiving.pending_queue import CAPACITY
-from nedbus.client.receiving.receiver import RING
+from nedbus.client.receiving.receiver import RING_CAPACITY
 from nedbus.errors import ClosedError
 from nedbus.transport import LEASE
 
@@ -32,8 +32,8 @@ def control(world: World, monkeypatch: pytest.MonkeyPatch) -> FlowControl:
 
 def test_limits_fit_into_each_other() -> None:
     """Messages sent without an acknowledgement are still kept for recovery, and fit into the queue of each reader."""
-    assert WINDOW < LIMIT < KEPT < RING < CAPACITY
-    assert LIMIT + WINDOW == KEPT
+    assert WINDOW < LIMIT < CACHE < RING_CAPACITY < CAPACITY
+    assert LIMIT + WINDOW == CACHE
 
 
 @pytest.mark.parametrize("routers", [["r1"], []])

@@ -9,8 +9,7 @@ from typing import cast
 import pytest
 import zenoh
 
-from nedbus.client.publishing.heartbeats import HEARTBEAT, Heartbeats
-from nedbus.client.publishing.writer import Writer
+from nedbus.client.publishing.writer import HEARTBEAT, Heartbeats, Writer
 from nedbus.transport import Session
 
 

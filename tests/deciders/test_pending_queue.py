@@ -208,7 +208,7 @@ def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout
 def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
     """Return a queue of mode `every` for 10 samples, of which 4 are kept as they are."""
     monkeypatch.setattr(module, "CAPACITY", 10)
-    monkeypatch.setattr(module, "_FRESH", 4)
+    monkeypatch.setattr(module, "_MAX_FRESH", 4)
     return make_queue("every")
 
 
@@ -337,7 +337,7 @@ def test_batch_goes_past_what_is_invalid() -> None:
 
 def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever reads asks what a message is, and waits; what arrives meanwhile is queued at once."""
-    monkeypatch.setattr(layout_lookup, "_JOIN", DEADLINE)
+    monkeypatch.setattr(layout_lookup, "_JOIN_TIMEOUT", DEADLINE)
     asked, answered = threading.Event(), threading.Event()
 
     def find(_: Collection[str]) -> Schemas:

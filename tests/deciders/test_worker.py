@@ -9,8 +9,8 @@ from typing import Any, cast
 
 import pytest
 
+from nedbus import SourceStatus
 from nedbus.client import PublisherRegistry
-from nedbus.daemon.status import SourceStatus
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account

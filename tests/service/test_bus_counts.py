@@ -81,7 +81,7 @@ def test_unread_subscription_holds_up_nobody(
     client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
 ) -> None:
     """While it is full, others of its bus and of another get all, and its bus still asks; it does not hold close."""
-    monkeypatch.setattr("nedbus.client.receiving.receiver.RING", 256)
+    monkeypatch.setattr("nedbus.client.receiving.receiver.RING_CAPACITY", 256)
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 1000)
     stuck = client.subscribe(VLP, mode=mode)
     with nedbus.connect(endpoint) as other:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import msgpack
 import pytest
@@ -47,15 +47,15 @@ def serve(run_nedbus: Start) -> Iterator[Serve]:
         yield start_service
 
 
-def source_of(bus: nedbus.Bus, number: int = 0) -> dict[str, object]:
-    """Return what the service says of a source; nothing while it does not answer."""
-    sources = [cast("list[dict[str, object]]", status["sources"]) for status in bus.services()]
-    return sources[0][number] if sources and sources[0] else {}
+def source_of(bus: nedbus.Bus, number: int = 0) -> nedbus.SourceStatus:
+    """Return what the service says of a source; an empty status while it does not answer."""
+    sources = [status.sources for status in bus.services()]
+    return sources[0][number] if sources and sources[0] else nedbus.SourceStatus()
 
 
 def has_state(bus: nedbus.Bus, state: str, number: int = 0) -> Callable[[], bool]:
     """Return the condition that a source has this state."""
-    return lambda: source_of(bus, number).get("state") == state
+    return lambda: source_of(bus, number).state == state
 
 
 def expected_rows(path: Path) -> dict[str, list[list[str]]]:
@@ -136,7 +136,7 @@ def test_replay_keeps_its_order_and_speed(tmp_path: Path, serve: Serve) -> None:
     path = write_log(tmp_path / "a.ulg", range(0, 4_000_001, 100_000))
     service, bus = serve("--until-done", "-s", f"ulog:{path}?speed=10&wait=1")
     wait_for(has_state(bus, "waiting"), what="the service")
-    assert source_of(bus)["published"] == 0
+    assert source_of(bus).published == 0
     with bus.subscribe(VLP, mode="every") as subscription:
         samples = [subscription.receive(DEADLINE) for _ in range(41)]
     assert [sample.message.x for sample in samples] == list(range(41))
@@ -163,8 +163,8 @@ def test_any_file_name_is_served(tmp_path: Path, serve: Serve, locale: str) -> N
     for number in range(len(texts)):
         wait_for(has_state(bus, "done", number), what=texts[number])
         status = source_of(bus, number)
-        assert status["published"] == 2
-        assert str(status["source"]).startswith(f"ulog:{tmp_path}/")
+        assert status.published == 2
+        assert status.source.startswith(f"ulog:{tmp_path}/")
 
 
 def test_ended_replay_starts_again_or_keeps_its_last_value(tmp_path: Path, serve: Serve) -> None:
@@ -196,7 +196,7 @@ def test_invalid_message_is_rejected_counted_and_reported(
     report, _ = [json.loads(sample.payload.to_bytes()) for sample in take(listener.handler, 2)]
     assert "z: must be finite while z_valid is true" in report["reason"]
     assert (report["fields"]["timestamp"], report["fields"]["z"]) == (3, "NaN")
-    assert source_of(bus)["rejected"] == 2
+    assert source_of(bus).rejected == 2
     assert "1/vehicle_local_position rejected: z: must be finite" in service.err
 
 
@@ -206,7 +206,7 @@ def test_failing_source_stops_nobody(tmp_path: Path, serve: Serve) -> None:
     service, bus = serve("-s", f"ulog:{missing}?vehicle=late", "-s", "sim:")
     wait_for(lambda: bus.latest(VLP, vehicle="1"), what="the good source")
     wait_for(has_state(bus, "retrying"), what="a retry")
-    assert "no such file" in str(source_of(bus)["error"])
+    assert "no such file" in str(source_of(bus).error)
     write_log(missing, [0, 1000])
     wait_for(lambda: bus.latest(VLP, vehicle="late"), what="the source that came later")
     assert service.popen.poll() is None
@@ -243,7 +243,7 @@ def test_signal_ends_a_replay_that_a_stuck_reader_holds(tmp_path: Path, serve: S
         published: list[object] = [0]
 
         def stands() -> bool:
-            published.append(source_of(bus).get("published", 0))
+            published.append(source_of(bus).published)
             return published[-1] == published[-2] != 0
 
         wait_for(stands, what="the replay to be held")

@@ -245,7 +245,7 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
     wait_for(lambda: sum(len(each.vehicles) for each in bus.accounts()) == len(sources), what="the vehicles")
 
     def has_ended() -> bool:
-        states = [source["state"] for service in bus.services() for source in service["sources"]]  # type: ignore[attr-defined]  # it is one of ours
+        states = [source.state for service in bus.services() for source in service.sources]
         return states == ["done"] * len(sources)
 
     wait_for(has_ended, what="the end of the flights")

@@ -13,7 +13,7 @@ import pytest
 
 import nedbus
 from nedbus import Batch
-from nedbus.client.publishing.flow_control import KEPT, WINDOW
+from nedbus.client.publishing.flow_control import CACHE, WINDOW
 from nedbus.transport import Session, open_router
 from nedbus_msgs import Address, Row, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
@@ -115,7 +115,7 @@ def test_exception_does_not_wait_for_readers(client: nedbus.Bus, monkeypatch: py
 
 def test_nothing_is_lost_while_the_router_is_away() -> None:
     """A lossless publisher sends no more than it keeps, and goes on when its reader is back at the router."""
-    endpoint, count = free_endpoint(), KEPT + 1000
+    endpoint, count = free_endpoint(), CACHE + 1000
     router = open_router(listen=(endpoint,))
     with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:
         publisher = bus.publisher(VLP, vehicle="1", lossless=True)

@@ -7,14 +7,14 @@ from contextlib import closing
 import zenoh
 
 import nedbus
-from nedbus.client.receiving.receiver import take_all
+from nedbus.client.receiving.receiver import drain
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
 from nedbus_msgs import decode
 from tests.messages import VLP
 from tests.waits import wait_for
 
+from .downsampling import Link, wait_for_demand
 from .publishing import publish, wait_for_subscriber
-from .thinning import Link, wait_for_demand
 
 
 def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> None:
@@ -24,7 +24,7 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
     samples: list[zenoh.Sample] = []
 
     def received() -> list[int]:
-        return [decode(sample.payload.to_bytes()).timestamp for sample in take_all(subscriber.handler, samples)]
+        return [decode(sample.payload.to_bytes()).timestamp for sample in drain(subscriber.handler, samples)]
 
     with closing(Link(endpoint)) as link, open_client([link.endpoint], timeout=5.0) as session:
         publisher = bus.publisher(VLP, vehicle="1")

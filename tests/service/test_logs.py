@@ -334,8 +334,8 @@ def test_flapping_vehicles_are_bounded(start: Start, endpoint: str, raw: Session
 
     def status(name: str) -> object:
         (answer,) = bus.services()
-        (source,) = cast("list[dict[str, object]]", answer["sources"])
-        return source[name]
+        (source,) = answer.sources
+        return getattr(source, name)
 
     for px4 in fleet:
         px4.put(2_000_000)

@@ -17,7 +17,7 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
-from nedbus.client.receiving import ThinnedQueue
+from nedbus.client.receiving import MaxRateQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
 from tests.messages import VLP, message
@@ -25,8 +25,8 @@ from tests.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
 from .answering import answering, reply_with
+from .downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from .publishing import is_read, take, wait_for_subscriber
-from .thinning import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 
 __all__ = ["Clock", "clock", "publish", "take", "wait_for_demand"]  # for others that thin
 
@@ -59,7 +59,7 @@ def test_invalid_rate_is_refused(client: nedbus.Bus) -> None:
 
 
 def test_every_topic_and_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
-    """Each stream of a selection is thinned for itself, with its address; instances too."""
+    """Each stream of a selection is downsampled for itself, with its address; instances too."""
     addresses = [Address("1", VLP), Address("2", VLP), Address("2", "estimator_local_position", 3)]
     publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in addresses]
     for publisher in publishers:
@@ -79,18 +79,18 @@ def test_every_topic_and_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
 def test_messages_arrive_as_they_were(bus: nedbus.Bus, clock: Clock) -> None:
     """Payload, source, missing fields and the time of sending are those of the stream."""
     publisher = bus.publisher(VLP, vehicle="7", source="ins")
-    with bus.subscribe(VLP, mode="every") as whole, bus.subscribe(VLP, mode="every", max_rate=5) as thinned:
+    with bus.subscribe(VLP, mode="every") as whole, bus.subscribe(VLP, mode="every", max_rate=5) as downsampled:
         wait_for_demand(publisher)
         wait_for_subscriber(publisher)
         clock.now += 10 * MS
         publisher.publish({"timestamp": 5, "x": 0.1})
-        one, other = whole.receive(DEADLINE), thinned.receive(DEADLINE)
+        one, other = whole.receive(DEADLINE), downsampled.receive(DEADLINE)
     assert (one.message, one.address, one.sent) == (other.message, other.address, other.sent)
     assert (other.source, other.missing) == (one.source, one.missing) == ("ins", one.missing)
     assert "y" in other.missing
 
 
-def test_array_is_thinned(bus: nedbus.Bus, clock: Clock) -> None:
+def test_array_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
     """publish_many thins as well: what is sent at once counts as one moment."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
@@ -104,12 +104,12 @@ def test_array_is_thinned(bus: nedbus.Bus, clock: Clock) -> None:
 
 
 def thinned_by(raw: Session) -> list[str]:
-    """Return the thinned streams that are declared, by their liveliness tokens."""
+    """Return the downsampled streams that are declared, by their liveliness tokens."""
     return [str(reply.ok.key_expr) for reply in raw.liveliness().get("nedbus/**/@rate/*") if reply.ok]
 
 
 def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
-    """A publisher declares thinned streams for who reads them, and withdraws them a minute after; not for others."""
+    """A publisher declares downsampled streams for their readers, and withdraws them a minute after; not for others."""
     publisher, other = (bus.publisher(VLP, vehicle=vehicle) for vehicle in "78")
     subscription = bus.subscribe(VLP, mode="every")
     wait_for_subscriber(publisher)
@@ -121,7 +121,7 @@ def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Cl
             wait_for_demand(publisher)
             publish(publisher, clock, 11, 2)
             publish(other, clock, 11, 2)
-            wait_for(lambda: thinned_by(raw) == [f"{publisher.key}/@rate/5"], what="the thinned stream")
+            wait_for(lambda: thinned_by(raw) == [f"{publisher.key}/@rate/5"], what="the downsampled stream")
         wait_for(lambda: not is_wanted(publisher), what="the end of the demand")
         publish(publisher, clock, 13, 3000)
         assert thinned_by(raw)
@@ -131,11 +131,11 @@ def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Cl
             publish(publisher, clock, 4000, 1)
             return not thinned_by(raw)
 
-        wait_for(withdraws, what="the end of the thinned stream")
+        wait_for(withdraws, what="the end of the downsampled stream")
 
 
 def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
-    """Closed publishers leave nothing, and another one of the same vehicle is thinned again."""
+    """Closed publishers leave nothing, and another one of the same vehicle is downsampled again."""
     first = bus.publisher(VLP, vehicle="8")
     first.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
@@ -146,7 +146,7 @@ def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock
                 wait_for_demand(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._downsampled  # as nobody else could see
+            assert not bus._publishers._matched  # as nobody else could see
         assert subscription.counts == nedbus.Counts(received=11)
 
 
@@ -223,11 +223,11 @@ def test_lossless_publisher_does_not_wait(endpoint: str, bus: nedbus.Bus) -> Non
         wait_for_demand(publisher)
         start = time.monotonic()
 
-        def reads_thinned() -> bool:
+        def reads_downsampled() -> bool:
             publisher.publish(message(0))
             return bool(subscription.waiting)
 
-        wait_for(reads_thinned, what="the first message")
+        wait_for(reads_downsampled, what="the first message")
         for timestamp in range(1, 10_001):
             publisher.publish(message(timestamp))
         assert publisher.flush(DEADLINE)
@@ -257,14 +257,14 @@ def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: 
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let readers give up the wait for a thinned stream at once."""
-    monkeypatch.setattr("nedbus.client.receiving.thinned_queue.PATIENCE", 0.0)
+    """Let readers give up the wait for a downsampled stream at once."""
+    monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
 
 
 def test_publisher_of_an_older_nedbus(
     endpoint: str, bus: nedbus.Bus, impatient: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """One that thins nothing is read whole, thinned by the reader, said once; when it learns to thin, no longer."""
+    """One that thins nothing is read whole, downsampled by the reader, said once; when it learns to thin, no longer."""
     knows = False
     put = Downsampler.put
     monkeypatch.setattr(Downsampler, "put", lambda *args: put(*args) if knows else None)
@@ -290,9 +290,9 @@ def test_publisher_of_an_older_nedbus(
             # Two at once perhaps, after a pause of this process.
             assert len(sent) <= 10 * (sent[-1] - sent[0]) / 1e9 + 2.1
         assert subscription.counts == nedbus.Counts(received=len(taken))
-        assert caplog.text.count("nobody sends it thinned") == 1
+        assert caplog.text.count("its publisher does not downsample") == 1
         knows = True
-        wait_for(lambda: publish_until_taken() and not any(map(is_read, publishers)), what="no more whole streams")
+        wait_for(lambda: publish_until_taken() and not any(map(is_read, publishers)), what="no full rate")
         assert subscription.counts.lost == 0
 
 
@@ -316,21 +316,21 @@ def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, cap
         start = time.monotonic()
         wait_for(put_until_taken, what="messages")
         assert time.monotonic() - start >= 0.2  # 4 messages at 10 Hz, two of them at once perhaps
-        assert caplog.text.count("nobody sends it thinned") == 1
+        assert caplog.text.count("its publisher does not downsample") == 1
 
 
-def test_vehicle_that_thins_is_never_read_whole(
+def test_vehicle_that_downsamples_is_never_read_at_full_rate(
     bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A downsampled stream is not read at full rate, also when its last message was long ago."""
     looks: list[set[str]] = []
-    unthinned = ThinnedQueue.unthinned
+    full_rate_keys = MaxRateQueue.full_rate_keys
 
-    def look(queue: ThinnedQueue, now: float) -> set[str]:
-        looks.append(unthinned(queue, now))
+    def look(queue: MaxRateQueue, now: float) -> set[str]:
+        looks.append(full_rate_keys(queue, now))
         return looks[-1]
 
-    monkeypatch.setattr(ThinnedQueue, "unthinned", look)
+    monkeypatch.setattr(MaxRateQueue, "full_rate_keys", look)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
     with caplog.at_level(logging.WARNING), bus.subscribe(VLP, max_rate=5) as subscription:
@@ -338,7 +338,7 @@ def test_vehicle_that_thins_is_never_read_whole(
         wait_for_demand(publisher)
         publish(publisher, clock, 2, 1)
         assert take(subscription, 1) == [2]
-        monkeypatch.setattr("nedbus.client.receiving.thinned_queue.PATIENCE", 0.0)
+        monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
         before = len(looks)
         wait_for(lambda: len(looks) > before + 1, what="a look at streams that nobody thins")
         assert not any(looks)
@@ -362,7 +362,7 @@ def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -
 
 
 def test_rate_keys() -> None:
-    """The key of a thinned stream is that of the stream, a verbatim chunk that no wildcard matches, and the rate."""
+    """The key of a downsampled stream is that of the stream, a chunk that no wildcard matches, and the rate."""
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"
     assert Address.from_rate_key("nedbus/7/estimator_local_position/1/@rate/5") == address

@@ -18,11 +18,11 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus import StreamHealth
+from nedbus import SourceStatus, StreamHealth, StreamStatus
 from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
-from nedbus.daemon.status import SourceStatus, State, StreamStatus
+from nedbus.daemon.status import State
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, metrics, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_metrics
@@ -102,7 +102,7 @@ def test_pages_of_an_exporter(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """An exporter sees what is published, lost and invalid, and how long messages take."""
-    monkeypatch.setattr("nedbus.client.receiving.writer_proxy._PATIENCE", 0.1)  # nobody keeps what is missing
+    monkeypatch.setattr("nedbus.client.receiving.writer_proxy.RETRANSMIT_TIMEOUT", 0.1)  # nobody keeps what is missing
     publisher = raw.declare_publisher(f"nedbus/7/{VLP}")
     numbers = [1, 2, 3, 6, 7]  # 4 and 5 were lost before they came to the router
     of_stream = {"vehicle": "7", "topic": VLP}

@@ -25,9 +25,9 @@ from tests.command_line import run_command
 from tests.messages import VLP, message
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
+from .downsampling import MS, Clock, clock, wait_for_demand
 from .lossy import LossyQueue
 from .publishing import take, wait_for_subscriber
-from .thinning import MS, Clock, clock, wait_for_demand
 
 __all__ = ["clock"]  # a fixture
 

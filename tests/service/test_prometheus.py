@@ -39,7 +39,7 @@ PATIENCE = 90.0  # s until all alerts have fired, or cleared
 HURRIED = """
 import nedbus.client.receiving.pending_queue, nedbus.client.receiving.writer_proxy, nedbus.daemon.worker
 nedbus.client.receiving.pending_queue.CAPACITY = 100
-nedbus.client.receiving.writer_proxy._PATIENCE = 1.0
+nedbus.client.receiving.writer_proxy.RETRANSMIT_TIMEOUT = 1.0
 nedbus.daemon.worker._BACKOFF = (1.0,)
 from nedbus.cli import main
 main()

@@ -165,7 +165,7 @@ def wait_until_counted(bus: nedbus.Bus, count: int) -> None:
 
     def is_counted() -> bool:
         now = status_of_source(bus)
-        return bool(now["published"] + now["rejected"] == count)
+        return now.published + now.rejected == count
 
     wait_for(is_counted, what=f"{count} messages")
 
@@ -233,7 +233,7 @@ def test_flight_arrives_as_it_was_logged(where: str) -> None:
                 total += 1
         wait_until_counted(bus, total)
         now = status_of_source(bus)
-        assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (total, 0, 0, 0)
+        assert (now.published, now.rejected, now.lost, now.reboots) == (total, 0, 0, 0)
         assert (total, every.counts.lost) == (26_514, 0)
     assert equal == {
         "1/estimator_local_position/0": 5318,
@@ -305,10 +305,10 @@ def test_every_message_arrives_as_it_was_logged(where: str) -> None:
             if total % WINDOW == 0:
                 read_all()
         read_all()
-        wait_for(lambda: status_of_source(bus)["published"] >= total, what="the last one to be counted")
+        wait_for(lambda: status_of_source(bus).published >= total, what="the last one to be counted")
         now = status_of_source(bus)
-        assert (total, now["rejected"], now["lost"], now["reboots"]) == (69_605, 0, 11, 0)
-        assert (now["not_carried"], now["silent"]) == ([], [])
+        assert (total, now.rejected, now.lost, now.reboots) == (69_605, 0, 11, 0)
+        assert (now.not_carried, now.silent) == ((), ())
         assert every.counts == nedbus.Counts(received=every.counts.received)
     assert (equal[True], equal[False]) == (45_702, 755)
 
@@ -338,10 +338,10 @@ def test_topics_that_a_px4_loses_are_named(where: str) -> None:
             px4.send(sent)
             last = sent
         with repeating(lambda: px4.send(last)):
-            wait_for(lambda: set(status_of_source(bus)["silent"]) == silent, what="silent topics")
+            wait_for(lambda: set(status_of_source(bus).silent) == silent, what="silent topics")
             findings = examine(load_settings(None, connect=(where,)), version=nedbus.__version__, listen=0.1)
-            uncarried = status_of_source(bus)["not_carried"]
-    assert uncarried == sorted(uncarried)
+            uncarried = status_of_source(bus).not_carried
+    assert list(uncarried) == sorted(uncarried)
     assert {"SensorCombined", "VehicleControlMode", "VehicleCommandAck", "AirspeedValidated"} < set(uncarried)
     [loss] = [each for each in findings if "nothing arrives while" in each.seen]
     assert (loss.state, "rel=" in loss.advice) == ("warning", True)
@@ -375,10 +375,10 @@ def test_two_that_are_alike_are_not_mixed(where: str) -> None:
         received = [encode_cdr(every.receive(DEADLINE).message.__dict__, layout="1.16") for _ in alone]
         assert sorted(received) == sorted(sent.cdr for sent in alone)
         now = status_of_source(bus)
-        assert (now["published"], now["rejected"]) == (len(alone), played - len(alone))
-        assert (now["lost"], now["reboots"], every.counts.lost) == (0, 0, 0)
-        assert len(now["warnings"]) == 4
-        assert all("two vehicles are alike" in warning for warning in now["warnings"])
+        assert (now.published, now.rejected) == (len(alone), played - len(alone))
+        assert (now.lost, now.reboots, every.counts.lost) == (0, 0, 0)
+        assert len(now.warnings) == 4
+        assert all("two vehicles are alike" in warning for warning in now.warnings)
 
 
 def test_restart_is_one_reboot(where: str) -> None:
@@ -391,7 +391,7 @@ def test_restart_is_one_reboot(where: str) -> None:
             with Px4(where) as px4:
                 play(bus, [px4], lines, played)
         now = status_of_source(bus)
-        assert (now["published"], now["rejected"], now["lost"], now["reboots"]) == (2 * len(messages), 0, 0, 1)
+        assert (now.published, now.rejected, now.lost, now.reboots) == (2 * len(messages), 0, 0, 1)
 
 
 def read_datagrams(path: Path) -> Iterator[tuple[int, bytes]]:

@@ -224,11 +224,11 @@ def test_message_without_a_file_is_read_by_its_definition(
     wait_for_reader(raw, key)
     token = raw.liveliness().declare_token(publisher_token(TopicKey.parse(key), "px4", "px4", 1))
     raw.put(key, b"")
-    wait_for(lambda: status_of_source(bus).get("not_carried") == ["WheelEncoders"], what="the list")
-    assert status_of_source(bus)["rejected"] == 0
+    wait_for(lambda: status_of_source(bus).not_carried == ("WheelEncoders",), what="the list")
+    assert status_of_source(bus).rejected == 0
     assert "not carried: WheelEncoders" in run_command("info", "--connect", endpoint).out
     token.undeclare()
-    wait_for(lambda: status_of_source(bus)["not_carried"] == [], what="the list to be empty")
+    wait_for(lambda: status_of_source(bus).not_carried == (), what="the list to be empty")
     service.kill()
     run_nedbus("serve", "--connect", endpoint, "-s", f"px4-zenoh:?msg={tmp_path}")
     wait_for_reader(raw, key)
@@ -240,7 +240,7 @@ def test_message_without_a_file_is_read_by_its_definition(
     with bus.subscribe("wheel_encoders") as wheels, repeating(lambda: put(1.5)):
         assert wheels.receive(DEADLINE).message.__dict__ == {"timestamp": 1, "wheel_speed": (1.5, 2.0)}
     put(501.0)
-    wait_for(lambda: status_of_source(bus)["rejected"] == 1, what="the message out of range")
+    wait_for(lambda: status_of_source(bus).rejected == 1, what="the message out of range")
 
 
 def test_newer_layout_is_read_by_its_definition(
@@ -374,7 +374,7 @@ def test_hostile_keys_leave_the_status_readable(serve: Callable[[], Process], ra
     for number in range(100):
         raw.put(f"0/{'a' * 4000}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
         raw.put(f"0/{'a' * 300}{number}/{dds_type(ROS2_TYPE)}/{type_hash('1.16')}", b"")
-    wait_for(lambda: status_of_source(bus).get("rejected") == 200, what="the status")
+    wait_for(lambda: status_of_source(bus).rejected == 200, what="the status")
 
 
 def test_what_waits_to_be_decoded_is_small(listener: Listener, raw: Session) -> None:
@@ -449,14 +449,14 @@ def test_stale_vehicle_is_not_listed(
 
     def is_stale() -> bool:
         other.put(time.monotonic_ns())
-        return bool(status_of_source(bus)["stale"] == [f"1/{VLP}"])
+        return status_of_source(bus).stale == (f"1/{VLP}",)
 
-    assert status_of_source(bus)["state"] == "running"
+    assert status_of_source(bus).state == "running"
     wait_for(is_stale, what="the status to be stale")
     assert list(bus.vehicles()) == ["domain1"]
     assert "is stale: nothing arrived for 3 s" in service.err
     px4.put(2)
-    wait_for(lambda: status_of_source(bus)["stale"] == [], what="the vehicle to be back")
+    wait_for(lambda: status_of_source(bus).stale == (), what="the vehicle to be back")
     assert {"1", "domain1"} >= set(bus.vehicles()) >= {"1"}
 
 

@@ -177,7 +177,7 @@ def test_reader_that_dies_is_given_up(
     number: signal.Signals,
 ) -> None:
     """A replay goes on without one that is killed, or ends, and others miss nothing."""
-    monkeypatch.setattr("nedbus.client.publishing.flow_control.RETURN", 0.5)
+    monkeypatch.setattr("nedbus.client.publishing.flow_control.RETURN_TIMEOUT", 0.5)
     dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
     _, sending = publish_all(bus)

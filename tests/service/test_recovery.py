@@ -18,7 +18,7 @@ from nedbus import Counts
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
-from nedbus.client.receiving.receiver import take_all
+from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
 from nedbus_msgs import encode
 from tests.first_message import encoding_of
@@ -86,7 +86,7 @@ def test_publisher_that_keeps_nothing_is_asked_once(
     lossy: Lossy, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another program numbers its messages, and has no cache: after one wait in vain it is asked once for a hole."""
-    monkeypatch.setattr(writer_proxy, "_PATIENCE", 0.2)
+    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
     foreign = zenoh.ext.declare_advanced_publisher(raw, key, sample_miss_detection=misses)
@@ -107,11 +107,11 @@ def test_publisher_that_keeps_nothing_is_asked_once(
 
 def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """One that was silent has lost nothing by that once it has answered."""
-    monkeypatch.setattr(writer_proxy, "_PATIENCE", 0.2)
+    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
     lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
     lossy.publish(0, 1, 2)
     assert lossy.receive(2) == [0, 2]
-    monkeypatch.setattr(writer_proxy, "_PATIENCE", DEADLINE)
+    monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", DEADLINE)
     lossy.unanswered = 0
     lossy.publish(3, 4)
     assert lossy.receive(2) == [3, 4]
@@ -156,7 +156,7 @@ def test_newest_message_is_recovered_by_heartbeat(
     assert lossy.subscription.counts == Counts(received=3)
     assert lossless.counts == Counts()
     elsewhere: list[zenoh.Sample] = []
-    wait_for(lambda: len(take_all(foreign.handler, elsewhere)) == 3, what="the messages in another session")
+    wait_for(lambda: len(drain(foreign.handler, elsewhere)) == 3, what="the messages in another session")
     assert WAKE_UP not in {str(sample.encoding) for sample in elsewhere}
     foreign.undeclare()
 
@@ -254,7 +254,7 @@ def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pyte
 
 def test_only_so_many_questions_are_open(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """Gaps of 60 vehicles at the same moment are requested a few at a time, and all are filled."""
-    monkeypatch.setattr(retransmission, "_OPEN", 4)
+    monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
         wait_for_subscriber(publisher)
@@ -278,7 +278,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
 
 def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(pending_queue, "_HELD_OF_KEY", 50)
+    monkeypatch.setattr(pending_queue, "_MAX_HELD_OF_KEY", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
@@ -287,7 +287,7 @@ def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyP
 
 def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Recovered messages do not push out those that a slow reader has not read yet."""
-    monkeypatch.setattr(retransmission, "_BEHIND", 5)
+    monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(lambda: (lossy.queue.waiting, lossy.queue.held) == (10, 9), what="what comes before the hole and after it")

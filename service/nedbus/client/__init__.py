@@ -7,23 +7,23 @@ from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
+from .discovery.service_status import ServiceStatus, SourceStatus, StreamStatus
 from .discovery.services import RejectionReport, Rejections, find_accounts, find_services
-from .health.histogram import Histogram
-from .health.stream_health import Health, Monitor, StreamHealth
+from .health.stream_health import Health, Histogram, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
 from .housekeeping import Housekeeping
-from .publishing.heartbeats import HEARTBEAT
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
+from .publishing.writer import HEARTBEAT
 from .rate_gate import check_max_rate
 from .sample import Counts, Mode, Sample
 from .subscription import AsyncSubscription, Subscription
 
 if TYPE_CHECKING:
-    from .batch import Batch
+    from .receiving.batch import Batch
 else:
-    __getattr__ = lazy_exports(__name__, {"Batch": ("", "batch")})  # NumPy takes longer to load than all the rest
+    __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})  # NumPy takes longer to load than all the rest
 
 __all__ = [
     "HEARTBEAT",
@@ -44,8 +44,11 @@ __all__ = [
     "RejectionReport",
     "Rejections",
     "Sample",
+    "ServiceStatus",
+    "SourceStatus",
     "StreamHealth",
     "StreamState",
+    "StreamStatus",
     "Subscription",
     "check_max_rate",
     "connect",

@@ -16,6 +16,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Message, Selection, vehicle
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
+from .discovery.service_status import ServiceStatus
 from .discovery.services import Rejections
 from .publishing.publisher import FLUSH_TIMEOUT, Publisher
 from .sample import Mode, Sample
@@ -40,7 +41,7 @@ class AsyncBus:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a link to a router at this moment."""
+        """True while there is a link to a router."""
         return self._opened().connected
 
     @property
@@ -88,7 +89,7 @@ class AsyncBus:
         """Return the vehicles that are published now as `Bus.vehicles` does."""
         return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
 
-    async def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+    async def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service as `Bus.services` does."""
         return await asyncio.to_thread(self._opened().services, timeout=timeout)
 
@@ -125,7 +126,7 @@ class AsyncBus:
             self._bus = opening.result()
         except asyncio.CancelledError:
             cancelled.set()  # the thread would try on, and Python waits for it
-            opening.cancel()  # nobody is to hear that it gave up
+            opening.cancel()  # its result is not needed
             raise
         return self
 
@@ -167,7 +168,7 @@ class AsyncPublisher:
 
     @property
     def published(self) -> int:
-        """How many messages it has published."""
+        """Messages published so far."""
         return self._publisher.published
 
     async def publish(self, message: Message | Mapping[str, object]) -> None:

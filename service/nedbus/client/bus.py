@@ -18,6 +18,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
+from .discovery.service_status import ServiceStatus
 from .discovery.services import Rejections, find_accounts, find_schemas, find_services
 from .discovery.vehicle_directory import VehicleDirectory
 from .housekeeping import Housekeeping
@@ -25,7 +26,7 @@ from .protocol import LIVE
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
-from .receiving import Decoder, LayoutLookup, PendingQueue, Receiver, ThinnedQueue, ThinnedReceiver
+from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
 from .sample import Mode, Sample
 from .subscription import Subscription
 
@@ -55,7 +56,7 @@ class Bus:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a link to a router at this moment."""
+        """True while there is a link to a router."""
         self._require_open()
         return bool(self._session.info.routers_zid())
 
@@ -75,10 +76,10 @@ class Bus:
         `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
-        Either way `counts` has what was lost, dropped or invalid, and nobody else has to wait.
-        `max_rate`: at most so many messages a second of each stream, thinned by its publisher, for links that carry no
-        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is thinned
-        here. What is left out is neither lost nor dropped.
+        Either way `counts` has what was lost, dropped or invalid, and no other reader has to wait.
+        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for links that carry no
+        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is left
+        out here. What is left out is neither lost nor dropped.
 
         Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
@@ -121,12 +122,12 @@ class Bus:
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
         """Return the vehicles that are published now, and the addresses of each; `latest` has their messages.
 
-        The first call asks, and waits at most `timeout` seconds; from then on the bus follows who comes and goes.
+        The first call asks, and waits at most `timeout` seconds; from then on the bus follows their liveliness tokens.
         """
         self._require_open()
         return self._directory.vehicles(timeout=timeout)
 
-    def services(self, *, timeout: float = 2.0) -> list[dict[str, object]]:
+    def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service on this network, as it reports it."""
         self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
@@ -152,7 +153,7 @@ class Bus:
     ) -> Publisher:
         """Return a publisher of one address; raise AddressInUseError if this bus has one already.
 
-        The router knows it then: whoever subscribes from now on gets the last message, be there only one.
+        The router knows it then: a reader that subscribes from now on gets the last message, be there only one.
         `lossless` is for replays as fast as readers take them: while a reader of mode "every" has more than 2,000
         messages to read, `publish` waits for it, and sends 10 a second meanwhile; `close` waits until they have all.
         `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
@@ -160,7 +161,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # what was declared before an answer came is known to whoever gave it
+        self._publishers.is_alive(address)  # the router that answers knows what was declared before
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
@@ -197,15 +198,15 @@ class Bus:
         decoder, name = Decoder(self._layouts, prefix=self.prefix), selection.key_expr(prefix=self.prefix)
         if max_rate is None:
             return PendingQueue(mode, decoder, name=name)
-        return ThinnedQueue(mode, decoder, max_rate=max_rate, name=name)
+        return MaxRateQueue(mode, decoder, max_rate=max_rate, name=name)
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
         self._require_open()
         session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
         receiver: Receiver
-        if isinstance(pending_queue, ThinnedQueue):
-            receiver = ThinnedReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
+        if isinstance(pending_queue, MaxRateQueue):
+            receiver = MaxRateReceiver(session, selection, pending_queue, prefix=prefix, housekeeping=housekeeping)
         else:
             receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue, housekeeping=housekeeping)
         self._receivers.add(receiver)

@@ -1,4 +1,4 @@
-"""What `subscribe` and `latest` return for each topic: only type checkers know, from the stub beside this file."""
+"""Decorators that type `subscribe` and `latest` by their topic, for type checkers, in the stub beside this file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Closing what a script forgot: never in the thread that collects garbage, and in any case before the process ends."""
+"""Finalizers: close what a script forgot, never in the thread that collects garbage, and before the process ends."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Finalizer:
 
     @property
     def alive(self) -> bool:
-        """Whether it has not been called yet."""
+        """True until it has been called."""
         return self._finalize.alive
 
     def close_now(self) -> None:

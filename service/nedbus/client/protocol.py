@@ -1,4 +1,4 @@
-"""What publishers and readers of nedbus tell each other beside messages.
+"""The protocol of publishers and readers of nedbus beside messages.
 
 A lossless publisher requests acknowledgements of the readers of mode `every` with the query
 `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`.

@@ -1,16 +1,21 @@
-"""Which messages of a stream pass when at most so many a second are asked for. Pure, with the caller's clock."""
+"""Downsampling: the rates that publishers offer, and the gate that lets messages pass at a rate. Pure."""
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from nedbus.errors import ConfigError
 
-from .qos import RATES
+RATES: Final = (1, 2, 5, 10, 20, 50, 100)
+"""Messages a second to which a publisher downsamples a stream for its readers, each on a key of its own."""
 
 
 class RateGate:
-    """Let at most `rate` messages a second pass: in T seconds rate x (T + 2.5 ms) + 2, two at once after a pause."""
+    """Let at most `rate` messages a second pass: in T seconds rate x (T + 2.5 ms) + 2, two at once after a pause.
+
+    The clock is the caller's.
+    """
 
     def __init__(self, rate: float) -> None:
         self._period = math.ceil(1e9 / rate)  # ns
@@ -38,5 +43,5 @@ def check_max_rate(max_rate: object) -> None:
 
 
 def rate_step(max_rate: float) -> int:
-    """Return which of RATES serves readers who ask for so much: the greatest that is not more, or else the least."""
+    """Return the rate to request of publishers: the greatest of RATES that is not above, or else the least."""
     return max((rate for rate in RATES if rate <= max_rate), default=RATES[0])

@@ -1,4 +1,4 @@
-"""What a reader gets: a Sample for each message, and the Counts of a subscription."""
+"""Sample, one message that arrived, and Counts of a subscription."""
 
 from __future__ import annotations
 
@@ -95,13 +95,13 @@ class Sample(Generic[M_co]):
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What became of the messages of a subscription.
+    """Counts of the messages of a subscription.
 
     `received`: handed to the reader.
     `lost`: lost in transit, and not recovered.
     `dropped`: arrived, but not read in time: superseded in mode "latest", beyond 65,536 that wait in mode "every".
     `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
-    `discarded`: came twice, or too late, as somebody sends under the id of another publisher, perhaps.
+    `discarded`: came twice, or too late, as another process sends under the id of a publisher, perhaps.
     """
 
     received: int = 0

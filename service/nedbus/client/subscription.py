@@ -20,14 +20,14 @@ from .receiving import PendingQueue, Receiver
 from .sample import Counts, M_co, Sample
 
 if TYPE_CHECKING:
-    from .batch import Batch
+    from .receiving.batch import Batch
 
 _YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop run
 _T = TypeVar("_T")
 
 
 class _SubscriptionBase(Generic[M_co]):
-    """What does not depend on how a reader waits: name, counts, and the forms of a message."""
+    """Name, counts and the forms of a message: all but the waiting."""
 
     def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
         self.name = name
@@ -37,12 +37,12 @@ class _SubscriptionBase(Generic[M_co]):
 
     @property
     def counts(self) -> Counts:
-        """What became of the messages so far."""
+        """Received, lost, dropped, invalid and discarded messages so far."""
         return self._queue.counts
 
     @property
     def waiting(self) -> int:
-        """How many messages have arrived and wait to be read."""
+        """Messages that have arrived and wait to be read."""
         return self._queue.waiting
 
 
@@ -56,7 +56,7 @@ class Subscription(_SubscriptionBase[M_co]):
     def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, name: str, owner: object) -> None:
         super().__init__(pending_queue, name=name)
         self._receiver = receiver
-        self._owner = owner  # the bus stays open for as long as somebody may read
+        self._owner = owner  # keeps the bus open as long as it may be read
         self._finalizer = Finalizer(self, receiver.close)
 
     def receive(self, timeout: float | None = None) -> Sample[M_co]:
@@ -205,7 +205,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
-            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # perhaps nobody waits for it
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # perhaps not awaited
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -217,5 +217,5 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
 def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:
     """Wake the reader, from any thread; a method would keep the subscription alive."""
-    with suppress(RuntimeError):  # the loop is closed: nobody waits any more
+    with suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(arrival.set)

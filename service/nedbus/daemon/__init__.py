@@ -2,15 +2,12 @@
 
 from .daemon import Daemon
 from .plan import Planned, plan_sources
-from .status import STATES, ServiceStatus, SourceMeasures, SourceStatus, StreamStatus
+from .status import STATES, SourceMeasures
 
 __all__ = [
     "STATES",
     "Daemon",
     "Planned",
-    "ServiceStatus",
     "SourceMeasures",
-    "SourceStatus",
-    "StreamStatus",
     "plan_sources",
 ]

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Final
 
-from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample
+from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
 from nedbus.events import QUESTION, Account, AccountReport, report_of
 from nedbus.log_event import about
@@ -22,7 +22,7 @@ from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_ro
 from nedbus_msgs import codec_of, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
-from .status import Role, ServiceStatus, SourceMeasures, SourceStatus
+from .status import Role, SourceMeasures
 from .worker import Worker
 from .workers import Workers
 from .write_permission import WritePermission, watch_permission

@@ -10,14 +10,12 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
 
-from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth
+from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import Account
 from nedbus.log_event import about
 from nedbus.sources import Absence, Rejection, ReplayRun, SourceMessage
 from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
-
-from .status import StreamStatus
 
 _log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
-from nedbus.client import PublisherRegistry
+from nedbus.client import PublisherRegistry, SourceStatus, StreamStatus
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
@@ -17,7 +17,7 @@ from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySour
 from nedbus.transport import Session
 
 from .output import SourceOutput
-from .status import SourceMeasures, SourceStatus, State, StreamStatus
+from .status import SourceMeasures, State
 
 _log = logging.getLogger(__name__)
 

@@ -59,7 +59,7 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
 def _check_reading(seen: Observation) -> Finding:
     if any(stream.address is not None for stream in seen.streams.values()) or seen.ages:
         return Finding("read", "", "ok", "this client may read: messages arrive")
-    published = sorted({address for service in seen.services for address in reported(service)})
+    published = sorted({address for service in seen.services for address in reported(service.status)})
     if not published:
         return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
     text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"
@@ -78,7 +78,7 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
     yield from _check_states(seen)
-    hidden = sorted({each for service in seen.services for each in reported(service)} - set(map(str, known)))
+    hidden = sorted({each for service in seen.services for each in reported(service.status)} - set(map(str, known)))
     hidden = [each for each in hidden if vehicle in (None, each.partition("/")[0])]
     for each in hidden if seen.streams or seen.ages else ():  # else nothing at all may be read
         advice = "may that service write this vehicle? a router drops what its rules do not allow: docs/security.md"
@@ -136,9 +136,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
 def check_clocks(seen: Observation) -> Iterator[Finding]:
     """Yield the clocks that are off; where all others agree and this host's does not, it is this host's."""
     clocks = {  # how far each is ahead of ours, and how well that is known [s]
-        f"service {brief(service.text('service'))} on {brief(service.text('host'))}": (service.offset, service.error)
-        for service in seen.services
-        if service.offset is not None
+        f"service {brief(each.status.service)} on {brief(each.status.host)}": (each.offset, each.error)
+        for each in seen.services
+        if each.offset is not None
     }
     for stream in seen.streams.values():
         if stream.address is not None and stream.delay is not None:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Final, TypeVar, cast
+from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus.client import find_accounts, find_services
+from nedbus.client import ServiceStatus, find_accounts, find_services
 from nedbus.events import AccountReport
 from nedbus.transport import (
     PublisherToken,
@@ -47,20 +47,9 @@ _RING: Final = 16_384  # samples of a subscription that wait
 class Service:
     """The status of a service as it reports it, and its clock: ahead of ours by `offset` +- `error` [s]."""
 
-    status: Mapping[str, object]
+    status: ServiceStatus
     offset: float | None
     error: float
-
-    @property
-    def sources(self) -> list[Mapping[str, object]]:
-        """The status of its sources."""
-        sources = self.status.get("sources")
-        return [each for each in sources if isinstance(each, dict)] if isinstance(sources, list) else []
-
-    def text(self, name: str) -> str:
-        """Return a value of the status as text, "" if it has none."""
-        value = self.status.get(name)
-        return "" if value is None else str(value)
 
 
 @dataclass(slots=True)
@@ -182,9 +171,8 @@ def _ask_services(session: Session, prefix: str) -> list[Service]:
     error = (time.time() - before) / 2
     services = []
     for status in statuses[:_MAX_SERVICES]:
-        now = status.get("now")
-        is_time = isinstance(now, int | float) and abs(now) < _MAX_TIME  # NaN is not
-        services.append(Service(status, cast("float", now) - before - error if is_time else None, error))
+        now = status.now if status.now is not None and abs(status.now) < _MAX_TIME else None  # NaN is not
+        services.append(Service(status, None if now is None else now - before - error, error))
     return services
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Final
 
@@ -11,8 +12,7 @@ import typer
 
 from nedbus.cli.options import JsonOption, on_bus
 from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
-from nedbus.cli.status import refused_of, sources_of, streams_of
-from nedbus.client import Bus, to_age
+from nedbus.client import Bus, SourceStatus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, Expectation, faults_of
 from nedbus_msgs import ANY, DEFAULT_TOPIC, check_vehicle
@@ -119,9 +119,9 @@ def _vehicle_faults(
     if expected.valid or expected.within is not None:
         told = {report.service for report in reports}
         silent = [
-            to_text(each.get("service"), 64)
+            to_text(each.service, 64)
             for each in bus.services()
-            if each.get("service") not in told and (anywhere or each.get("host") == socket.gethostname())
+            if each.service not in told and (anywhere or each.host == socket.gethostname())
         ]
         found += [f"service {each} does not say what happens to its vehicles: update nedbus there" for each in silent]
     return [*found, *doubtful]
@@ -147,8 +147,8 @@ class _Report:
 def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float, wanted: Expectation) -> _Report:
     host = socket.gethostname()
     anywhere = vehicle is not None or expected is not None or bool(wanted.expect) or wanted.vehicles is not None
-    found = [each for each in bus.services() if anywhere or each.get("host") == host]
-    sources = [source for service in found for source in sources_of(service)]
+    found = [each for each in bus.services() if anywhere or each.host == host]
+    sources = [source for service in found for source in service.sources]
     ages = _ages(sources)
     denied = ""
     if vehicle is not None:
@@ -159,8 +159,8 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
         ages = {vehicle: min(known)} if answers and known else {}
     report = _Report(None, len(found), len(sources), ages)
     at = " or ".join(bus.routers)
-    refused = sorted({to_text(name, 64) for service in found for name in refused_of(service)})
-    failed = [source for source in sources if source.get("state") in {"retrying", "failed"}]
+    refused = sorted({to_text(name, 64) for service in found for name in service.refused})
+    failed = [source for source in sources if source.state in {"retrying", "failed"}]
     if expected is not None and len(found) < expected:
         report.reason = f"{len(found)} of {expected} services answer at {at}"
     elif not found and not anywhere:
@@ -169,11 +169,9 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
         report.reason = f"the router refuses vehicle {', '.join(refused)[:300]}: do its access rules name it?"
     elif failed and vehicle is None:
         source = failed[0]
-        report.reason = " ".join(
-            (to_text(source.get("source")), "is", f"{to_text(source.get('state'))}:", to_text(source.get("error"), 300))
-        )
+        report.reason = f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
     elif not ages and (vehicle is not None or not (wanted.expect or wanted.vehicles)):
-        states = ", ".join(f"{to_text(each.get('source'), 60)} is {to_text(each.get('state'), 20)}" for each in sources)
+        states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in sources)
         what = "no vehicle is published" if vehicle is None else f"vehicle {vehicle} is not published"
         report.reason = f"{what}{denied or (f': {states[:300]}' if states else '')}"
     elif ages and min(ages.values()) > max_age:
@@ -182,13 +180,12 @@ def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float
     return report
 
 
-def _ages(sources: list[dict[str, object]]) -> dict[str, float]:
+def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
     """Return the age of the newest message of each vehicle that is published, as its service measures it [s]."""
     ages: dict[str, float] = {}
     for source in sources:
-        published = source.get("addresses")
-        for address, health_ in streams_of(source):
-            vehicle = to_text(address.partition("/")[0], 64)
-            if health_.age is not None and isinstance(published, list) and address in published:
-                ages[vehicle] = min(health_.age, ages.get(vehicle, health_.age))
+        for stream in source.streams:
+            vehicle, age = to_text(stream.address.partition("/")[0], 64), stream.health.age
+            if age is not None and stream.address in source.addresses:
+                ages[vehicle] = min(age, ages.get(vehicle, age))
     return ages

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from difflib import get_close_matches
 from typing import Annotated, Any, Final
 
@@ -14,8 +15,7 @@ from nedbus.cli.options import FieldOption, JsonOption, VehicleOption, on_bus, p
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import terminal_width, to_table
-from nedbus.cli.status import list_of, refused_of, sources_of, streams_of
-from nedbus.client import Bus, Health, describe_stream, health_of_last, stream_state, to_age
+from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
     ANY,
@@ -99,23 +99,23 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     vehicles = bus.vehicles()
     if json_output:
         for service in services:
-            write(json.dumps(service))
+            write(json.dumps(asdict(service)))
         return
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
     width = terminal_width()
     for service in services[:_MAX_ROWS]:
-        name, version, role = (to_text(service.get(key)) for key in ("service", "version", "role"))
+        name, version, role = map(to_text, (service.service, service.version, service.role))
         write(f"\nservice {name}, nedbus {version}, as {role}")
-        rows = [_source_row(source) for source in sources_of(service)]
+        rows = [_source_row(source) for source in service.sources]
         if rows:
             write(to_table(_SOURCE_HEAD, rows, width=width, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
-            if absent := [str(each) for source in sources_of(service) for each in list_of(source, what)]:
+            if absent := [each for source in service.sources for each in getattr(source, what)]:
                 write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
-        if refused := refused_of(service):
+        if refused := service.refused:
             write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
-        streams = [_stream_row(source, refused, *each) for source in sources_of(service) for each in streams_of(source)]
+        streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         if streams:
             table = to_table(_STREAM_HEAD, streams, width=width, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
@@ -162,13 +162,11 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     raise ConfigError("message", f"there is no file for {topic!r}, {reason}: {hint}")
 
 
-def _source_row(source: dict[str, object]) -> list[str]:
-    keys = ("source", "state", "published", "rejected", "lost", "reboots", "retries")
-    gone = len(list_of(source, "stale"))
-    return [
-        *(to_text(source.get(key, "-")) for key in keys),
-        to_text(source.get("error") or (f"{gone} gone" if gone else "-")),
-    ]
+def _source_row(source: SourceStatus) -> list[str]:
+    numbers = (source.published, source.rejected, source.lost, source.reboots, source.retries)
+    gone = len(source.stale)
+    remark = source.error or (f"{gone} gone" if gone else "-")
+    return [*map(to_text, (source.source, source.state, *numbers, remark))]
 
 
 def _fold_list(head: str, text: str, width: int | None) -> str:
@@ -177,9 +175,9 @@ def _fold_list(head: str, text: str, width: int | None) -> str:
     return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
-def _stream_row(source: dict[str, object], refused: Sequence[str], address: str, health: Health) -> list[str]:
-    addresses = source.get("addresses")
-    alive = address in addresses if isinstance(addresses, list) else None
+def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:
+    address, health = stream.address, stream.health
+    alive = address in source.addresses
     is_refused = address.partition("/")[0] in refused
     suffix = ", by PX4's definition" if TOPICS.keys().isdisjoint(address.split("/")) else ""
     return [

@@ -12,7 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from nedbus.daemon import Daemon, SourceStatus
+from nedbus.client import SourceStatus
+from nedbus.daemon import Daemon
 from nedbus.log_event import about
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 from nedbus_msgs import DEFAULT_TOPIC

@@ -1,1 +1,1 @@
-"""What is known of others: who publishes, which services there are, which layouts they know, what they reject."""
+"""Discovery of peers: vehicles, services and their status, layouts, rejected messages."""

@@ -8,31 +8,27 @@ from __future__ import annotations
 
 import math
 import time
+from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from typing import Final, cast
 
 from nedbus.client.sample import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
 
-from .histogram import Histogram
-
 _REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
 _GAP: Final = 3.0  # times the usual step of PX4's time
 _SETTLED: Final = 5  # steps from which on there is a usual one
 _WEIGHT: Final = 0.05  # of a new step in the usual one, and of a new second in the usual rate
-_MAX_LATENCIES: Final = 1000  # that are kept of a window
+_MAX_MEASURED: Final = 1000  # intervals and latencies that are kept of a window
 _WINDOW: Final = 1_000_000_000  # ns
 _STALE: Final = 3.0  # s without a message after which a stream has no rate
 _COUNTER: Final = 256  # where reset counters wrap
 _LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, limits of the histogram
 _MAX_STREAMS: Final = 4096  # that a monitor follows
-_NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # what is looked at
-_UNSEEN: Final = (0,) * (len(_NAMES) - 1)
-_of_message: Callable[[object], tuple[int, ...]] = attrgetter(*_NAMES)
-_of_fields: Callable[[Mapping[str, object]], tuple[int, ...]] = itemgetter(*_NAMES)
+_NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # fields of a position that are followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +77,39 @@ class _Window:
 
     start: int
     messages: int = 0
-    intervals: int = 0
-    mean: float = 0.0
-    spread: float = 0.0
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_LATENCIES))
+    intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(DOUBT_FLAGS, 0))
 
-    def add_interval(self, seconds: float) -> None:
-        """Follow mean and spread as Welford does."""
-        self.intervals += 1
-        deviation = seconds - self.mean
-        self.mean += deviation / self.intervals
-        self.spread += deviation * (seconds - self.mean)
+    @property
+    def mean(self) -> float:
+        """The mean interval [s], 0 without any."""
+        return sum(self.intervals) / len(self.intervals) if self.intervals else 0.0
+
+    @property
+    def deviation(self) -> float:
+        """The standard deviation of the intervals [s]."""
+        mean = self.mean
+        return math.sqrt(sum((each - mean) ** 2 for each in self.intervals) / len(self.intervals))
+
+
+class Histogram:
+    """Count measurements by size; `limits` are the largest of each bucket but the last, which has no limit."""
+
+    def __init__(self, limits: Sequence[float]) -> None:
+        self.limits = tuple(limits)
+        self.sum = 0.0
+        self._counts = [0] * (len(self.limits) + 1)
+
+    def add(self, value: float) -> None:
+        """Count one measurement."""
+        self._counts[bisect_left(self.limits, value)] += 1
+        self.sum += value
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Number of measurements in each bucket, the one without a limit last."""
+        return tuple(self._counts)
 
 
 class StreamHealth:
@@ -120,7 +137,11 @@ class StreamHealth:
         self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
     ) -> None:
         """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
-        timestamp, *seen = _look(message) if self._is_position else (_time_of(message), *_UNSEEN)
+        names = _NAMES if self._is_position else _NAMES[:1]
+        if isinstance(message, Mapping):
+            timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
+        else:
+            timestamp, *seen = (getattr(message, name) for name in names)
         if received - self._window.start >= _WINDOW:
             self._end_window(received)
         window = self._window
@@ -128,7 +149,7 @@ class StreamHealth:
         self._lost += lost
         window.messages += 1
         if self._received is not None:
-            window.add_interval((received - self._received) / 1e9)
+            window.intervals.append((received - self._received) / 1e9)
         self._received = received
         rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
         if counters != self._counters:
@@ -149,12 +170,12 @@ class StreamHealth:
         now = time.monotonic_ns() if now is None else now
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
-        latencies = sorted(window.latencies)
-        is_live = window.intervals and window.mean > 0 and age is not None and age < max(_STALE, 2 * window.mean)
+        latencies, mean = sorted(window.latencies), window.mean
+        is_live = mean > 0 and age is not None and age < max(_STALE, 2 * mean)
         return Health(
-            rate=1 / window.mean if is_live else None,
+            rate=1 / mean if is_live else None,
             nominal=self._topic.rate,
-            jitter=math.sqrt(window.spread / window.intervals) if is_live else None,
+            jitter=window.deviation if is_live else None,
             latency=latencies[len(latencies) // 2] if latencies else None,
             latency_max=latencies[-1] if latencies else None,
             age=age,
@@ -175,8 +196,8 @@ class StreamHealth:
         window, self._window = self._window, _Window(received)
         if window.messages:
             self._last_window = window
-        if window.mean > 0:
-            rate = 1 / window.mean
+        if (mean := window.mean) > 0:
+            rate = 1 / mean
             usual = self._usual_rate or rate
             self._usual_rate = usual + _WEIGHT * (min(rate, 2 * usual) - usual)
 
@@ -235,20 +256,6 @@ class Monitor:
     def forget(self, address: Address) -> None:
         """Forget a stream; it is followed anew if it comes back."""
         self._streams.pop(address, None)
-
-
-def _time_of(message: Message | Mapping[str, object]) -> int:
-    return cast("int", message.get("timestamp", 0)) if isinstance(message, Mapping) else message.timestamp
-
-
-def _look(message: Message | Mapping[str, object]) -> tuple[int, ...]:
-    """Return the values of _NAMES; 0 for what is not given."""
-    if not isinstance(message, Mapping):
-        return _of_message(message)
-    try:
-        return _of_fields(message)
-    except KeyError:
-        return tuple(cast("int", message.get(name, 0)) for name in _NAMES)
 
 
 def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:

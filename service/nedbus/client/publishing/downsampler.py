@@ -1,7 +1,7 @@
 """Downsampled copies of a stream, one for each of RATES, while readers with a maximum rate subscribe to it.
 
 `<key>/@rate/5` has at most 5 messages a second of `<key>`, with sequence numbers and a cache of its own.
-A vehicle without such readers costs one declaration; a stream declares more once that one is matched.
+A vehicle that never had such readers costs one declaration; a stream declares more once that one is matched.
 """
 
 from __future__ import annotations
@@ -14,13 +14,11 @@ from typing import Final
 
 import zenoh
 
-from nedbus.client.qos import RATES, priority_of
-from nedbus.client.rate_gate import RateGate
+from nedbus.client.rate_gate import RATES, RateGate
 from nedbus.transport import Session, while_open
 from nedbus_msgs import ANY, Address, get_topic
 
-from .heartbeats import Heartbeats
-from .writer import Writer
+from .writer import Heartbeats, Writer, priority_of
 
 _CACHE: Final = 20  # s of messages that are kept for readers that missed some
 _LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come back, and get what they missed
@@ -66,7 +64,7 @@ class Downsampler:
         self._streams: list[_Stream] = []
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
-        """Publish a message at the rates for which it is due and wanted; this never waits for a reader."""
+        """Publish a message at the rates that are matched and for which it is due; this never waits for a reader."""
         if self._any_rate is None:
             if not self.vehicle.is_matched():
                 return
@@ -76,23 +74,15 @@ class Downsampler:
         if is_matched and not self._streams:
             self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._priority) for rate in RATES]
         for stream in self._streams:
-            stream.put(now, payload, stamp, encoding)
-        if not is_matched and not any(stream.writer for stream in self._streams):
-            self._close_streams()
-            if not self.vehicle.is_matched():
-                self.close()
+            if is_matched or stream.writer is not None:
+                stream.put(now, payload, stamp, encoding)
 
     def close(self) -> None:
-        """Withdraw all that is declared; a message that is put later declares it anew."""
-        self._close_streams()
-        if self._any_rate is not None:
-            self._any_rate.close()
-        self._any_rate = None
-
-    def _close_streams(self) -> None:
+        """Withdraw all that is declared."""
         for stream in self._streams:
             stream.close()
-        self._streams = []
+        if self._any_rate is not None:
+            self._any_rate.close()
 
 
 class _Stream:

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 import zenoh
 
-from nedbus.client.qos import priority_of
 from nedbus.errors import NedbusError
 from nedbus.transport import require_unforked, translate_error, while_open
 from nedbus_msgs import Address, Definition, Message, Provenance, codec_of, encoding_of, get_topic
 
 from .downsampler import Downsampler, MatchingListener
-from .flow_control import KEPT, FlowControl, SharedWindow
-from .heartbeats import Heartbeats
-from .writer import Writer
+from .flow_control import CACHE, FlowControl
+from .writer import Writer, priority_of
 
 if TYPE_CHECKING:
     from nedbus_msgs.arrays import MessageArray
+
+    from .publisher_registry import PublisherRegistry
 
 FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
 
@@ -38,25 +39,21 @@ class Publisher:
         address: Address,
         definition: Definition[Any],
         *,
-        prefix: str,
+        registry: PublisherRegistry,
+        matched: MatchingListener,
         lossless: bool,
         source: str | None,
-        heartbeats: Heartbeats,
-        downsampled: MatchingListener,
-        window: SharedWindow,
-        needs_router: bool,
-        on_close: Callable[[], object],
         owner: object,
     ) -> None:
+        prefix, heartbeats = registry.prefix, registry.heartbeats
         self.address = address
         self.key = address.key(prefix=prefix)
         self.source = Provenance(source).source
         self.lossless = lossless
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
-        session = heartbeats.session
-        self._new_timestamp = session.new_timestamp
-        self._on_close = on_close
-        self._owner = owner  # the bus stays open for as long as a script may publish
+        self._new_timestamp = heartbeats.session.new_timestamp
+        self._on_close = partial(registry.forget, address)
+        self._owner = owner  # keeps the bus open as long as a script may publish
         self.definition = definition
         self._codec = codec_of(definition)
         self._all = definition.all_fields
@@ -64,15 +61,15 @@ class Publisher:
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # the fields of messages, and their encoding
         topic = get_topic(address.topic)
         with while_open():
-            self._token = session.liveliness().declare_token(address.alive_key(prefix=prefix))
-        cache = KEPT if lossless else topic.kept
+            self._token = heartbeats.session.liveliness().declare_token(address.alive_key(prefix=prefix))
+        cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, priority=priority_of(topic), cache=cache, encoding=self._encoding)
-        self._flow_control = FlowControl(self._writer, window, needs_router=needs_router)
-        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=downsampled)
+        self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)
+        self._downsampler = Downsampler(heartbeats, address, prefix=prefix, vehicle=matched)
 
     @property
     def published(self) -> int:
-        """How many messages it has published."""
+        """Messages published so far."""
         return self._writer.published
 
     def publish(self, message: Message | Mapping[str, object]) -> None:
@@ -108,7 +105,7 @@ class Publisher:
     def publish_many(self, messages: MessageArray) -> None:
         """Validate all messages in a structured array of shape (n,) and dtype DTYPE, then publish them in order.
 
-        None is published if one is invalid. `published` tells how many were where the bus is closed meanwhile.
+        None is published if one is invalid. Where the bus is closed meanwhile, `published` is their number.
 
         Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`,
         ClosedError once the publisher or its bus is closed.
@@ -172,4 +169,4 @@ class Publisher:
         except zenoh.ZError as exc:
             raise translate_error(exc) from exc
         if self.lossless:
-            self._flow_control.pace(self.published)
+            self._flow_control.wait_for_credit(self.published)

@@ -1,4 +1,4 @@
-"""All publishers of a session by address, and what is known of others that publish or read the same."""
+"""All publishers of a session by address, with answers to queries for their last messages and schemas."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
-from .heartbeats import Heartbeats
 from .publisher import FLUSH_TIMEOUT, Publisher
 from .query_server import JSON, Answer, QueryServer, Reply
+from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
@@ -42,15 +42,13 @@ class PublisherRegistry:
     def __init__(
         self, session: Session, queries: QueryServer, housekeeping: Housekeeping, *, prefix: str, is_client: bool
     ) -> None:
-        self.prefix = prefix
+        self.prefix, self.is_client = prefix, is_client
+        self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries, self._housekeeping = session, queries, housekeeping
-        self._is_client = is_client
-        self._heartbeats = Heartbeats(session)
         self._publishers: dict[Address, Publisher] = {}
         self._vehicles: set[str] = set()  # whose queries are answered
         self._described: set[str] = set()  # names of messages whose schema is answered
-        self._downsampled: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
-        self._window = SharedWindow()
+        self._matched: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
         self._lock = threading.Lock()
 
     @property
@@ -79,30 +77,19 @@ class PublisherRegistry:
             if address in self._publishers:
                 raise AddressInUseError(address)
             vehicle = address.vehicle
-            if vehicle not in self._downsampled:
+            if vehicle not in self._matched:
                 key_expr = Selection(vehicle=vehicle).rate_key_expr(ANY, prefix=self.prefix)
-                self._downsampled[vehicle] = MatchingListener(self._session, key_expr)
-            publisher = Publisher(
-                address,
-                definition,
-                prefix=self.prefix,
-                lossless=lossless,
-                source=source,
-                heartbeats=self._heartbeats,
-                downsampled=self._downsampled[vehicle],
-                window=self._window,
-                needs_router=self._is_client,
-                on_close=lambda: self._forget(address),
-                owner=owner,
+                self._matched[vehicle] = MatchingListener(self._session, key_expr)
+            matched = self._matched[vehicle]
+            publisher = self._publishers[address] = Publisher(
+                address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
-            self._publishers[address] = publisher
             if definition.name not in self._described:
                 self._described.add(definition.name)
-                self._queries.answer_json(
-                    schema_key(definition.name, prefix=self.prefix), partial(schema_of, definition)
-                )
+                key = schema_key(definition.name, prefix=self.prefix)
+                self._queries.answer_json(key, partial(schema_of, definition))
             if not self._vehicles:
-                self._housekeeping.add(self._heartbeats.send_due)
+                self._housekeeping.add(self.heartbeats.send_due)
             if vehicle not in self._vehicles:
                 self._vehicles.add(vehicle)
                 self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._last_messages, vehicle))
@@ -145,11 +132,12 @@ class PublisherRegistry:
                     _log.info("%s: waiting for a slow reader", address, extra=about("slow-reader", address))
                 logged = True
 
-    def _forget(self, address: Address) -> None:
+    def forget(self, address: Address) -> None:
+        """Free an address whose publisher is closed."""
         with self._lock:
             self._publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self._publishers):
-                self._downsampled.pop(address.vehicle).close()
+                self._matched.pop(address.vehicle).close()
 
     def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
         for publisher in self.publishers:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,17 +11,17 @@ from typing import Final
 
 import zenoh
 
+from nedbus.client.housekeeping import Housekeeping
 from nedbus.log_event import about
 from nedbus.transport import Session, while_open
 
 _log = logging.getLogger(__name__)
 
 _MAX_PENDING: Final = 1000  # queries that wait for an answer, on each key expression; the oldest are not answered
-_TURN: Final = 64  # queries on one key expression until others have their turn
+_MAX_TURN: Final = 64  # queries on one key expression until others have their turn
 _POLL: Final = 0.01  # s between two polls for queries
 _IDLE_POLL: Final = 0.05  # s, when none has come for a second
 _BUSY: Final = 1.0  # s
-_JOIN: Final = 10.0  # s that an answer has to get out of Zenoh: its thread would abort a process that ends
 JSON: Final = "application/json"
 
 
@@ -47,21 +45,28 @@ class QueryServer:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._replies: list[tuple[zenoh.Queryable[zenoh.Handler[zenoh.Query]], zenoh.Handler[zenoh.Query], Reply]] = []
-        self._ended = threading.Event()
-        self._starting = threading.Lock()
-        self._thread: threading.Thread | None = None
+        self._queryables: list[zenoh.Queryable[zenoh.Handler[zenoh.Query]]] = []
+        self._thread = Housekeeping(name="nedbus-queries")
 
     def answer(self, key_expr: str, reply: Reply) -> None:
         """Answer queries on a key expression with what `reply` returns; raise ClosedError once it is closed."""
         channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
             queryable = self._session.declare_queryable(key_expr, channel)
-        self._replies.append((queryable, queryable.handler, reply))
-        with self._starting:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="nedbus-queries", daemon=True)
-                self._thread.start()
+        self._queryables.append(queryable)
+        busy_until, handler = 0.0, queryable.handler
+
+        def poll(now: float) -> float:
+            nonlocal busy_until
+            with suppress(zenoh.ZError):  # the session is closed
+                for _ in range(_MAX_TURN):
+                    if self._thread.closed or (query := handler.try_recv()) is None:
+                        break
+                    _answer(query, reply)
+                    busy_until = now + _BUSY
+            return _POLL if now < busy_until else _IDLE_POLL
+
+        self._thread.add(poll)
 
     def answer_json(
         self, key: str, content: Callable[[], Mapping[str, object]],
@@ -82,24 +87,10 @@ class QueryServer:
 
     def close(self) -> None:
         """Stop answering."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join(_JOIN)
-        for queryable, _, _ in self._replies:
+        self._thread.close()
+        for queryable in self._queryables:
             with suppress(zenoh.ZError):
                 queryable.undeclare()
-
-    def _run(self) -> None:
-        busy_until = 0.0
-        while not self._ended.wait(_POLL if time.monotonic() < busy_until else _IDLE_POLL):
-            for _, handler, reply in list(self._replies):
-                with suppress(zenoh.ZError):  # the session is closed
-                    for _ in range(_TURN):
-                        query = handler.try_recv()
-                        if query is None or self._ended.is_set():
-                            break
-                        _answer(query, reply)
-                        busy_until = time.monotonic() + _BUSY
 
 
 def _answer(query: zenoh.Query, reply: Reply) -> None:

@@ -2,9 +2,8 @@
 
 from .decoder import Decoder
 from .layout_lookup import LayoutLookup
+from .max_rate import MaxRateQueue, MaxRateReceiver
 from .pending_queue import PendingQueue
 from .receiver import Receiver
-from .thinned_queue import ThinnedQueue
-from .thinned_receiver import ThinnedReceiver
 
-__all__ = ["Decoder", "LayoutLookup", "PendingQueue", "Receiver", "ThinnedQueue", "ThinnedReceiver"]
+__all__ = ["Decoder", "LayoutLookup", "MaxRateQueue", "MaxRateReceiver", "PendingQueue", "Receiver"]

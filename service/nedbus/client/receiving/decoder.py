@@ -43,11 +43,11 @@ _MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
 
 
 @dataclass(slots=True, eq=False)
-class Stream:
-    """What is known of a key: what is derived from it once, who publishes on it, and what is to be reported of it.
+class KeyState:
+    """State of a key: its address, codec and publishers, and the losses to be reported of it.
 
-    `key`: that of the whole stream. `heard`: that on which messages come. `thinned`: these are those of a thinned copy.
-    `codec`: that of its messages, None while it is not known what a `message` is; `size`: bytes of a payload of ours.
+    `key`: that of the stream at full rate; `heard`: that on which messages come, perhaps downsampled.
+    `codec`: that of its messages, None while nothing defines `message`; `size`: bytes of a payload of ours.
     `writers`: its publishers, by name; `writer` is that of the last message.
     `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
     dropped or invalid; they are reported with the next sample that is read.
@@ -56,7 +56,6 @@ class Stream:
     key: str
     heard: str
     address: Address
-    thinned: bool = False
     codec: Codec[Any] | None = None
     size: int = -1
     message: str = ""
@@ -67,19 +66,19 @@ class Stream:
     unreported: int = 0
 
     def carry(self, codec: Codec[Any]) -> None:
-        """Take note of which messages these are."""
-        self.codec, self.size = codec, codec.size
+        """Note the codec of these messages."""
+        self.codec, self.size, self.message = codec, codec.size, codec.definition.name
 
 
 class Kept(NamedTuple):
-    """What is kept of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
+    """The parts of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
 
     timestamp: zenoh.Timestamp | None
     source_info: zenoh.SourceInfo | None
     provenance: Provenance
 
 
-Arrival = tuple[Stream, bytes, RawSample | Kept, int]  # the last: how many messages were lost before it
+Arrival = tuple[KeyState, bytes, RawSample | Kept, int]  # the last: number of messages lost before it
 
 
 class Decoder:
@@ -89,17 +88,17 @@ class Decoder:
         self.invalid = 0
         self._layouts = layouts
         self._prefix = prefix
-        self._streams: dict[str, Stream] = {}
+        self._streams: dict[str, KeyState] = {}
         self._warned: set[int] = set()  # hashes of keys, which may be long
-        self._counting = threading.Lock()  # whoever receives and whoever reads both reject
+        self._counting = threading.Lock()  # the receiving and the reading thread both reject
 
-    def stream(self, key: str) -> Stream:
-        """Return what is known of a key; raise AddressError for one that is none of ours."""
+    def stream(self, key: str) -> KeyState:
+        """Return the state of a key; raise AddressError for one that is none of ours."""
         stream = self._streams.get(key)
         if stream is None:
-            thinned = "/@" in key  # only who asks for thinned streams gets such keys
-            address = (Address.from_rate_key if thinned else Address.from_key)(key, prefix=self._prefix)
-            stream = Stream(address.key(prefix=self._prefix), key, address, thinned)
+            from_key = Address.from_rate_key if "/@" in key else Address.from_key  # only with a max_rate
+            address = from_key(key, prefix=self._prefix)
+            stream = KeyState(address.key(prefix=self._prefix), key, address)
             if address.topic in BY_TOPIC:
                 stream.carry(codec_of(BY_TOPIC[address.topic]))
             if len(self._streams) < MAX_KEYS:
@@ -107,7 +106,7 @@ class Decoder:
         return stream
 
     def learn(self, batch: Iterable[RawSample]) -> None:
-        """Ask for what is not known of these, and wait for the answer: for a thread on which nothing arrives."""
+        """Ask for unknown messages and layouts of these, and wait for the answer: not for a thread that receives."""
         for raw in batch:
             with suppress(AddressError, DecodeError):
                 stream, payload = self.stream(str(raw.key_expr)), raw.payload.to_bytes()
@@ -116,7 +115,7 @@ class Decoder:
         self._layouts.wait()
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
-        """Return what is worth queueing, with no losses so far; what is rejected, without its payload, for its number.
+        """Return arrivals to queue, with no losses so far; rejected ones without a payload, for their number.
 
         A payload of the size that `encode` writes is decoded when it is read; any other already here, as it must
         neither displace a valid sample nor take up much memory.
@@ -171,24 +170,21 @@ class Decoder:
             if payload:
                 self.reject(stream.key, DecodeError("no publisher has said what it is", stream.message))
             return None
+        decode = codec.decode_row if rows else codec.decode
         try:
-            message = codec.decode_row(payload) if rows else codec.decode(payload)
-        except DecodeError as exc:
-            newer = self._layouts.newer(codec.definition)
-            if not (isinstance(exc, UnknownLayoutError) and exc.layout in newer):
-                self.reject(stream.key, exc)
-                return None
             try:
-                message = (codec.decode_row if rows else codec.decode)(payload, newer=newer)
-            except DecodeError as again:
-                self.reject(stream.key, again)
-                return None
+                message = decode(payload)
+            except UnknownLayoutError:
+                message = decode(payload, newer=self._layouts.newer(codec.definition))
+        except DecodeError as exc:
+            self.reject(stream.key, exc)
+            return None
         return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
 
-    def resolve(self, stream: Stream) -> Codec[Any] | None:
-        """Return the codec of a stream whose message has no file here, None if nobody says what it is.
+    def resolve(self, stream: KeyState) -> Codec[Any] | None:
+        """Return the codec of a stream whose message has no file here, None if no publisher describes it.
 
-        A script that reads waits for an answer that is on its way, once; whoever receives does not.
+        A script that reads waits for an answer that is on its way, once; a thread that receives does not.
         """
         if stream.codec is None and stream.message:
             for _ in range(2):
@@ -216,7 +212,7 @@ class Decoder:
         extra = about("invalid", stream.address if stream else None, reason=reason)
         _log.warning("%r: %s%s", key[:_MAX_TEXT], reason, last, extra=extra)
 
-    def _inspect(self, stream: Stream, payload: bytes, raw: RawSample) -> None:
+    def _inspect(self, stream: KeyState, payload: bytes, raw: RawSample) -> None:
         if len(payload) > PAYLOAD_LIMIT:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
         if raw.kind == zenoh.SampleKind.DELETE:

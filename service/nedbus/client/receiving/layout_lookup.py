@@ -1,4 +1,4 @@
-"""Messages and layouts that this reader does not know: which are known by now, and when to ask for the others."""
+"""Lookup of messages and layouts that have no file here: publishers describe them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _log = logging.getLogger(__name__)
 _MAX_LAYOUTS: Final = 16  # newer layouts of a message, and messages without a file here that are remembered
 _MAX_MESSAGES: Final = 256
 _MAX_UNKNOWN: Final = 64  # that are asked for at once
-_PAUSES: Final = (0.0, 2.0, 5.0, 10.0, 30.0, 60.0)  # s after a question, by how many explained nothing new
+_PAUSES: Final = (0.0, 2.0, 5.0, 10.0, 30.0, 60.0)  # s after a question, by the number of those in vain
 _MAX_TEXT: Final = 300  # characters of names that a publisher wrote
-_JOIN: Final = 3.0  # s
+_JOIN_TIMEOUT: Final = 3.0  # s
 
 Schemas = Mapping[str, Mapping[int, Mapping[str, str]]]
 """Types of fields by name, by the number of their layout, by the message, as publishers know them."""
@@ -29,8 +29,8 @@ Schemas = Mapping[str, Mapping[int, Mapping[str, str]]]
 class LayoutLookup:
     """Ask publishers, through `find`, for messages that are not known here, by name, in a thread of its own.
 
-    A message of which that is asked is invalid until the answer is there: whoever receives never waits for it, as any
-    peer can send unknown messages, and leave questions unanswered.
+    Such a message is invalid until the answer is there: a thread that receives never waits for it, as any peer can
+    send unknown messages, and leave questions unanswered.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class LayoutLookup:
             raise
 
     def wait(self) -> None:
-        """Wait for the answers to what is being asked: for a thread on which nothing arrives."""
-        end, last = time.monotonic() + _JOIN, None
+        """Wait for the answers to open questions: not for a thread that receives."""
+        end, last = time.monotonic() + _JOIN_TIMEOUT, None
         while (thread := self._thread) is not last and thread is not None:
             thread.join(max(0.0, end - time.monotonic()))
             last = thread

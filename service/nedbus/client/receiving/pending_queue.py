@@ -1,7 +1,7 @@
-"""What waits to be read: every sample in order, or the newest of each key. No I/O.
+"""The queue between receiving and the reader: every sample in order, or the newest of each key. No I/O.
 
-Whoever receives puts, the reader's thread takes. Here is decided that a reader is too slow: `latest` supersedes what
-was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond. Both are counted, and hold back nobody.
+A slow reader: `latest` supersedes what was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond.
+Both are counted, and hold up no publisher and no other reader.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus.client.sample import Counts, Mode, Sample
@@ -19,27 +20,44 @@ from nedbus.log_event import about
 from nedbus.transport import RawSample
 from nedbus_msgs import AddressError
 
-from .acknowledgements import Acknowledgements, AckRequest
 from .decoder import MAX_KEYS, Arrival, Decoder
 from .stateful_reader import StatefulReader
 from .writer_proxy import WriterProxy
 
 if TYPE_CHECKING:
-    from nedbus.client.batch import Batch
+    from .batch import Batch
 
 _log = logging.getLogger(__name__)
 
 CAPACITY: Final = 65_536
 """Samples that are kept for a reader of mode `every`, some 45 MB; beyond, the oldest are dropped."""
 
-_HELD: Final = 2 * CAPACITY  # messages that wait for those before them, some 90 MB,
-_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key: whoever may publish there pushes out nobody else
+MAX_ACK_REQUESTS: Final = 1000
+"""Acknowledgement requests that wait for an answer; an honest publisher has one for each key at a time."""
+
+_MAX_HELD: Final = 2 * CAPACITY  # messages behind gaps, some 90 MB,
+_MAX_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key, so that one key does not push out others
 _MAX_BATCH: Final = 4096  # messages of a batch
-_FRESH: Final = 1024  # samples that are queued as they are; further ones are going to wait
+_MAX_FRESH: Final = 1024  # samples that are queued with Zenoh's buffer; further ones are going to wait
+
+
+@dataclass(slots=True, eq=False)
+class AckRequest:
+    """A publisher's request to acknowledge that message `number` has arrived or, with `read`, was read by the script.
+
+    `reply` answers it, and is called once. `until`: the samples that must have been read, once the message has arrived.
+    """
+
+    key: str
+    publisher: str
+    number: int
+    read: bool
+    reply: Callable[[], object]
+    until: int | None = None
 
 
 class PendingQueue:
-    """Queue what can be delivered until it is read, decode it then, and count what became of it; `name` is for the log.
+    """Queue what can be delivered, decode it when it is read, and count losses and drops; `name` is for the log.
 
     `on_gap` is called, in any thread, when something is missing that publishers may still have.
     """
@@ -50,7 +68,6 @@ class PendingQueue:
         decoder: Decoder,
         *,
         name: str = "",
-        thinned: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if mode not in get_args(Mode):
@@ -58,9 +75,9 @@ class PendingQueue:
         self.newest_only = mode == "latest"
         self.ended = False
         self.idle = False
-        """Set by whoever receives, while it waits and nothing is left to receive."""
+        """Set by the receiver, while it waits and nothing is left to receive."""
         self.drains = 0
-        """How often all that had arrived was put."""
+        """Number of times that all that had arrived was put."""
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
         """Called, in any thread, when there may be something to read: an event loop wakes its reader with it."""
@@ -71,14 +88,13 @@ class PendingQueue:
         self._tokens: queue.SimpleQueue[None] = queue.SimpleQueue()  # cheaper than a Condition
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
-        self._groups: deque[list[Arrival]] = deque()  # of batches that were taken, and not returned yet
-        self._reader = StatefulReader(decoder, recovers=not self.newest_only, thinned=thinned, clock=clock)
-        self._acknowledgements = Acknowledgements(self._reader)
+        self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
+        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
         self._arrived = self._dropped = self._received = 0
 
     @property
     def counts(self) -> Counts:
-        """What became of the messages so far."""
+        """Received, lost, dropped, invalid and discarded messages so far."""
         with self._lock:
             account = self._reader.account
             dropped = self._dropped + account.dropped
@@ -86,12 +102,12 @@ class PendingQueue:
 
     @property
     def waiting(self) -> int:
-        """How many messages wait to be read."""
-        return sum(map(len, self._groups)) + (len(self._every) or len(self._newest))
+        """Messages that wait to be read."""
+        return len(self._every) or len(self._newest)
 
     @property
     def held(self) -> int:
-        """How many messages wait for those before them."""
+        """Messages that are held back behind a gap."""
         return self._reader.account.held
 
     @property
@@ -105,7 +121,7 @@ class PendingQueue:
         self._decoder.count_invalid(count)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        """Queue all that has arrived, in its order, wake the reader, and reject what is not worth queueing.
+        """Queue all that has arrived, in its order, wake the reader, and reject what is invalid.
 
         `overflowed`: it comes from a ring that was full, and perhaps dropped something: nothing is asked for.
         """
@@ -123,7 +139,7 @@ class PendingQueue:
             self.on_wake()
         if overflowed:
             self._warn_once()
-        if self._acknowledgements.pending:
+        if self._ack_requests:
             self.acknowledge(drained=True)
 
     def on_link(self) -> None:
@@ -153,10 +169,10 @@ class PendingQueue:
 
     def bound(self) -> str:
         """Give up gaps for which too many messages are held back; return as `on_retransmission`."""
-        if self.held <= _HELD_OF_KEY:
+        if self.held <= _MAX_HELD_OF_KEY:
             return ""
         with self._lock:
-            return self._recover(self._reader.give_up(_HELD, _HELD_OF_KEY))
+            return self._recover(self._reader.give_up(_MAX_HELD, _MAX_HELD_OF_KEY))
 
     def give_up(self) -> None:
         """Give up all that is missing: it is lost."""
@@ -166,28 +182,30 @@ class PendingQueue:
     def add(self, request: AckRequest) -> None:
         """Answer a publisher's request as soon as it can be answered."""
         with self._lock:
-            self._acknowledgements.add(request)
+            self._ack_requests.append(request)
         self.acknowledge(drained=self.idle)
 
     def acknowledge(self, *, drained: bool) -> None:
-        """Answer the requests that can be answered now; `drained` as in Acknowledgements."""
+        """Answer the requests that can be answered now.
+
+        `drained`: all that came before them is queued, so that an unknown publisher has sent nothing to this reader.
+        """
         with self._lock:
-            if self.ended:
-                ready = self._acknowledgements.take_all()
-            else:
-                taken = self._arrived - self.waiting
-                ready = self._acknowledgements.settle(arrived=self._arrived, taken=taken, drained=drained)
+            ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
+            if ready:
+                waiting = (request for request in self._ack_requests if request not in ready)
+                self._ack_requests = deque(waiting, MAX_ACK_REQUESTS)
         for request in ready:
             request.reply()
 
     def end(self) -> None:
-        """Let readers know that nothing more comes, and publishers that nobody reads any more."""
+        """Tell readers that nothing more comes, and publishers that there is no reader any more."""
         self.ended = True
         self.acknowledge(drained=True)
         self.wake()
 
     def wake(self) -> None:
-        """Let a thread that waits look again, or the one that waits next, and an event loop."""
+        """Wake a thread that waits, or the one that waits next, and an event loop."""
         if self._tokens.empty():
             self._tokens.put(None)
         if self.on_wake is not None:
@@ -211,11 +229,7 @@ class PendingQueue:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take
-                if self._groups:
-                    arrival = self._groups[0].pop(0)
-                    if not self._groups[0]:
-                        self._groups.popleft()
-                elif self._every:
+                if self._every:
                     arrival = self._every.popleft()
                 elif self._newest:
                     arrival = self._newest.pop(next(iter(self._newest)))
@@ -224,7 +238,7 @@ class PendingQueue:
                 stream, _, _, lost = arrival
                 if stream.unreported:
                     lost, stream.unreported = lost + stream.unreported, 0
-            if self._acknowledgements.pending:
+            if self._ack_requests:
                 self.acknowledge(drained=False)
             sample = self._decoder.decode(arrival, rows=rows, lost=lost)
             if sample is not None:
@@ -233,25 +247,16 @@ class PendingQueue:
             stream.unreported += lost
 
     def pop_batch(self) -> Batch | None:
-        """Return all that is queued, None if that is nothing; what is invalid is counted and left out."""
-        from nedbus.client.batch import by_message, make_batch
+        """Return all messages of one kind that are queued, up to 4096, None if there are none; count the invalid."""
+        from .batch import make_batch
 
         while True:
             with self._lock:
-                arrived: list[Arrival] = []
-                if not self._groups:
-                    arrived = [*self._newest.values()] or [
-                        self._every.popleft() for _ in range(min(len(self._every), _MAX_BATCH))
-                    ]
-                    self._newest.clear()
-            groups = by_message(arrived, self._decoder)  # without the lock: it waits for what a message is, perhaps
-            with self._lock:
-                self._groups.extend(groups)
-                taken = self._groups.popleft() if self._groups else []
+                taken = self._take_batch()
                 lost = sum(lost for _, _, _, lost in taken)
                 for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
                     lost, stream.unreported = lost + stream.unreported, 0
-            if self._acknowledgements.pending:
+            if self._ack_requests:
                 self.acknowledge(drained=False)
             if not taken:
                 return None
@@ -261,6 +266,25 @@ class PendingQueue:
                 return batch
             taken[0][0].unreported += lost
 
+    def _take_batch(self) -> list[Arrival]:
+        """Take the messages that are of the kind of the first one; the others still wait, in order."""
+        every, newest = self._every, self._newest
+        waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
+        taken = [arrival for arrival in waiting if arrival[0].message == waiting[0][0].message]
+        rest = [arrival for arrival in waiting if arrival[0].message != waiting[0][0].message]
+        if self.newest_only:
+            self._newest = {arrival[0].key: arrival for arrival in rest}
+        else:
+            every.extendleft(reversed(rest))
+        return taken
+
+    def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
+        if request.until is None:
+            has = self._reader.has(request.key, request.publisher, request.number)
+            if has or (has is None and drained and not self._reader.unsettled):
+                request.until = self._arrived if request.read else 0
+        return self.ended or (request.until is not None and self._arrived - self.waiting >= request.until)
+
     def _queue(self, arrivals: Sequence[Arrival]) -> None:
         """Queue all; the oldest beyond the capacity are dropped, and those that are superseded."""
         self._arrived += len(arrivals)
@@ -269,7 +293,7 @@ class PendingQueue:
                 self._supersede(arrival)
             return
         every = self._every
-        every.extend(map(self._decoder.keep, arrivals) if len(every) > _FRESH else arrivals)
+        every.extend(map(self._decoder.keep, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
             self._drop(every.popleft())
 

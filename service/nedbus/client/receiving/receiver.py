@@ -1,6 +1,6 @@
-"""Zenoh's side of a subscription: the advanced subscriber, its ring, and who empties it.
+"""Zenoh's side of a subscription: the advanced subscriber, its ring, and the threads that empty it.
 
-The ring lies in Rust: Zenoh never waits for it, so that no reader holds up its session or anybody else.
+The ring lies in Rust: Zenoh never waits for it, so that no reader holds up its session or other readers.
 A reader that waits without a timeout empties it in its own thread. For one that waits with a timeout, or in asyncio,
 the pump does, a thread that starts with the first such wait; while the reader does something else, housekeeping does.
 """
@@ -16,39 +16,35 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus.client.housekeeping import Housekeeping
+from nedbus.client.housekeeping import Housekeeping, Wakeup
 from nedbus.client.protocol import CLOSED, read_parameters
-from nedbus.client.wakeup import Wakeup
 from nedbus.log_event import about
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
 from nedbus_msgs import ack_key
 
-from .acknowledgements import MAX_PENDING, AckRequest
 from .decoder import WAKE_UP
-from .pending_queue import PendingQueue
+from .pending_queue import MAX_ACK_REQUESTS, AckRequest, PendingQueue
 from .retransmission import Retransmission
 
 _log = logging.getLogger(__name__)
 
-RING: Final = 16_384
-"""Samples that may arrive until somebody looks; more than 0.2 s of the largest fleet."""
+RING_CAPACITY: Final = 16_384
+"""Samples that may arrive until the next poll; more than 0.2 s of the largest fleet."""
 
-_LOOK: Final = 0.1  # s between two looks of housekeeping
-_POLL: Final = 0.005  # s between them while publishers ask for acknowledgements,
-_ASKED: Final = 1.0  # s from the last such request on
-_LOOK_AT_HEARTBEATS: Final = 0.1  # s
-_BUSY: Final = 64  # samples at once after which a pause pays: whoever receives is woken once for many
-_PAUSE: Final = 0.001  # s
-_JOIN: Final = 3.0  # s that a busy machine has to end a thread
+_POLL: Final = 0.1  # s between two polls of the ring by housekeeping, and of heartbeats
+_ACK_POLL: Final = 0.005  # s between them while publishers request acknowledgements,
+_ACK_POLL_AFTER: Final = 1.0  # s from the last such request on
+_MIN_BUSY_BATCH: Final = 64  # samples at once after which a pause pays: the next wait then takes many
+_BUSY_PAUSE: Final = 0.001  # s
+_JOIN_TIMEOUT: Final = 3.0  # s that a busy machine has to end a thread
 _T = TypeVar("_T")
 
 
 class Receiver:
     """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
 
-    A subscriber of mode `every` asks publishers for what is missing, and answers those that ask whether it has what
-    they sent. One of `thinned` streams does not answer, as these do not wait for it, and begins with what is published
-    from now on.
+    A subscriber of mode `every` requests retransmissions of publishers, and acknowledges their messages on request.
+    One of `downsampled` streams does not, as these do not wait for it, and begins with what is published from now on.
     """
 
     def __init__(
@@ -58,50 +54,50 @@ class Receiver:
         pending_queue: PendingQueue,
         *,
         housekeeping: Housekeeping,
-        thinned: bool = False,
+        downsampled: bool = False,
     ) -> None:
         every = not pending_queue.newest_only
         self._session = session
         self._queue = pending_queue
         self._name = key_expr
-        self._thinned = thinned
+        self._downsampled = downsampled
         self._changing = threading.Lock()
         self._closed = False
-        self._receiving = threading.RLock()  # whoever has it empties the ring; a reader may keep it by a Ctrl-C
+        self._receiving = threading.RLock()  # its holder empties the ring; a reader may keep it by a Ctrl-C
         self._by_reader = False  # the reader has waited by itself since the pump looked
         self._reader_waits = False  # for the ring
         self._reader: int | None = None  # the thread that did so last
         self._busy = False
         self._needed = Wakeup()  # the pump is
         self._pump: threading.Thread | None = None
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING)
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
-        history = None if thinned else zenoh.ext.HistoryConfig(max_samples=1)
-        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_PENDING)
+        history = None if downsampled else zenoh.ext.HistoryConfig(max_samples=1)
+        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
         links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
-            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not thinned else None
+            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not downsampled else None
             self._links = session.info.declare_transport_events_listener(links, history=False) if every else None
         self._take_query = None if self._asked is None else self._asked.handler.try_recv
         self._take_link = None if self._links is None else self._links.handler.try_recv
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
-        self._heartbeats = {key_expr: follow_heartbeats(session, key_expr)} if every else {}
-        self._late: Heartbeats = {}  # what the heartbeats of the last look told of
-        self._next_look = 0.0
+        self._heartbeats = follow_heartbeats(session, key_expr) if every else None  # how to take, and to end them
+        self._late: Heartbeats = {}  # of the last poll
+        self._next_heartbeat_poll = 0.0
         self._drains = 0  # of the queue, then
-        self._asked_until = 0.0
+        self._ack_poll_until = 0.0
         self._retransmission = Retransmission(session, pending_queue)
         pending_queue.on_gap = housekeeping.wake
         self._end_job = housekeeping.add(self._keep_house)
 
     def receive(self) -> bool:
-        """Queue what has arrived by now; return False, at once, if somebody does so already."""
+        """Queue what has arrived by now; return False, at once, if another thread does so already."""
         if not self._receiving.acquire(blocking=False):
             return False
         try:
-            if batch := take_all(self._handler, []):
+            if batch := drain(self._handler, []):
                 self._put(batch)
         finally:
             self._receiving.release()
@@ -109,11 +105,11 @@ class Receiver:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something in the queue; return False after `timeout` seconds."""
-        if timeout is not None or self._thinned:  # not all of the thinned comes through the ring
+        if timeout is not None or self._downsampled:  # what comes at full rate does not come through the ring
             self.pump()
             return self._queue.wait(timeout)
         self._by_reader = True
-        if not self._receiving.acquire(timeout=_PAUSE):  # housekeeping has it for less
+        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # housekeeping has it for less
             return self._queue.wait(None)
         try:
             self._reader, self._reader_waits = threading.get_ident(), True
@@ -146,14 +142,14 @@ class Receiver:
         self._undeclare()
         self._needed.set()
         if self._pump is not None:  # one that is inside Zenoh when the interpreter ends aborts the process
-            self._pump.join(_JOIN)
-        if self._reader != threading.get_ident() and self._receiving.acquire(timeout=_JOIN):
+            self._pump.join(_JOIN_TIMEOUT)
+        if self._reader != threading.get_ident() and self._receiving.acquire(timeout=_JOIN_TIMEOUT):
             self._receiving.release()
 
     def _undeclare(self) -> None:
         with suppress(zenoh.ZError):  # closed already with the session
-            for _, undeclare in self._heartbeats.values():
-                undeclare()
+            if self._heartbeats is not None:
+                self._heartbeats[1]()
             if self._asked is not None:
                 self._asked.undeclare()
             if self._links is not None:
@@ -172,33 +168,33 @@ class Receiver:
             _log.exception("%s: the subscription ends after an unexpected error", self._name, extra=about("error"))
             raise
         finally:
-            self._queue.end()  # nobody waits for a pump that has ended
+            self._queue.end()  # a reader must not wait for a pump that has ended
 
     def _receive(self) -> None:
         """Wait for something, and queue all that is there; the queue ends with Zenoh's side."""
         pending, handler = self._queue, self._handler
         if self._busy:
-            time.sleep(_PAUSE)
+            time.sleep(_BUSY_PAUSE)
         pending.idle = True
         try:
             batch = [handler.recv()]
             pending.idle = False
             if (item := handler.try_recv()) is not None:
                 batch.append(item)
-                take_all(handler, batch)
+                drain(handler, batch)
         except zenoh.ZError:
             pending.idle = False
             pending.end()
             return
-        self._busy = len(batch) >= _BUSY
+        self._busy = len(batch) >= _MIN_BUSY_BATCH
         self._put(batch)
 
-    def _put(self, batch: list[zenoh.Sample], *, full: int = RING) -> None:
+    def _put(self, batch: list[zenoh.Sample]) -> None:
         if self._queue.ended:
             return
-        self._listen()
+        self._take_events()
         try:
-            self._queue.put(batch, overflowed=len(batch) >= full)
+            self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
         except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
             extra = about("bug")
             _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
@@ -206,34 +202,32 @@ class Receiver:
 
     def _keep_house(self, now: float) -> float:
         """Do what is due beside receiving; return the seconds until the next time."""
-        self._listen()
+        self._take_events()
         if drained := self.receive():
             self._queue.acknowledge(drained=True)
         if self._links is None:
-            return _LOOK
-        if now >= self._next_look:
-            self._next_look = now + _LOOK_AT_HEARTBEATS
-            self._look_at_heartbeats(drained=drained)
+            return _POLL
+        if now >= self._next_heartbeat_poll:
+            self._next_heartbeat_poll = now + _POLL
+            self._take_heartbeats(drained=drained)
         filled, pause = self._retransmission.turn(now)
         filled = self._queue.bound() or filled
         if filled:
             self._wake(filled)
-        return min(pause, _LOOK, _POLL if now < self._asked_until else _LOOK)
+        return min(pause, _POLL, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
-    def _look_at_heartbeats(self, *, drained: bool) -> None:
-        """Ask for the newest messages that heartbeats of the look before told of, if they have not come since."""
+    def _take_heartbeats(self, *, drained: bool) -> None:
+        """Request the newest messages that the heartbeats of the last poll told of, if they have not come since."""
         drained |= self._queue.idle or self._queue.drains >= self._drains + 2
         if self._late and not drained:
             return  # what they tell of may be in the ring still
         for (key, publisher), number in self._late.items():
-            self._queue.on_heartbeat(key, publisher, number, begins=not self._thinned)
-        self._late = {}
-        for take, _ in self._heartbeats.values():
-            self._late |= take()
+            self._queue.on_heartbeat(key, publisher, number, begins=not self._downsampled)
+        self._late = {} if self._heartbeats is None else self._heartbeats[0]()
         self._drains = self._queue.drains
 
     def _wake(self, key: str) -> None:
-        """Let the reader look into the queue, even one that waits for the ring, by something on one of its keys.
+        """Wake the reader, even one that waits for the ring, by a sample on one of its keys.
 
         Nothing else ends a wait for Zenoh's ring; only this session gets it, and no reader sees it.
         """
@@ -243,7 +237,7 @@ class Receiver:
                 here = zenoh.Locality.SESSION_LOCAL
                 self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
 
-    def _listen(self) -> None:
+    def _take_events(self) -> None:
         """Note that links broke or came back, before what arrived since is queued; take acknowledgement requests."""
         try:
             while self._take_link is not None and self._take_link() is not None:
@@ -254,7 +248,7 @@ class Receiver:
             pass
 
     def _take_request(self, query: zenoh.Query) -> None:
-        self._asked_until = time.monotonic() + _ASKED
+        self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
         parameters = read_parameters(query.parameters.get)
         if parameters is not None:  # else it is dropped, and so answered: from a publisher that asks in another way
             key = str(query.key_expr)
@@ -262,10 +256,10 @@ class Receiver:
             self._queue.add(AckRequest(key.removesuffix(ack_key("")), *parameters, reply))
 
 
-def take_all(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
+def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
     """Add all that is there to a batch, up to a full ring, and return it."""
     try:
-        while len(batch) < RING and (item := handler.try_recv()) is not None:
+        while len(batch) < RING_CAPACITY and (item := handler.try_recv()) is not None:
             batch.append(item)
     except zenoh.ZError:  # undeclared: the next wait notices
         pass

@@ -1,4 +1,4 @@
-"""Ask publishers for what is missing in a subscription of mode `every`: each by its exact key, and again.
+"""Retransmission requests of a subscription of mode `every`: to each publisher by its exact key, and again.
 
 Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
 all publishers: the restart of a router with 1,000 of them became a storm in which requests went unanswered. Here at
@@ -21,14 +21,14 @@ from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
-_OPEN: Final = 64  # requests at a time,
-_OPEN_BEGINNINGS: Final = 16  # and of these for what a publisher sent before it was heard
-_OPEN_OF_KEY: Final = 4  # and for one key: whoever publishes there may leave them unanswered
-_BEHIND: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
-_TIMEOUT: Final = 3.0  # s until a request is given up
-_POLL: Final = 0.005  # s between two looks for answers
-_SOON: Final = 0.05  # s between two looks at what is due
-_IDLE: Final = 1.0  # s
+_MAX_OPEN: Final = 64  # requests at a time,
+_MAX_OPEN_UNCERTAIN: Final = 16  # and of these for what a publisher sent before it was heard
+_MAX_OPEN_OF_KEY: Final = 4  # and for one key, whose publishers may leave them unanswered
+_MAX_WAITING: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
+_REQUEST_TIMEOUT: Final = 3.0  # s until a request is given up
+_ANSWER_POLL: Final = 0.005  # s between two looks for answers
+_REQUEST_POLL: Final = 0.05  # s between two looks at what is due
+_IDLE_POLL: Final = 1.0  # s
 
 
 class Retransmission:
@@ -40,21 +40,21 @@ class Retransmission:
         self._open: dict[WriterProxy, RetransmitRequest] = {}
 
     def turn(self, now: float) -> tuple[str, float]:
-        """Do what is due; return a key of which something can be read now, or "", and s until the next."""
+        """Do what is due; return a key of which something can be read now, or "", and seconds until the next turn."""
         filled = ""
         for writer, answers in list(self._open.items()):
             filled = self._take(writer, answers, now) or filled
         requesting = self._queue.requesting
-        if self._queue.waiting <= _BEHIND:
+        if self._queue.waiting <= _MAX_WAITING:
             for writer in requesting:
-                if len(self._open) >= _OPEN:
+                if len(self._open) >= _MAX_OPEN:
                     break
                 if writer not in self._open and self._has_room(writer):
                     self._ask(writer, now)
-        return filled, _POLL if self._open else _SOON if requesting else _IDLE
+        return filled, _ANSWER_POLL if self._open else _REQUEST_POLL if requesting else _IDLE_POLL
 
     def close(self) -> None:
-        """Ask no more; a channel of answers that nobody takes would hold up the session."""
+        """Drop all requests: a channel of answers that is not emptied would hold up the session."""
         self._open.clear()
 
     def _take(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
@@ -75,17 +75,16 @@ class Retransmission:
     def _has_room(self, writer: WriterProxy) -> bool:
         share = [each for each in self._open if bool(each.uncertain) == bool(writer.uncertain)]
         if writer.uncertain:
-            return len(share) < _OPEN_BEGINNINGS
+            return len(share) < _MAX_OPEN_UNCERTAIN
         of_key = sum(each.stream is writer.stream for each in share)
-        return of_key < _OPEN_OF_KEY
+        return of_key < _MAX_OPEN_OF_KEY
 
     def _ask(self, writer: WriterProxy, now: float) -> None:
         numbers = self._queue.next_request(writer, now)
         if numbers is None:
             return
         try:
-            self._open[writer] = request_samples(
-                self._session, writer.stream.heard, writer.name, numbers, timeout=_TIMEOUT
-            )
+            key = writer.stream.heard
+            self._open[writer] = request_samples(self._session, key, writer.name, numbers, timeout=_REQUEST_TIMEOUT)
         except NedbusError:  # the session is closed
             self._queue.on_retransmission(writer, {}, ended=True, now=now)

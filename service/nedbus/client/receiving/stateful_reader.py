@@ -11,11 +11,11 @@ from typing import Final
 from nedbus.transport import SourceInfo, entity_name
 from nedbus_msgs import AddressError
 
-from .decoder import Arrival, Decoder, Stream
+from .decoder import Arrival, Decoder, KeyState
 from .writer_proxy import NUMBERS, Account, WriterProxy
 
-_WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
-_BATCH: Final = 8  # messages of one key for which a look at all of them together pays
+_MAX_WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
+_MIN_BATCH: Final = 8  # messages of one key for which a look at all of them together pays
 _UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
 _PAYLOAD: Final = itemgetter(1)
 
@@ -24,24 +24,20 @@ class StatefulReader:
     """Follow what arrives, publisher by publisher: `requesting` are those of which something is missing.
 
     With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
-    Of `thinned` streams only those that publishers thin are followed from their beginning after a link came back.
     Not thread-safe.
     """
 
-    def __init__(
-        self, decoder: Decoder, *, recovers: bool, thinned: bool, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, decoder: Decoder, *, recovers: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self.account = Account()
         self.requesting: dict[WriterProxy, None] = {}
         self.recovers = recovers
         self._decoder = decoder
-        self._thinned = thinned
         self._clock = clock
         self._unsettled_until = float("-inf")
 
     @property
     def unsettled(self) -> bool:
-        """Whether there may be publishers that sent something, and are not known yet."""
+        """True while there may be publishers that sent something, and are not known yet."""
         return self._clock() < self._unsettled_until
 
     def on_link(self) -> None:
@@ -52,7 +48,7 @@ class StatefulReader:
 
     def on_samples(self, arrivals: list[Arrival], *, overflowed: bool) -> list[Arrival]:
         """Return what can be delivered, each with what was lost before it; `overflowed`: from a ring that was full."""
-        if len(arrivals) >= _BATCH and self._in_order(arrivals):
+        if len(arrivals) >= _MIN_BATCH and self._in_order(arrivals):
             return arrivals
         delivered: list[Arrival] = []
         for arrival in arrivals:
@@ -73,7 +69,7 @@ class StatefulReader:
             else:
                 asks = self.recovers and not overflowed
                 delivered += writer.on_sample(number, arrival, asks=asks, overflowed=overflowed)
-                self._note(writer)
+                self._track(writer)
         return delivered
 
     def on_heartbeat(self, key: str, name: str, number: int, *, begins: bool) -> bool:
@@ -87,14 +83,13 @@ class StatefulReader:
             return False
         writer = stream.writers.get(name)
         if writer is None:
-            began = self._may_have_begun(stream)
-            if not (began or begins):
+            if not (self.unsettled or begins):
                 return False
-            writer = self._meet(stream, name, 0 if began else number, uncertain=number + 1)
+            writer = self._add_writer(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
         if writer is None:
             return False
         writer.on_heartbeat(number)
-        return self._note(writer)
+        return self._track(writer)
 
     def on_retransmission(
         self, writer: WriterProxy, found: dict[int, Arrival], *, ended: bool, now: float
@@ -102,7 +97,7 @@ class StatefulReader:
         """Return what can be delivered after an answer to a publisher's retransmission request."""
         delivered = writer.on_retransmission(found, ended=ended, now=now)
         self.requesting.pop(writer, None)  # others come first
-        self._note(writer)
+        self._track(writer)
         return delivered
 
     def give_up(self, total: int, of_key: int) -> list[Arrival]:
@@ -117,7 +112,7 @@ class StatefulReader:
             if self.account.held > total or by_key[writer.stream.heard] > of_key:
                 by_key[writer.stream.heard] -= len(writer.held)
                 delivered += writer.give_up()
-                self._note(writer)
+                self._track(writer)
         return delivered
 
     def has(self, key: str, name: str, number: int) -> bool | None:
@@ -128,13 +123,14 @@ class StatefulReader:
             return None
         return None if writer is None else writer.has(number)
 
-    def _writer_of(self, stream: Stream, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
+    def _writer_of(self, stream: KeyState, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
         """Return the publisher of a sample; None if it is not remembered."""
         name = entity_name(info.source_id)
         writer = stream.writers.get(name)
         if writer is None:
-            late = asks and self._may_have_begun(stream)
-            writer = self._meet(stream, name, 0 if late else info.source_sn, uncertain=info.source_sn)
+            writer = self._add_writer(
+                stream, name, 0 if asks and self.unsettled else info.source_sn, uncertain=info.source_sn
+            )
         stream.writer = writer
         if writer is not None:
             writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
@@ -156,12 +152,9 @@ class StatefulReader:
         writer.expected = stop
         return True
 
-    def _may_have_begun(self, stream: Stream) -> bool:
-        return self.unsettled and (stream.thinned or not self._thinned)
-
-    def _meet(self, stream: Stream, name: str, expected: int, *, uncertain: int) -> WriterProxy | None:
+    def _add_writer(self, stream: KeyState, name: str, expected: int, *, uncertain: int) -> WriterProxy | None:
         """Remember a publisher; None if there are too many on its key of which something is missing."""
-        if len(stream.writers) >= _WRITERS_OF_KEY:
+        if len(stream.writers) >= _MAX_WRITERS_OF_KEY:
             writers = stream.writers.values()
             first = next((each for each in writers if each is not stream.writer and each.request is None), None)
             if first is None:
@@ -170,7 +163,7 @@ class StatefulReader:
         writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, uncertain=uncertain)
         return writer
 
-    def _note(self, writer: WriterProxy) -> bool:
+    def _track(self, writer: WriterProxy) -> bool:
         if writer.request is None:
             self.requesting.pop(writer, None)
             return False

@@ -1,4 +1,4 @@
-"""A remote publisher as one reader knows it: what comes next, what is held back, what is asked for. Pure, without I/O.
+"""A remote publisher as one reader knows it: the next number, messages held back, the open request. Pure.
 
 The name is that of RTPS, and so is the idea: all that a reader knows of one publisher lies in one object.
 """
@@ -11,23 +11,23 @@ from typing import Final
 
 from nedbus.transport import MAX_ANSWERS
 
-from .decoder import Arrival, Decoder, Stream
+from .decoder import Arrival, Decoder, KeyState
 
 NUMBERS: Final = 2**32
 """Zenoh's sequence numbers wrap here."""
 
-LARGEST_GAP: Final = 2**30
+MAX_GAP: Final = 2**30
 """A step of more messages is not a gap: the publisher started again, or the message is late."""
 
-_LAST: Final = NUMBERS - 1  # across the wrap nothing is asked for
-_REORDERED: Final = 2**16  # a number that is so much too low is late or a duplicate; more is a restart
-_PATIENCE: Final = 20.0  # s of requests after which what is still missing is lost: so long publishers keep it
-_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
+_LAST_NUMBER: Final = NUMBERS - 1  # across the wrap nothing is asked for
+_MAX_REORDERED: Final = 2**16  # a number that is lower by less is late or a duplicate; by more it is a restart
+RETRANSMIT_TIMEOUT: Final = 20.0  # s of requests after which what is missing is lost: publishers keep it as long
+_RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
 
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """What became of the messages of all publishers that a reader hears, but for those that it received.
+    """Counts of the messages of all publishers of a reader that it did not receive.
 
     `dropped`: by a ring that overflowed. `held`: that wait for those before them. `discarded`: duplicates, and late.
     """
@@ -68,7 +68,7 @@ class WriterProxy:
     in vain, and is asked only once from then on. Not thread-safe.
     """
 
-    stream: Stream
+    stream: KeyState
     name: str
     expected: int
     account: Account
@@ -85,26 +85,26 @@ class WriterProxy:
         `overflowed`: it comes from a ring that was full: what is absent was dropped there.
         """
         step = (number - self.expected) % NUMBERS
-        if step > LARGEST_GAP:
-            if NUMBERS - step <= _REORDERED:
+        if step > MAX_GAP:
+            if NUMBERS - step <= _MAX_REORDERED:
                 self.account.discarded += 1
                 return []
             delivered = self.give_up()
             self.expected = number
-        elif step and (self.request is not None or asks) and self.expected + step < _LAST:
+        elif step and (self.request is not None or asks) and self.expected + step < _LAST_NUMBER:
             self._hold(number, arrival)
-            self._miss(number + 1)
+            self._extend_request(number + 1)
             return []
         else:
             delivered = self.give_up() if step and self.request is not None else []
-            self._skip(number, overflowed=overflowed)
+            self._count_missing(number, overflowed=overflowed)
         self._deliver(arrival, delivered)
         return self._release(delivered)
 
     def on_heartbeat(self, number: int) -> None:
         """Note that a message was sent that should have arrived by now."""
-        if self.expected <= number < min(self.expected + LARGEST_GAP, _LAST):
-            self._miss(number + 1)
+        if self.expected <= number < min(self.expected + MAX_GAP, _LAST_NUMBER):
+            self._extend_request(number + 1)
 
     def next_request(self, now: float) -> range | None:
         """Return the numbers to ask for now, None if nothing is due: all that is missing, up to the last of it."""
@@ -117,7 +117,7 @@ class WriterProxy:
         while request.witness is None and last in self.held:
             last -= 1
         if request.until is None:
-            request.until = now if self.silent else now + _PATIENCE
+            request.until = now if self.silent else now + RETRANSMIT_TIMEOUT
         request.tries += 1
         request.asked = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
         return request.asked
@@ -138,7 +138,7 @@ class WriterProxy:
             last, request.asked, over = request.asked[-1], None, request.until is not None and now >= request.until
             if request.answered:
                 self.silent = False
-                self._judge(request, delivered, over=over)
+                self._confirm_lowest(request, delivered, over=over)
             elif request.witness is not None:
                 request.witness = request.stop - 1  # the other one is perhaps not kept any more
             self._release(delivered)
@@ -146,7 +146,7 @@ class WriterProxy:
                 self.silent = request.kept_from is None
                 self._give_up(last, delivered)
             request.answered = False
-            request.due = now + _PAUSES[min(request.tries, len(_PAUSES) - 1)]
+            request.due = now + _RETRY_PAUSES[min(request.tries, len(_RETRY_PAUSES) - 1)]
         return delivered
 
     def give_up(self) -> list[Arrival]:
@@ -155,10 +155,10 @@ class WriterProxy:
 
     def has(self, number: int) -> bool:
         """Return whether this message has arrived, or is known to be lost."""
-        return (self.expected - 1 - number) % NUMBERS <= LARGEST_GAP
+        return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
-    def _judge(self, request: Request, delivered: list[Arrival], *, over: bool) -> None:
-        """Give up what is below the lowest number that was answered, if it was so twice: answers may be lost too."""
+    def _confirm_lowest(self, request: Request, delivered: list[Arrival], *, over: bool) -> None:
+        """Give up numbers below the lowest that was answered, once it is confirmed: answers may be lost too."""
         lowest = request.kept_from
         if lowest is None or lowest <= self.expected:
             return
@@ -175,13 +175,13 @@ class WriterProxy:
             self.held[number] = Decoder.keep(arrival)
             self.account.held += 1
 
-    def _miss(self, stop: int) -> None:
+    def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
         self.request.stop = max(self.request.stop, stop)
 
-    def _skip(self, number: int, *, overflowed: bool = False) -> None:
-        """Count what is missing before a number, which comes next."""
+    def _count_missing(self, number: int, *, overflowed: bool = False) -> None:
+        """Count the gap before a number, which comes next."""
         certain = max(self.expected, min(self.uncertain, number))
         lost = (number - certain) % NUMBERS
         if overflowed:
@@ -193,7 +193,7 @@ class WriterProxy:
 
     def _give_up(self, last: int, delivered: list[Arrival]) -> list[Arrival]:
         while self.request is not None and self.expected <= last:
-            self._skip(min(self.held, default=self.request.stop))
+            self._count_missing(min(self.held, default=self.request.stop))
             self._release(delivered)
         return delivered
 
@@ -206,7 +206,7 @@ class WriterProxy:
             stream.gap = 0
 
     def _release(self, delivered: list[Arrival]) -> list[Arrival]:
-        """Deliver what was held back and comes next."""
+        """Deliver messages that were held back, up to the next gap."""
         request = self.request
         if request is None:
             return delivered

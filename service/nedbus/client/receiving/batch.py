@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs import DEFAULT, Address, Definition, Message, Provenance, codec_of
+from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
-from .receiving.decoder import Arrival, Decoder
+from .decoder import Arrival, Decoder
 
 
 @dataclass(eq=False)
@@ -66,7 +65,8 @@ class Batch:
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
     received = time.time_ns()
-    definition = _definition_of(arrivals[0]) or DEFAULT
+    codec = decoder.resolve(arrivals[0][0])  # which waits for an answer that is on its way
+    definition = codec.definition if codec else DEFAULT
     blank = bytes(codec_of(definition).size)  # in the place of another layout, invalid, so that it is decoded by itself
     own = arrivals[0][0].size  # -1 while it is not known what these are
     payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
@@ -86,16 +86,3 @@ def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> B
     return Batch(
         messages, definition.model, tuple(addresses.values()), address_index, received, lost, arrivals, decoder
     )
-
-
-def by_message(arrivals: Iterable[Arrival], decoder: Decoder) -> list[list[Arrival]]:
-    """Return what arrived, grouped by message, as an array holds messages of one kind; each in order."""
-    groups: dict[int, list[Arrival]] = {}
-    for arrival in arrivals:
-        groups.setdefault(id(arrival[0].codec or decoder.resolve(arrival[0])), []).append(arrival)
-    return list(groups.values())
-
-
-def _definition_of(arrival: Arrival) -> Definition[Any] | None:
-    codec = arrival[0].codec
-    return codec.definition if codec else None

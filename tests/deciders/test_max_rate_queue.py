@@ -11,25 +11,41 @@ import pytest
 from hypothesis import given
 
 from nedbus import Counts, Mode
-from nedbus.client.qos import RATES
-from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
-from nedbus.client.receiving import Decoder, LayoutLookup, ThinnedQueue
-from nedbus.client.receiving.thinned_queue import PATIENCE
+from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
+from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateQueue
+from nedbus.client.receiving.max_rate import DOWNSAMPLED_TIMEOUT
 from nedbus.errors import ConfigError
 from nedbus.transport import RawSample
 
-from .raw_samples import KEY, OTHER_KEY, drain, name_of, put, raw, timestamps
+from .raw_samples import KEY, OTHER_KEY, drain, put, raw, timestamps
 
-THINNED = f"{KEY}/@rate/5"
+DOWNSAMPLED = f"{KEY}/@rate/5"
 
 
-def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> ThinnedQueue:
+def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateQueue:
     """Return an empty queue."""
-    return ThinnedQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), max_rate=max_rate, name="queue")
+    return MaxRateQueue(mode, Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), max_rate=max_rate, name="queue")
+
+
+class Clock:
+    """A reader's monotonic clock."""
+
+    now = 0
+
+    def monotonic_ns(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Let readers downsample by a clock of the test's."""
+    clock = Clock()
+    monkeypatch.setattr("nedbus.client.receiving.max_rate.time", clock)
+    return clock
 
 
 def at(
-    sent: float, number: int | None, *, key: str = THINNED, timestamp: int | None = None, publisher: str = "a"
+    sent: float, number: int | None, *, key: str = DOWNSAMPLED, timestamp: int | None = None, publisher: str = "a"
 ) -> RawSample:
     """Return a sample that was sent at this second; its message's timestamp is that, in milliseconds."""
     stamp = SimpleNamespace(get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9)))
@@ -37,17 +53,17 @@ def at(
     return raw(number, timestamp=timestamp, key=key, publisher=publisher, stamp=stamp)
 
 
-def test_thinned_stream_passes_whole() -> None:
+def test_downsampled_stream_passes() -> None:
     """A stream that its publisher downsamples is not downsampled again, whatever the jitter of its timestamps."""
     queue = make_queue()
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
     assert queue.counts == Counts(received=5)
     queue.on_token(KEY, 0.0, alive=True)
-    assert queue.unthinned(PATIENCE) == set()
+    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == set()
 
 
-def test_gap_of_a_thinned_stream_is_lost() -> None:
+def test_gap_of_a_downsampled_stream_is_lost() -> None:
     """Its sequence numbers are its own: what is absent of them is counted to the message behind it."""
     queue = make_queue()
     put(queue, [at(1.0, 0), at(1.2, 1), at(1.8, 4)])
@@ -56,92 +72,87 @@ def test_gap_of_a_thinned_stream_is_lost() -> None:
     assert queue.counts == Counts(received=4, lost=5)
 
 
-def test_whole_stream_begins_with_now_after_a_break() -> None:
-    """A reader turns to it when nobody sends it thinned: what its publisher keeps would take it back in time."""
-    queue = make_queue()
-    queue.on_link()
-    queue.put([at(1.0, 50, key=KEY)])
-    queue.on_heartbeat(OTHER_KEY, name_of("b"), 70, begins=False)
-    assert not queue.requesting
-    assert timestamps(queue) == [1000]
-    queue.put([at(2.0, 7, key=f"{OTHER_KEY}/@rate/5", publisher="c")])
-    [writer] = queue.requesting
-    assert (writer.stream.heard, queue.next_request(writer, 0.0)) == (f"{OTHER_KEY}/@rate/5", range(7))
-
-
 @pytest.mark.parametrize("mode", ["latest", "every"])
-def test_rest_is_thinned_here(mode: Mode) -> None:
+def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
     """Below the least step each second message is left out; a gap before it is reported with the next one."""
     queue = make_queue(mode, max_rate=0.5)
     assert queue.rate == 1
     taken = []
     for number in (0, 1, 2, 4, 5, 6, 7, 8):
+        clock.now = number * 10**9
         put(queue, [at(10.0 + number, number, key=f"{KEY}/@rate/1")])
         taken += [(sample.message.timestamp, sample.lost) for sample in drain(queue)]
     assert taken == [(10_000, 0), (12_000, 0), (14_000, 1), (16_000, 0), (18_000, 0)]
     assert queue.counts == Counts(received=5, lost=1)
-    put(queue, [at(19.0, 10, key=f"{KEY}/@rate/1"), at(20.0, 11, key=f"{KEY}/@rate/1")])
+    clock.now += 10**9
+    put(queue, [at(19.0, 10, key=f"{KEY}/@rate/1")])
+    clock.now += 10**9
+    put(queue, [at(20.0, 11, key=f"{KEY}/@rate/1")])
     assert [sample.lost for sample in drain(queue)] == [1]
 
 
-def test_whole_stream_is_thinned_here() -> None:
-    """Of 100 Hz that nobody thins 5 Hz are queued; what is left out is not lost, and what is lost is."""
+@pytest.mark.parametrize("stamped", [True, False])
+def test_stream_at_full_rate_is_downsampled_here(stamped: bool, clock: Clock) -> None:
+    """5 of 100 Hz are queued, by their arrival: a plain publisher need not stamp. None of the others is lost."""
     queue = make_queue()
-    put(queue, [at(number / 100, number, key=KEY) for number in range(1000) if number != 505])
+    for number in range(1000):
+        clock.now = number * 10_000_000
+        sample = at(number / 100, number, key=KEY) if stamped else raw(None, timestamp=10 * number)
+        queue.put_full_rate([sample] if number != 505 else [])
     assert timestamps(queue) == list(range(0, 10_000, 200))
-    assert queue.counts == Counts(received=50, lost=1)
+    assert queue.counts == Counts(received=50)
     queue.on_token(KEY, 0.0, alive=True)
-    assert queue.unthinned(PATIENCE) == {KEY}
+    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == {KEY}
 
 
 def test_last_message_comes_once() -> None:
     """It is the first if nothing else is; what it has overtaken, itself included, is left out then."""
     queue = make_queue()
-    queue.put_last([at(10.0, None, key=KEY)])
+    queue.put_full_rate([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
-    queue.put_last([at(10.3, None, key=KEY)])
+    queue.put_full_rate([at(10.3, None, key=KEY)])
     assert timestamps(queue) == [10_000, 10_200]
     assert queue.counts == Counts(received=2)
 
 
 def test_restart_with_an_earlier_clock_passes() -> None:
-    """A vehicle that restarts before its clock is set is heard at once, thinned or whole."""
-    for key in (THINNED, KEY):
-        queue = make_queue()
-        queue.put_last([at(1000.0, None, key=KEY)])
-        queue.put([at(5.0, 0, key=key), at(5.2, 1, key=key)])
-        assert timestamps(queue) == [1_000_000, 5000, 5200]
+    """A vehicle that restarts before its clock is set is heard at once."""
+    queue = make_queue()
+    queue.put_full_rate([at(1000.0, None, key=KEY)])
+    queue.put([at(5.0, 0), at(5.2, 1)])
+    assert timestamps(queue) == [1_000_000, 5000, 5200]
 
 
-def test_message_without_a_timestamp_is_thinned_by_arrival(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plain publisher need not stamp; and a clock that stands still does not silence a stream."""
-    now = [100_000_000_000]
-    monkeypatch.setattr("nedbus.client.receiving.thinned_queue.time", SimpleNamespace(monotonic_ns=lambda: now[0]))
-    queue, standing = make_queue(), make_queue()
-    for number in range(200):
-        queue.put([raw(None, timestamp=number)])
-        standing.put([at(50.0, number, key=KEY, timestamp=number)])
-        now[0] += 10_000_000
-    assert timestamps(queue) == list(range(0, 200, 20))
-    assert timestamps(standing) == list(range(0, 200, 40))
+def test_full_rate_ends_with_the_first_downsampled_message(clock: Clock) -> None:
+    """Both may arrive for a moment: each message comes once, in order."""
+    queue = make_queue()
+    queue.put_full_rate([at(1.0, 100, key=KEY)])
+    clock.now += 200_000_000
+    queue.put_full_rate([at(1.2, 120, key=KEY)])
+    queue.put([at(1.2, 0)])
+    clock.now += 200_000_000
+    queue.put_full_rate([at(1.3, 130, key=KEY), at(1.4, 140, key=KEY)])
+    queue.put([at(1.4, 1)])
+    assert timestamps(queue) == [1000, 1200, 1400]
+    assert queue.counts == Counts(received=3)
 
 
-def test_stream_is_read_whole_when_nobody_thins_it() -> None:
-    """One that is alive for a while and not heard thinned; a publisher that returns is waited for again."""
+def test_stream_is_read_at_full_rate_when_its_publisher_does_not_downsample() -> None:
+    """One that is alive for a while and not heard downsampled; a publisher that returns is waited for again."""
     queue = make_queue()
     for key in (KEY, OTHER_KEY):
         queue.on_token(key, 0.0, alive=True)
     queue.put([at(1.0, 0)])
-    assert queue.unthinned(PATIENCE - 0.1) == set()
+    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT - 0.1) == set()
     queue.on_token(OTHER_KEY, 1.0, alive=True)  # told twice
-    assert queue.unthinned(PATIENCE) == {OTHER_KEY}
+    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == {OTHER_KEY}
     queue.put([at(1.0, 0, key=f"{OTHER_KEY}/@rate/5")])
-    assert queue.unthinned(PATIENCE) == set()
+    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == set()
     queue.on_token(OTHER_KEY, 10.0, alive=False)
-    assert queue.unthinned(20.0) == set()
+    assert queue.full_rate_keys(20.0) == set()
     queue.on_token(OTHER_KEY, 20.0, alive=True)
-    assert queue.unthinned(20.0) == set()
-    assert queue.unthinned(20.0 + PATIENCE) == {OTHER_KEY}
+    assert queue.full_rate_keys(20.0) == set()
+    assert queue.full_rate_keys(20.0 + DOWNSAMPLED_TIMEOUT) == {OTHER_KEY}
 
 
 def passed(rate: float, times: list[float]) -> list[float]:

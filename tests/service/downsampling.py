@@ -89,13 +89,13 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 
 def is_wanted(publisher: nedbus.Publisher) -> bool:
-    """Return whether a publisher knows that somebody reads its vehicle thinned."""
+    """Return whether a publisher knows that somebody reads its vehicle downsampled."""
     return publisher._downsampler.vehicle.is_matched()  # what it does about that shows only once it publishes
 
 
 def wait_for_demand(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher knows that somebody reads it thinned."""
-    wait_for(partial(is_wanted, publisher), what="the demand for a thinned stream")
+    """Wait until a publisher knows that somebody reads it downsampled."""
+    wait_for(partial(is_wanted, publisher), what="the demand for a downsampled stream")
 
 
 def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription) -> None:
