@@ -6,6 +6,7 @@ A comment above a block says what is special about it; the site and plain git ho
     <!-- run by: tests/... -->          the same here; that test runs it
     <!-- continues -->                  Python that needs the blocks of its page before it
     <!-- output -->                     what the block before it prints; numbers may differ
+    <!-- all sh not run: REASON -->     of a page: so are all of this language (bash, sh, ini) without a comment
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ ROOT: Final = Path(__file__).parents[1]
 PAGES: Final = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs").glob("[!mr]*/*.md"))]
 """README and the pages that somebody writes: all but docs/messages and docs/reference."""
 
-_MARKER = r"(?: *<!-- ([a-z ]+?)(?:: (.*?))? -->\n)?"
+_MARKER = r"(?: *<!-- ([a-z ]+?)(?:: ([^\n]*?))? -->\n)?"
 _BLOCK = re.compile(rf"^{_MARKER}^( *)```([\w{{}}]*)\n(.*?)^\3```$", re.DOTALL | re.MULTILINE)
+_ALL = re.compile(r"<!-- all (\w+) (not run|run by): (.*?) -->")
 _SHELL = re.compile(r"[|<>&;$`\\*{}]|^(?!nedbus )")
 
 
@@ -65,9 +67,11 @@ class Block:
 def blocks_of(page: Path) -> Iterator[Block]:
     """Yield the blocks of a page."""
     text = page.read_text()
+    of_all = {language: (marker, reason) for language, marker, reason in _ALL.findall(text)}
     for found in _BLOCK.finditer(text):
         line = text.count("\n", 0, found.start(5))
-        yield Block(page, line, found[4], textwrap.dedent(found[5]), found[1] or "", found[2] or "")
+        marker, reason = (found[1] or "", found[2] or "") if found[1] else of_all.get(found[4], ("", ""))
+        yield Block(page, line, found[4], textwrap.dedent(found[5]), marker, reason)
 
 
 BLOCKS: Final = [block for page in PAGES for block in blocks_of(page)]

@@ -331,7 +331,7 @@ def test_nothing_is_installed_by_our_name() -> None:
 def test_reference_has_every_public_name() -> None:
     """Each name of `nedbus.__all__` has an entry with what it is; each method of the bus is there."""
     page = api_page()
-    entries = dict(re.findall(r"^### `(\w+)`\n\n(.*?)(?=\n\n##|\Z)", page, re.MULTILINE | re.DOTALL))
+    entries = dict(re.findall(r"^### `(\w+)`\n\n(.*?)(?=\n\n###? |\Z)", page, re.MULTILINE | re.DOTALL))
     constants = dict(re.findall(r"^\| `(\w+)` \| .*? \| (.+) \|$", page.partition("## Constants")[2], re.MULTILINE))
     assert {*entries, *constants} == set(nedbus.__all__)
     assert all(re.search(r"[a-z]{3}.*\.", text) for text in entries.values())

@@ -41,6 +41,7 @@ def api_page() -> str:
     for title, packages in _SECTIONS.items():
         own = [name for name in named if name not in constants and _section_of(named[name]) == title]
         tree = docstring(nedbus.errors.__doc__) if title == "Errors" else ""
+        own.sort(key=lambda name: (name.startswith("Async"), inspect.isclass(named[name]), title == "Errors"))
         parts.append(section(title, tree, *(_entry(name, named[name]) for name in own)))
         assert own, packages
     return page(
@@ -68,19 +69,22 @@ def _entry(name: str, value: Any) -> str:
 
 
 def _members(cls: type) -> Iterator[str]:
+    """Yield the properties and the methods of a class."""
     own = [base for base in cls.__mro__ if base.__module__.startswith("nedbus")]
     names = dict.fromkeys(name for base in own for name in vars(base) if not name.startswith("_"))
     if issubclass(cls, nedbus.Message):
         names = {name: None for name in names if name in vars(nedbus.Message)}
-    properties = []
+    properties, methods = [], []
     for name in names:
         value = inspect.getattr_static(cls, name)
         if isinstance(value, (property, cached_property)):
             properties.append([code(name), cell(value.__doc__ or "")])
         elif isinstance(value, (classmethod, staticmethod)) or inspect.isroutine(value):
             routine = getattr(cls, name)
-            yield f"{_signature(name, routine)}\n\n{docstring(inspect.getdoc(routine))}"
+            texts = _signature(name, routine), docstring(inspect.getdoc(routine))
+            methods.append(section(f"`{cls.__name__}.{name}`", *texts, level=4))
     yield table(["property", "is"], properties)
+    yield from methods
 
 
 def _signature(name: str, value: Any) -> str:
