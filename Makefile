@@ -28,6 +28,7 @@ docs: $(DEV)  ## the site with its reference, in build/site; a link that leads n
 	$(BIN)/pip install -q --group docs
 	$(BIN)/python -m docs.generator --site
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --fresh-env docs build/site
+	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # nothing is fetched
 	@echo "build/site/index.html is the site; for a server: $(BIN)/python -m http.server --directory build/site"
 
 quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
