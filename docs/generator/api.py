@@ -56,7 +56,8 @@ def api_page() -> str:
 def _section_of(value: Any) -> str:
     module = f"{value.__module__}."
     return next(
-        title for title, packages in _SECTIONS.items() if any(module.startswith(f"{each}.") for each in packages)
+        (title for title, packages in _SECTIONS.items() if any(module.startswith(f"{each}.") for each in packages)),
+        next(iter(_SECTIONS)),
     )
 
 

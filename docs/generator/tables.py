@@ -18,13 +18,14 @@ from .api import constants_of
 from .markdown import cell, code, page, section, table
 
 _PARTS: Final = {  # of the limits, by the package that holds them
-    "Readers and publishers": "client",
+    "Readers and publishers": ("client",),
     "Services and sources": ("daemon", "sources"),
-    "Events": "events",
-    "Recordings": "recording",
+    "Events": ("events",),
+    "Recordings": ("recording",),
     "Metrics, the log and the page": ("monitoring", "cli", "web"),
     "Zenoh, certificates and ROS 2": ("transport", "bridges"),
-    "Messages": "nedbus_msgs",
+    "Messages": ("nedbus_msgs",),
+    "Others": (),
 }
 
 
@@ -133,11 +134,11 @@ def limits_page() -> str:
         root = Path(package.__path__[0])
         for path in sorted(root.rglob("*.py")):
             folder = "nedbus_msgs" if package is nedbus_msgs else path.relative_to(root).parts[0]
-            title = next((title for title, folders in _PARTS.items() if folder in folders), None)
+            title = next((title for title, folders in _PARTS.items() if folder in folders), "Others")
             tree = ast.parse(path.read_text())
             numbers = dict(_numbers(tree))
             for name, text in constants_of(tree):
-                if title and name in numbers and not name.startswith("_"):
+                if name in numbers and not name.startswith("_"):
                     parts[title].append([cell(text), code(numbers[name]), code(name)])
     return page(
         "Limits",
