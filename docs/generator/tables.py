@@ -141,7 +141,7 @@ def limits_page() -> str:
                 if name in numbers and not name.startswith("_"):
                     parts[title].append([cell(text), code(numbers[name]), code(name)])
     return page(
-        "Limits",
+        "Limits and constants",
         "The limits in the code, with the names of their constants; a vehicle's name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
         "and an instance 0 to 255.",
         *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
