@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 DEV := $(VENV)/.dev
 ARGS = --source sim: --http 127.0.0.1:9464
 
-.PHONY: run check generated quick test behaviour test-all measured compose-test wheel bench clean
+.PHONY: run check generated docs quick test behaviour test-all measured compose-test wheel bench clean
 
 run: $(READY)  ## the service with a simulated flight, or as ARGS say; it prints what to type in a second terminal
 	$(info $(BIN)/nedbus serve $(ARGS))
@@ -23,7 +23,14 @@ check: $(DEV)  ## lint and types
 	$(BIN)/mypy
 
 generated: $(DEV)  ## what is made from the files of messages: the stubs of type checkers, and a page each
-	$(BIN)/python -m tests.generated
+	$(BIN)/python -m docs.generator
+
+docs: $(DEV)  ## the site with its reference, in build/site; a link that leads nowhere is an error
+	$(BIN)/pip install -q --group docs
+	$(BIN)/python -m docs.generator --site
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet --fresh-env docs build/site
+	@! grep -rnE '<(script|link|img)[^>]+(src|href)="https?:' build/site --include='*.html'  # nothing is fetched
+	@echo "build/site/index.html is the site; for a server: $(BIN)/python -m http.server --directory build/site"
 
 quick: $(DEV)  ## the tests of rules alone, without routers and processes: under half a minute
 	$(BIN)/pytest -q -n 2 -m "not slow and not router and not process and not compose"

@@ -5,8 +5,8 @@ Zenoh: as fast as it can without losing any, then at 1 kHz and at 100 Hz; some w
 with the messages of other flights.
 Rounds are interleaved, and medians taken, as machines are shared and noisy; only the ratios of one run mean something.
 Peers are installed in environments of their own under build/bench; one that cannot be is named as such.
-The results are written to docs/performance.json and, as tables, into the README; those of a part, as with
-`--forms raw,models --loads 1kHz --flights "no origin"`, are only printed.
+The results are written to docs/explanation/performance.json and, as tables, into the page beside it and the README;
+those of a part, as with `--forms raw,models --loads 1kHz --flights "no origin"`, are only printed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The picture of docs/performance.json: python -m benchmarks.compare.picture."""
+"""The picture of docs/explanation/performance.json: python -m benchmarks.compare.picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The results as text: docs/performance.json, and two tables for the README."""
+"""The results as text: performance.json, two tables for the page beside it, and four rows for the README."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+from pathlib import Path
 from typing import Final
 
 from benchmarks.processes import ROOT
@@ -16,7 +17,8 @@ from .fields import DEFAULT_FLIGHT, FLIGHTS
 from .peers import CORE, title
 from .results import FULL, KHZ, LOADS, SLOW, TEN, Measured, Results
 
-RESULTS: Final = ROOT / "docs" / "performance.json"
+RESULTS: Final = ROOT / "docs" / "explanation" / "performance.json"
+PAGE: Final = RESULTS.with_suffix(".md")
 README: Final = ROOT / "README.md"
 HEAD: Final = (
     "| what | bytes | messages/s | of raw | CPU µs/message at full speed, publisher / reader"
@@ -97,7 +99,7 @@ def _rounded(numbers: Measured) -> dict[str, object]:
 
 
 def as_markdown(results: Results, rounds: int) -> str:
-    """Return what stands in the README: a few sentences and two tables."""
+    """Return what stands on the page: a few sentences and two tables."""
     about = as_json(results, rounds)
     return (
         f"Measured on {about['date']} on {about['machine']}, publisher, router and reader in processes of their own,"
@@ -111,9 +113,37 @@ def as_markdown(results: Results, rounds: int) -> str:
     )
 
 
+SHOWN: Final = {
+    "raw": "raw Zenoh, bytes of the same size",
+    "batches": "batches, NumPy arrays",
+    "rows": "rows, named tuples",
+    "models": "models, Pydantic",
+}
+
+
+def short_table(results: Results) -> str:
+    """Return the rows of the README."""
+    lines = [
+        "| form | messages/s | CPU µs/message, publisher / reader | one-way p50 / p99 at 1 kHz, µs |",
+        "|---|---|---|---|",
+    ]
+    for form, name in SHOWN.items():
+        full, khz = (results.median(DEFAULT_FLIGHT, load, form) for load in (FULL, KHZ))
+        lines.append(
+            f"| {name} | {full['rate']:,.0f} | {full['publish_cpu']:.1f} / {full['receive_cpu']:.1f} |"
+            f" {khz['p50']:.0f} / {khz['p99']:.0f} |"
+        )
+    return "\n".join(lines)
+
+
 def write(results: Results, rounds: int) -> None:
-    """Write the results as JSON, and as tables into the README."""
+    """Write the results as JSON, as tables into their page, and as rows into the README."""
     RESULTS.write_text(json.dumps(as_json(results, rounds), indent=2) + "\n")
-    text = as_markdown(results, rounds)
-    marks = r"(<!-- performance -->\n).*?(\n<!-- /performance -->)"
-    README.write_text(re.sub(marks, lambda found: found[1] + text + found[2], README.read_text(), flags=re.DOTALL))
+    _replace(PAGE, "performance", as_markdown(results, rounds))
+    if all(form in results.forms(DEFAULT_FLIGHT, FULL) for form in SHOWN):
+        _replace(README, "speed", short_table(results))
+
+
+def _replace(path: Path, name: str, text: str) -> None:
+    marks = rf"(<!-- {name} -->\n).*?(\n<!-- /{name} -->)"
+    path.write_text(re.sub(marks, lambda found: found[1] + text + found[2], path.read_text(), flags=re.DOTALL))

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from docs.generator import committed
 from nedbus_msgs import (
     ALL,
     MESSAGES,
@@ -35,7 +36,6 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import arrays_of
 from tests.first_message import decode_cdr, encode_cdr
-from tests.generated import made
 from tests.processes import Start
 from tests.ulogs import UlogWriter
 
@@ -232,8 +232,8 @@ def test_message_is_described(name: str) -> None:
 @pytest.mark.process
 def test_what_is_made_from_the_files_is_up_to_date() -> None:
     """The stubs of type checkers and the page of each message: after a change, `make generated`."""
-    assert [path.name for path, text in made().items() if not path.exists() or path.read_text() != text] == []
-    assert {path.name for path in PAGES.glob("*.md")} == {path.name for path in made() if path.suffix == ".md"}
+    assert [path.name for path, text in committed().items() if not path.exists() or path.read_text() != text] == []
+    assert {path.name for path in PAGES.glob("*.md")} == {path.name for path in committed() if path.suffix == ".md"}
 
 
 THIRTEENTH = '''

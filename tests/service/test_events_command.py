@@ -345,7 +345,7 @@ def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Ses
 
 
 PAGE = Path(__file__).parents[2] / "docs" / "events.md"
-BASH = "".join(re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL))
+BASH = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
 SHOWN = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
 
 

@@ -23,7 +23,8 @@ from .subscription import AsyncSubscription, Subscription
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 else:
-    __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})  # NumPy takes longer to load than all the rest
+    # NumPy takes longer to load than all the rest.
+    __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})
 
 __all__ = [
     "HEARTBEAT",

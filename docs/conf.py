@@ -1,0 +1,15 @@
+"""The site of the documentation: `make docs`, which makes docs/reference first. Nothing of it is fetched."""
+
+import nedbus
+
+project = "nedbus"
+project_copyright = "the nedbus authors, BSD-3-Clause"
+release = version = nedbus.__version__
+extensions = ["myst_parser"]
+exclude_patterns = ["generator"]
+nitpicky = True
+myst_heading_anchors = 4
+html_theme = "furo"
+html_title = f"nedbus {release}"
+html_copy_source = False
+html_show_sphinx = False

@@ -1,0 +1,35 @@
+"""What is made from the code: the stubs of type checkers, a page for each message, and the reference of the site."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from nedbus_msgs import MESSAGES
+
+from .api import api_page
+from .commands import commands_page
+from .messages import module_of, page
+from .metrics import metrics_page
+from .stubs import ROOT, stubs
+from .tables import events_page, keys_page, limits_page, settings_page
+
+DOCS = ROOT / "docs"
+
+
+def committed() -> dict[Path, str]:
+    """Return what is kept in the repository: what type checkers read, and the pages of messages."""
+    pages = {DOCS / "messages" / f"{module_of(each)}.md": page(each) for each in MESSAGES.values()}
+    return {**stubs(), **pages}
+
+
+def reference() -> dict[str, str]:
+    """Return the pages that are made for the site, by the name of their file."""
+    return {
+        "api.md": api_page(),
+        "command-line.md": commands_page(),
+        "settings.md": settings_page(),
+        "metrics.md": metrics_page(),
+        "log-events.md": events_page(),
+        "keys.md": keys_page(),
+        "limits.md": limits_page(),
+    }

@@ -1,0 +1,17 @@
+"""Write what is made from the code: `make generated`, after a message was added or changed, and `make docs`."""
+
+from __future__ import annotations
+
+import sys
+
+from . import DOCS, committed, reference
+from .stubs import ROOT
+
+files = committed()
+if "--site" in sys.argv:
+    files |= {DOCS / "reference" / name: text for name, text in reference().items()}
+for path, text in files.items():
+    path.parent.mkdir(exist_ok=True)
+    if not path.exists() or path.read_text() != text:
+        path.write_text(text)
+        sys.stdout.write(f"{path.relative_to(ROOT)}\n")

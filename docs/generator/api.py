@@ -1,0 +1,130 @@
+"""The page of the Python API: each public name with its signature and what its docstring says."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import nedbus
+import nedbus.errors
+import nedbus_msgs
+
+from .markdown import cell, code, docstring, page, section, table
+
+_SECTIONS: Final = {  # the packages whose names they have
+    "The bus, subscriptions and publishers": ("nedbus.client", "nedbus.transport"),
+    "Files": ("nedbus.recording",),
+    "Events": ("nedbus.events",),
+    "Errors": ("nedbus.errors", "nedbus_msgs.errors"),
+    "Messages, arrays, frames and resets": ("nedbus_msgs",),
+}
+_CONSTANTS: Final = {  # of which no line of the code says more
+    "ANY": "Any topic, or any vehicle",
+    "Mode": "A slow reader gets the newest message of each key, or every message",
+    "Quantity": "What an estimator resets",
+    "Vector": "Three components",
+    "Session": "Zenoh's own session, for what nedbus does not do",
+}
+
+
+def api_page() -> str:
+    """Return the page of `nedbus.__all__`."""
+    named = {name: getattr(nedbus, name) for name in nedbus.__all__}
+    constants = {name: each for name, each in named.items() if not (inspect.isclass(each) or inspect.isroutine(each))}
+    constants["Session"] = named["Session"]
+    parts = []
+    for title, packages in _SECTIONS.items():
+        own = [name for name in named if name not in constants and _section_of(named[name]) == title]
+        tree = docstring(nedbus.errors.__doc__) if title == "Errors" else ""
+        own.sort(key=lambda name: (name.startswith("Async"), inspect.isclass(named[name]), title == "Errors"))
+        parts.append(section(title, tree, *(_entry(name, named[name]) for name in own)))
+        assert own, packages
+    return page(
+        "Python API",
+        "Everything is imported from `nedbus`; units are SI and the frame is NED unless a line says otherwise.",
+        "The classes of messages have [a page each](../messages.md).",
+        *parts,
+        section("Constants and types", table(["name", "is", "meaning"], map(_constant, constants.items()))),
+    )
+
+
+def _section_of(value: Any) -> str:
+    module = f"{value.__module__}."
+    return next(
+        (title for title, packages in _SECTIONS.items() if any(module.startswith(f"{each}.") for each in packages)),
+        next(iter(_SECTIONS)),
+    )
+
+
+def _entry(name: str, value: Any) -> str:
+    if inspect.isroutine(value):
+        return section(f"`{name}`", _signature(name, value), docstring(value.__doc__), level=3)
+    made = "" if "get one from" in (value.__doc__ or "") or "from `connect" in (value.__doc__ or "") else name
+    signature = _signature(made, value) if made and not issubclass(value, (Exception, nedbus.Message)) else ""
+    return section(f"`{name}`", signature, docstring(value.__doc__), *map(str, _members(value)), level=3)
+
+
+def _members(cls: type) -> Iterator[str]:
+    """Yield the properties and the methods of a class."""
+    own = [base for base in cls.__mro__ if base.__module__.startswith("nedbus")]
+    names = dict.fromkeys(name for base in own for name in vars(base) if not name.startswith("_"))
+    if issubclass(cls, nedbus.Message):
+        names = {name: None for name in names if name in vars(nedbus.Message)}
+    properties, methods = [], []
+    for name in names:
+        value = inspect.getattr_static(cls, name)
+        if isinstance(value, (property, cached_property)):
+            properties.append([code(name), cell(value.__doc__ or "")])
+        elif isinstance(value, (classmethod, staticmethod)) or inspect.isroutine(value):
+            routine = getattr(cls, name)
+            texts = _signature(name, routine), docstring(inspect.getdoc(routine))
+            methods.append(section(f"`{cls.__name__}.{name}`", *texts, level=4))
+    yield table(["property", "is"], properties)
+    yield from methods
+
+
+def _signature(name: str, value: Any) -> str:
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):
+        return ""
+    shown = [each for each in signature.parameters.values() if each.name not in {"self", "cls"}]
+    returned = signature.return_annotation if inspect.isroutine(value) else inspect.Signature.empty
+    text = f"{name}{signature.replace(parameters=shown, return_annotation=returned)}"
+    text = re.sub(r"(: |-> )'((?:[^'\\]|\\.)*)'", r"\1\2", re.sub(r'(: |-> )"([^"]*)"', r"\1\2", text))
+    text = re.sub(r"ForwardRef\('(\w+)'\)|<class '(?:\w+\.)*(\w+)'>", lambda found: found[1] or found[2], text)
+    if len(text) > 100:
+        text = re.sub(r"\(", "(\n    ", text, count=1)
+        text = re.sub(r", (?=\*?\*?\w+(?::|,|=|\)))", ",\n    ", text)
+    return f"```python\n{text}\n```"
+
+
+def _constant(item: tuple[str, Any]) -> list[str]:
+    name, value = item
+    shown = {"TOPICS": "a mapping of names to `Topic`", "DTYPE": "`numpy.dtype`", "Session": "`zenoh.Session`"}
+    return [code(name), shown.get(name) or code(str(value).replace("typing.", "")), cell(_meaning(name))]
+
+
+def _meaning(name: str) -> str:
+    if name in _CONSTANTS:
+        return _CONSTANTS[name]
+    for package in (nedbus_msgs, nedbus):
+        for path in Path(package.__path__[0]).rglob("*.py"):
+            for assigned, text in constants_of(ast.parse(path.read_text())):
+                if assigned == name:
+                    return text
+    raise LookupError(name)
+
+
+def constants_of(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield each name that is assigned in a module, and the string that stands below it."""
+    for statement, below in zip(tree.body, tree.body[1:], strict=False):
+        target = getattr(statement, "target", None) or next(iter(getattr(statement, "targets", ())), None)
+        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        if isinstance(target, ast.Name) and is_text:
+            yield target.id, str(below.value.value)  # type: ignore[attr-defined]  # what is_text says

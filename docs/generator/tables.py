@@ -1,0 +1,166 @@
+"""The pages of settings and sources, events, keys, payloads and limits: tables of what the code has."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Final
+
+import nedbus
+import nedbus_msgs
+from nedbus.events import KINDS
+from nedbus.log_event import EVENTS
+from nedbus.settings import Settings
+from nedbus.sources import SOURCE_KINDS
+from nedbus_msgs import MESSAGES, TOPICS, Address, encode
+
+from .api import constants_of
+from .markdown import cell, code, page, section, table
+
+_PARTS: Final = {  # of the limits, by the package that holds them
+    "Readers and publishers": ("client",),
+    "Services and sources": ("daemon", "sources"),
+    "Events": ("events",),
+    "Recordings": ("recording",),
+    "Metrics, the log and the page": ("monitoring", "cli", "web"),
+    "Zenoh, certificates and ROS 2": ("transport", "bridges"),
+    "Messages": ("nedbus_msgs",),
+    "Others": (),
+}
+
+
+def settings_page() -> str:
+    """Return the page of the settings of a service, and of the options of its sources."""
+    rows = []
+    for name, field in Settings.model_fields.items():
+        default = field.get_default(call_default_factory=True)
+        shown = "" if default in (None, (), "") else str(default).lower()
+        flag = f"--{name.replace('_', '-')}"
+        rows.append([code(name), code(f"NEDBUS_{name.upper()}"), code(flag), code(shown), cell(field.description)])
+    sources = []
+    for name, kind in SOURCE_KINDS.items():
+        options = []
+        for option, field in kind.options.model_fields.items():
+            default = field.get_default(call_default_factory=True)
+            shown = "" if default in (None, (), {}, "", False) else str(default)
+            options.append([code(option), code(shown), cell(field.description)])
+        needs = f"Needs the extra `{kind.extra}`." if kind.extra else ""
+        title = f"`{name}:{kind.target or ''}`"
+        sources.append(section(title, needs, table(["option", "default", "meaning"], options), level=3))
+    return page(
+        "Settings",
+        "Flags win over the environment, which wins over `nedbus.toml`, or the file that `--config` or `NEDBUS_CONFIG` "
+        "names. An empty default is none.",
+        table(["in `nedbus.toml`", "environment", "flag", "default", "meaning"], rows),
+        section("Sources", "A source is `KIND:TARGET?OPTION=VALUE&OPTION=VALUE`, or a table of TOML.", *sources),
+    )
+
+
+def events_page() -> str:
+    """Return the page of the events of the log, and of those of vehicles."""
+    rows = [[code(name), cell(each.doc), "yes" if each.limited else "never"] for name, each in EVENTS.items()]
+    kinds = [[code(kind), ", ".join(map(code, evidence))] for kind, evidence in KINDS.items()]
+    return page(
+        "Events of the log, and of vehicles",
+        section(
+            "Of the log",
+            "The `event` of a line with `--log-format json`. "
+            "Of one that is limited, 50 lines of a kind are logged at once and 6 a minute after that.",
+            table(["event", "meaning", "limited"], rows),
+        ),
+        section(
+            "Of vehicles",
+            "The `kind` of an event, and the kinds that may explain it; [what they mean](../events.md#events).",
+            table(["kind", "evidence"], kinds),
+        ),
+    )
+
+
+def keys_page() -> str:
+    """Return the page of keys, payloads and topics."""
+    one, other = Address("7", "vehicle_local_position"), Address("7", "sensor_gps", 0)
+    keys = [
+        [code(one.key()), "messages; a `get` returns the last one"],
+        [code(other.key()), "the same, for each EKF or sensor instance"],
+        [code(one.rate_key(5)), "the same, downsampled by its publisher to 5 messages a second"],
+        [code(one.alive_key()), "liveliness token"],
+        [
+            code(f"{one.key()}/@ack"),
+            (
+                "queryable of each reader of mode `every`, with `?publisher=<zid>:<eid>;number=<sequence number>;"
+                "read=<0 or 1>`: it answers when that message of that publisher has arrived, with `read=1` when its "
+                "script has taken it; the key is that of the subscription"
+            ),
+        ],
+        [code("nedbus/@schema/VehicleLocalPosition"), "queryable: JSON Schema and layouts of a message"],
+        [code("nedbus/@service/*/status"), "queryable: status of each service, in JSON"],
+        [code(one.rejected_key()), "rejected messages, with the reason, in JSON"],
+    ]
+    messages = [
+        [
+            code(name),
+            str(len(each.types)),
+            str(len(encode(each.model(timestamp=1)))),
+            code(f"application/msgpack;px4_msgs/{name}"),
+        ]
+        for name, each in MESSAGES.items()
+    ]
+    topics = [
+        [code(name), f"{each.rate:g}", str(each.kept), "first" if each.priority == "data_high" else ""]
+        for name, each in TOPICS.items()
+    ]
+    return page(
+        "Keys and payloads",
+        "For clients in other languages; `examples/plain_zenoh.py` is one.",
+        section("Keys", table(["key", "content"], keys)),
+        section(
+            "Payloads",
+            "`[layout, field 1, ... field n]` as msgpack, the fields in the order of "
+            "[the message's page](../messages.md)."
+            "\nEvery field is written at its full width, so a payload of a message always has the same size, with "
+            "every field at a fixed offset; any other valid msgpack of the array is read too."
+            "\nThe encoding begins with the message; `;source=...` may follow, and `;missing=...`, a hexadecimal "
+            "number with a bit for each field that was not provided, the lowest for `timestamp`.",
+            table(["message", "fields", "bytes", "encoding"], messages),
+        ),
+        section("Topics", table(["topic", "Hz", "messages kept", "priority"], topics)),
+    )
+
+
+def limits_page() -> str:
+    """Return the page of limits: the numbers of the code that a line of it explains."""
+    parts: dict[str, list[list[str]]] = {title: [] for title in _PARTS}
+    for package in (nedbus, nedbus_msgs):
+        root = Path(package.__path__[0])
+        for path in sorted(root.rglob("*.py")):
+            folder = "nedbus_msgs" if package is nedbus_msgs else path.relative_to(root).parts[0]
+            title = next((title for title, folders in _PARTS.items() if folder in folders), "Others")
+            tree = ast.parse(path.read_text())
+            numbers = dict(_numbers(tree))
+            for name, text in constants_of(tree):
+                if name in numbers and not name.startswith("_"):
+                    parts[title].append([cell(text), code(numbers[name]), code(name)])
+    return page(
+        "Limits and constants",
+        "The limits in the code, with the names of their constants; a vehicle's name is 1 to 64 of `A-Z a-z 0-9 _ -`, "
+        "and an instance 0 to 255.",
+        *(section(title, table(["limit", "value", "constant"], rows)) for title, rows in parts.items()),
+    )
+
+
+def _numbers(tree: ast.Module) -> list[tuple[str, str]]:
+    found = []
+    for each in tree.body:
+        value, target = getattr(each, "value", None), getattr(each, "target", None)
+        if isinstance(target, ast.Name) and isinstance(value, (ast.Constant, ast.BinOp)):
+            number = eval(ast.unparse(value), {"__builtins__": {}}) if _is_number(value) else None  # noqa: S307 - numbers
+            if number is not None:
+                found.append((target.id, f"{number:,}"))
+    return found
+
+
+def _is_number(value: ast.expr) -> bool:
+    kinds = (ast.Constant, ast.BinOp, ast.operator)
+    return all(isinstance(each, kinds) for each in ast.walk(value)) and all(
+        isinstance(each.value, (int, float)) for each in ast.walk(value) if isinstance(each, ast.Constant)
+    )

@@ -1,0 +1,382 @@
+"""README and docs: every snippet runs, or is checked where it cannot; every name of the code is in the reference."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import json
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import nedbus
+from docs.generator import DOCS
+from docs.generator.api import api_page
+from docs.generator.commands import commands, commands_page
+from docs.generator.metrics import metrics_page
+from docs.generator.tables import events_page, keys_page, limits_page, settings_page
+from nedbus.events import KINDS
+from nedbus.log_event import EVENTS
+from nedbus.settings import Settings
+from nedbus.sources import SOURCE_KINDS, parse_source
+from nedbus.transport import open_router
+from nedbus_msgs import MESSAGES, TOPICS
+from tests.command_line import run_command
+from tests.documents import BLOCKS, PAGES, ROOT, Block, check_options, nedbus_commands, parse_command, shape_of
+from tests.ports import free_endpoint, free_port
+from tests.processes import Process, Start, Zygote, unmeasured
+from tests.replays import convert_replay
+from tests.waits import wait_for
+
+from .service.test_events_command import write_flight
+
+SERVERS: Final = ("serve", "router", "export", "web", "foxglove", "ros2")
+ENDLESS: Final = (*SERVERS, "echo", "hz", "events")
+JUDGES: Final = ("health", "doctor")  # which may answer with 1
+THERE: Final = "import os, runpy, sys; os.chdir(sys.argv.pop(1)); runpy.run_module('nedbus', run_name='__main__')"
+NAMES: Final = dict(commands())
+SHELLS: Final = [block for block in BLOCKS if block.language in ("bash", "sh")]
+TEXTS: Final = {page: page.read_text() for page in PAGES}
+ALL: Final = "".join(TEXTS.values())
+DATA: Final = ("toml", "json", "ini", "python")
+PYTHON: Final = [block for block in BLOCKS if block.language == "python"]
+
+
+@pytest.fixture(scope="module")
+def vehicles(zygote: Zygote, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Run a router with the vehicles of the pages, for all snippets that only read."""
+    endpoint = free_endpoint()
+    router = open_router(listen=(endpoint,))
+    sources = [text for vehicle in (1, 2, 7) for text in ("--source", f"sim:?vehicle={vehicle}")]
+    command = (sys.executable, "-m", "nedbus", "serve", "--connect", endpoint, *sources)
+    environment = {name: value for name, value in unmeasured().items() if not name.startswith("NEDBUS_")}
+    service = Process(command, tmp_path_factory.mktemp("vehicles"), environment, zygote)
+    with nedbus.connect(endpoint) as bus:
+        wait_for(lambda: len(bus.latest("*")) == 36, what="three vehicles")
+    yield endpoint
+    service.kill()
+    router.close()
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make the files of the pages: a recording, and a log with a fault."""
+    folder = tmp_path_factory.mktemp("flights")
+    convert_replay("sim:?duration=40", folder / "flight.mcap")
+    write_flight(folder / "flight.ulg")
+    return folder
+
+
+@pytest.fixture
+def here(flights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Go where the files of the pages are."""
+    folder = tmp_path / "clone"
+    shutil.copytree(flights, folder)
+    for name in ("config", "examples"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "nedbus.toml").write_text('source = ["sim:"]\n')
+    outline = {"type": "Polygon", "coordinates": [[[8.5, 47.3], [8.6, 47.3], [8.6, 47.4], [8.5, 47.3]]]}
+    (folder / "field.geojson").write_text(json.dumps(outline))
+    (folder / "field.png").touch()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+class Runner:
+    """Run snippets with the vehicles of this test in place of those of the reader."""
+
+    def __init__(self, start: Start, endpoint: str, folder: Path) -> None:
+        self._start, self._endpoint, self._folder = start, endpoint, folder
+        self._environment = {"NEDBUS_CONNECT": endpoint, "PYTHONUNBUFFERED": "1", "MPLBACKEND": "agg"}
+
+    def run(self, block: Block) -> str:
+        """Run a snippet, and return what it printed."""
+        for made in re.findall(r"--output (\S+)", block.text):
+            (self._folder / made).unlink(missing_ok=True)
+        if block.language == "python":
+            return self._run_python(block)
+        if block.is_plain:
+            return "".join(map(self._run_command, block.commands))
+        path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+        done = subprocess.run(
+            ["bash", "-e", "-c", self._localize(block.text)],
+            cwd=self._folder,
+            env=os.environ | self._environment | {"PATH": path},
+            capture_output=True,
+            text=True,
+            timeout=100,
+            check=False,
+        )
+        assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+        return done.stdout
+
+    def _localize(self, text: str) -> str:
+        for pattern, local in (
+            (r"(--connect |connect\(\")tcp/192\.168\.1\.[56]:7447", rf"\1{self._endpoint}"),
+            (r"tcp/(?:0\.0\.0\.0|127\.0\.0\.1):7447", free_endpoint()),
+            (r"(udpin:|--http )(?:0\.0\.0\.0|127\.0\.0\.1):\d+", rf"\g<1>127.0.0.1:{free_port()}"),
+        ):
+            text = re.sub(pattern, local, text)
+        return text
+
+    def _run_command(self, command: str) -> str:
+        """Run a command of nedbus until it ends; an endless one until it has said something, and then Ctrl-C."""
+        arguments = shlex.split(self._localize(command))[1:]
+        name = next(each for each in arguments if f"nedbus {each}" in NAMES)
+        if name == "router":
+            arguments += ["--listen", free_endpoint()]
+        if name in {"web", "foxglove"} and "--http" not in arguments:
+            arguments += ["--http", f"127.0.0.1:{free_port()}"]
+        process = self._start("-c", THERE, str(self._folder), *arguments, measured=False, **self._environment)
+        wait_for(lambda: self._has_said(process) or process.popen.poll() is not None, what=command)
+        ends = bool({"--duration", "--check"} & {*arguments}) or (name == "events" and "flight.ulg" in arguments)
+        if name in ENDLESS and not ends:
+            process.signal(signal.SIGINT)
+        code = process.wait(60)
+        assert code in {0, 130, *([1] * (name in JUDGES))}, f"{command}: {process.err}"
+        assert "Traceback" not in process.err
+        return process.out
+
+    @staticmethod
+    def _has_said(process: Process) -> bool:
+        return bool(process.out or " router on " in process.err or re.search("client of|http|ws:|->", process.err))
+
+    def _run_python(self, block: Block) -> str:
+        """Run a script until it ends, or until it has printed three lines."""
+        own = [each for each in PYTHON if each.page == block.page]
+        texts: list[str] = []
+        for each in reversed(own[: own.index(block) + 1]):
+            texts.insert(0, each.text)
+            if each.marker != "continues":
+                break
+        script = self._folder / "script.py"
+        script.write_text(self._localize("\n".join([f"import os; os.chdir({str(self._folder)!r})", *texts])))
+        process = self._start(str(script), measured=False, **self._environment)
+        wait_for(
+            lambda: process.popen.poll() is not None or process.out.count("\n") >= 3, what=f"{block}: {process.err}"
+        )
+        if process.popen.poll() is None:
+            process.signal(signal.SIGINT)
+            process.wait()
+            assert not process.err or process.err.rstrip(": \n").endswith("KeyboardInterrupt"), process.err
+        else:
+            assert process.wait() == 0, process.err
+        return process.out
+
+
+@pytest.fixture
+def runner(start: Start, vehicles: str, here: Path) -> Runner:
+    """Run snippets where the files are, beside the vehicles."""
+    return Runner(start, vehicles, here)
+
+
+@pytest.mark.parametrize("block", [each for each in (*SHELLS, *PYTHON) if each.is_run], ids=str)
+def test_snippet_runs(runner: Runner, block: Block) -> None:
+    """Whatever is shown without a reason against it does what it should, and ends without an error."""
+    runner.run(block)
+
+
+@pytest.mark.parametrize("block", [each for each in BLOCKS if each.marker == "output"], ids=str)
+def test_shown_output_is_printed(runner: Runner, block: Block) -> None:
+    """Each line that is shown is printed by the snippet above, with other numbers perhaps."""
+    printed = runner.run(BLOCKS[BLOCKS.index(block) - 1]).splitlines()
+    for line in block.text.splitlines():
+        assert line == "..." or any(shape_of(line).fullmatch(each.strip()) for each in printed), line
+
+
+@pytest.mark.parametrize("block", [each for each in BLOCKS if not each.is_run], ids=str)
+def test_what_is_not_run_has_a_reason(block: Block) -> None:
+    """A snippet that is not run here says why; one that another test runs names a file that reads its page."""
+    assert len(block.reason) > 10
+    for file in re.findall(r"tests/\S+\.py", block.reason):
+        assert (ROOT / file).is_file()
+    if block.marker == "run by":
+        assert block.page.stem in (ROOT / block.reason).read_text()
+
+
+def test_each_language_is_known() -> None:
+    """No snippet escapes: what is in no language of these is a text, and a fence has one."""
+    languages = {block.language for block in BLOCKS} - {"{toctree}"}
+    assert languages <= {"bash", "sh", "python", "toml", "json", "ini", "text"}
+    assert {block.marker for block in BLOCKS} <= {"", "not run", "run by", "continues", "output"}
+    assert not [str(block) for block in SHELLS if block.language == "sh" and block.is_run]
+    assert sum(text.count("```") for text in TEXTS.values()) == 2 * len(BLOCKS)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("block", SHELLS, ids=str)
+def test_shell_is_valid(here: Path, block: Block) -> None:
+    """Run or not: a shell can read it, each command of nedbus has these options, each source and file exists."""
+    subprocess.run(["bash", "-n", "-c", block.text], check=True, timeout=30)
+    for command in nedbus_commands(block):
+        parse_command(command)
+    for source in re.findall(r"--source \"?([^\s\"]+)", block.text):
+        parse_source(source)
+    for file in re.findall(r"(?:config|packaging|examples)/[\w./-]+\.\w+", block.text):
+        assert (ROOT / file).is_file()
+    for module in re.findall(r"python -m (benchmarks\.\w+)", block.text):
+        assert (ROOT / f"{module.replace('.', '/')}.py").is_file()
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"^make (\w+)", block.text, re.MULTILINE):
+        assert f"\n{target}:" in makefile or target.startswith("px4_")
+
+
+@pytest.mark.parametrize("block", [each for each in BLOCKS if each.language in DATA], ids=str)
+def test_other_text_is_valid(block: Block, tmp_path: Path) -> None:
+    """Settings are settings without a mistake; JSON, Python and the additions to a unit can be read."""
+    if block.language == "toml":
+        (tmp_path / "nedbus.toml").write_text(block.text)
+        others = {} if "source" in block.text else {"NEDBUS_SOURCE": "sim:"}
+        checked = run_command("check", "--offline", str(tmp_path / "nedbus.toml"), **others)
+        assert checked.exit_code == 0, checked.err
+    elif block.language == "json":
+        assert [json.loads(line) for line in block.text.splitlines()]
+    elif block.language == "ini":
+        configparser.ConfigParser().read_string(block.text)
+    else:
+        ast.parse(block.text)
+
+
+def test_shown_names_exist() -> None:
+    """Every name of nedbus in a text is public; every command in a sentence exists, with its options."""
+    names = set(re.findall(r"\bnedbus\.([A-Za-z]\w*)(?!.*\")", re.sub(r"^\{.*", "", ALL, flags=re.MULTILINE)))
+    assert names - {"toml", "json", "yml", "service", "mcap"} <= {*nedbus.__all__, *MESSAGES}
+    for command in re.findall(r"`(nedbus [a-z][^`]*)`", ALL):
+        if "COMMAND" not in command:
+            check_options(command)
+
+
+def test_first_script_is_the_example() -> None:
+    """What is shown is what the tests of the examples run."""
+    example = (ROOT / "examples" / "position.py").read_text()
+    assert example in [block.text for block in BLOCKS if block.page.name == "README.md"]
+
+
+def test_readme_is_short() -> None:
+    """The README is read in one go; what is longer is a page of its own."""
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 180
+    assert {"run", "test"} <= set(re.findall(r"\bmake (\w+)", text))
+
+
+def test_speed_is_what_was_measured() -> None:
+    """The rows of the README are those of the last measurement."""
+    measured = json.loads((DOCS / "explanation" / "performance.json").read_text())
+    full = measured["results"][measured["flight"]]["full"]
+    rows = re.search(r"<!-- speed -->\n(.*?)<!-- /speed -->", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert rows is not None
+    shown = re.findall(r"^\| \w.*? \| ([\d,]+) \|", rows[1], re.MULTILINE)
+    assert shown == [f"{full[form]['rate']:,.0f}" for form in ("raw", "batches", "rows", "models")]
+
+
+def test_shown_stacks_exist() -> None:
+    """Every compose command names files, profiles and services that are there; every variable is in a file."""
+    stacks = {file.name: file.read_text() for file in ROOT.glob("docker-compose*.yml")}
+    shown = [each for block in SHELLS for each in block.commands if each.startswith("docker compose ")]
+    assert len(shown) > 6
+    for command in shown:
+        files = re.findall(r"-f (\S+)", command)
+        assert set(files) <= set(stacks)
+        for profile in re.findall(r"--profile (\S+)", command):
+            assert f"profiles: [{profile}]" in stacks["docker-compose.yml"]
+    for variable in re.findall(r"`(NEDBUS_[A-Z]+_IMAGE|NEDBUS_PUBLISH|NEDBUS_PKI|NEDBUS_USER|NEDBUS_WEB)`", ALL):
+        assert any(variable in text for text in stacks.values())
+
+
+def test_links_lead_somewhere() -> None:
+    """Every link to a file of this project has a file at its end, and a heading where it names one."""
+    for page in (*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"):
+        for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#?([^)]*)\)", page.read_text()):
+            file = page.parent / target if target else page
+            assert file.exists(), f"{page.name}: {target}"
+            headings = re.findall(r"^#+ (.*)", file.read_text(), re.MULTILINE) if anchor else []
+            anchors = [re.sub(r"[^\w -]", "", each.lower()).replace(" ", "-") for each in headings]
+            assert not anchor or anchor in anchors, f"{page.name}: {target}#{anchor}"
+
+
+BARE_EXTRA = re.compile(r"(?<![\w./])nedbus\[[^\]\n]*\](?! @ )")
+INSTALL = re.compile(r"\b(?:pip3?|pipx|uv)\b.*\b(?:install|download|run|add)\b(.*)")
+BARE_NAME = re.compile(r"""(?<![^\s"'`])nedbus(?=[\s"'`=<>~!]|$)(?! @ )""")
+
+
+def bare_names(text: str) -> list[str]:
+    """Return what a text shows to pip by our name alone, without a path or an address."""
+    commands = [(match[0], match[1].partition("&&")[0]) for match in INSTALL.finditer(text)]
+    return BARE_EXTRA.findall(text) + [whole for whole, arguments in commands if BARE_NAME.search(arguments)]
+
+
+def test_nothing_is_installed_by_our_name() -> None:
+    """On PyPI the name is not ours: whatever is installed is named with a path or an address."""
+    for refused in ('"nedbus[web]"', "-U nedbus", "nedbus==1"):
+        assert bare_names(f"pip install {refused}"), refused
+    assert bare_names("extra `nedbus[all]`")
+    for allowed in ('".[web]"', "./nedbus-1.whl", "'nedbus[web] @ git+ssh://host/x'"):
+        assert not bare_names(f"pip install {allowed}"), allowed
+    folders = ("docs", "service", "schemas", "examples", "packaging", "config")
+    files = [file for folder in folders for file in (ROOT / folder).rglob("*") if file.is_file()]
+    files += [*ROOT.glob("*.md"), *ROOT.glob("*.yml"), ROOT / "Dockerfile", ROOT / "Makefile"]
+    texts = {file: file.read_text() for file in files if file.suffix not in (".png", ".pyc")}
+    assert {str(file): names for file, text in texts.items() if (names := bare_names(text))} == {}
+
+
+def test_reference_has_every_public_name() -> None:
+    """Each name of `nedbus.__all__` has an entry with what it is; each method of the bus is there."""
+    page = api_page()
+    entries = dict(re.findall(r"^### `(\w+)`\n\n(.*?)(?=\n\n###? |\Z)", page, re.MULTILINE | re.DOTALL))
+    constants = dict(re.findall(r"^\| `(\w+)` \| .*? \| (.+) \|$", page.partition("## Constants")[2], re.MULTILINE))
+    assert {*entries, *constants} == set(nedbus.__all__)
+    assert all(re.search(r"[a-z]{3}.*\.", text) for text in entries.values())
+    assert all(constants.values())
+    for name in ("subscribe", "latest", "vehicles", "publisher", "services"):
+        assert f"{name}(" in entries["Bus"]
+
+
+def test_reference_has_every_option() -> None:
+    """Each command has a section with all of its options and arguments."""
+    page = commands_page()
+    sections = dict(re.findall(r"^## `(nedbus[^`]*)`\n(.*?)(?=\n## |\Z)", page, re.MULTILINE | re.DOTALL))
+    assert len(sections) > 25
+    for name, command in commands():
+        for option in command.params:
+            assert all(each in sections[name] for each in option.opts if each.startswith("-")), f"{name} {option.opts}"
+
+
+def test_reference_has_every_setting() -> None:
+    """Each setting with its variable and flag, each kind of source with its options."""
+    page = settings_page()
+    for name in Settings.model_fields:
+        assert f"| `{name}` | `NEDBUS_{name.upper()}` | `--{name.replace('_', '-')}` |" in page
+    for name, kind in SOURCE_KINDS.items():
+        section = page.partition(f"### `{name}:")[2].partition("###")[0]
+        assert all(f"| `{option}` |" in section for option in kind.options.model_fields)
+
+
+def test_reference_has_every_event_key_and_limit() -> None:
+    """Events of the log and of vehicles, topics and messages, and the limits that the pages name."""
+    events, keys, limits = events_page(), keys_page(), limits_page()
+    assert all(f"| `{name}` | " in events for name in (*EVENTS, *KINDS))
+    assert all(f"| `{name}` | " in keys for name in (*TOPICS, *MESSAGES))
+    assert all(f"| `{limit}` |" in limits for limit in ("65,536", "2,000"))
+
+
+@pytest.mark.process
+def test_reference_has_every_metric() -> None:
+    """Each metric that is written out in the code, and each that the alerts need, with its labels."""
+    page = metrics_page()
+    for path in Path(nedbus.__path__[0], "monitoring").rglob("*.py"):
+        for name in re.findall(r'"(nedbus_[a-z_]+)"', path.read_text()):
+            assert f"| `{name}" in page, name
+    alerts = (ROOT / "packaging" / "prometheus" / "alerts.yml").read_text()
+    assert all(
+        f"| `{name}" in page for name in re.findall(r"\b(nedbus_[a-z_]+?)(?:_bucket|_sum|_count)?\b[{\[ )]", alerts)
+    )
+    assert "| `nedbus_stream_age_seconds` | gauge | `source, topic, vehicle` |" in page
