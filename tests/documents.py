@@ -49,7 +49,7 @@ class Block:
 
     @property
     def is_run(self) -> bool:
-        """Whether it is run here."""
+        """True if it is run here."""
         return self.marker not in {"not run", "run by"}
 
     @property
@@ -60,7 +60,7 @@ class Block:
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is commands of nedbus alone, with nothing that needs a shell."""
+        """True if it is commands of nedbus alone, with nothing that needs a shell."""
         return not any(_SHELL.search(re.sub(r"\"[^\"]*\"|'[^']*'", "", each)) for each in self.commands)
 
 

@@ -38,7 +38,7 @@ def test_packages_are_imported_through_their_doors() -> None:
 
 
 def test_docstrings_are_no_questions() -> None:
-    """The first line of a file says its one duty; no docstring opens with a question, or counts "so many"."""
+    """The first line of a file says its one duty; no docstring opens with a question, or counts without a number."""
     for path in ALL:
         first = (ast.get_docstring(parse(path)) or "\n").splitlines()[0]
         assert path not in PRODUCT or path.stem.startswith("__") or first.endswith((".", ":")), path

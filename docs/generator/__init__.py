@@ -1,4 +1,4 @@
-"""What is made from the code: the stubs of type checkers, a page for each message, and the reference of the site."""
+"""Generated files: the stubs of type checkers, a page for each message, and the reference of the site."""
 
 from __future__ import annotations
 

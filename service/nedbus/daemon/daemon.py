@@ -64,7 +64,7 @@ class Daemon:
 
     @property
     def until_done(self) -> bool:
-        """Whether it ends when its finite sources have ended."""
+        """True if it ends when its finite sources have ended."""
         return self._settings.until_done
 
     @property
@@ -89,12 +89,12 @@ class Daemon:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Whether the router refuses a vehicle that is published, of those of which that is known."""
+        """Answer of the router for each published vehicle where it is known: true if access rules refuse it."""
         return {} if self._permission is None else self._permission.refused
 
     @property
     def measures(self) -> list[SourceMeasures]:
-        """What is measured of each source, for metrics."""
+        """Measurements of each source, for metrics."""
         return [worker.measures for worker in self._list_workers()]
 
     @property
@@ -104,7 +104,7 @@ class Daemon:
 
     @property
     def sessions(self) -> int:
-        """How many sessions are connected: to the embedded router, or of this client to its router."""
+        """Number of connected sessions: of the embedded router, or of this client to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
 
     def look(self, measures: Sequence[SourceMeasures] | None = None) -> Account:

@@ -68,17 +68,17 @@ class SourceOutput:
 
     @property
     def addresses(self) -> list[Address]:
-        """What is published now."""
+        """Addresses that are published now."""
         return [address for address, stream in list(self._streams.items()) if stream.publisher is not None]
 
     @property
     def stale(self) -> list[Address]:
-        """What a live source published, until nothing arrived any more."""
+        """Addresses that a live source published, until nothing arrived any more."""
         streams = list(self._streams.items())
         return [address for address, stream in streams if stream.publisher is None and stream.heard is not None]
 
     def streams(self, limit: int | None = None) -> tuple[StreamStatus, ...]:
-        """Return the health of all streams, or of so many."""
+        """Return the health of all streams, or of `limit` of them."""
         streams, now = list(self._streams.items())[:limit], self._now_ns()
         return tuple(StreamStatus(str(address), stream.health.snapshot(now)) for address, stream in streams)
 

@@ -1,4 +1,4 @@
-"""What a service is to run: the sources of its settings, opened, or all that is wrong with them."""
+"""Plan of a service: the sources of its settings, opened, or all mistakes in them."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ Role = Literal["router", "client"]
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
-    """What is measured of one source, for metrics: its status, all its streams, and how long publishing takes [s]."""
+    """Measurements of one source, for metrics: its status, all its streams, and the time that publishing takes [s]."""
 
     status: SourceStatus
     streams: tuple[StreamStatus, ...]

@@ -40,7 +40,7 @@ class Clock:
 
     @property
     def stopped(self) -> bool:
-        """Whether the worker is to end."""
+        """True once the worker is to end."""
         return self._event.is_set()
 
 
@@ -91,7 +91,7 @@ class Worker:
 
     @property
     def measures(self) -> SourceMeasures:
-        """What is measured of the source, for metrics."""
+        """Measurements of the source, for metrics."""
         streams = self._output.streams()
         return SourceMeasures(self._status(streams[:_MAX_STREAMS]), streams, self._output.durations)
 

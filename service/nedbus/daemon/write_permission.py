@@ -1,4 +1,4 @@
-"""Whether the router lets through what a service publishes: access rules drop the rest, and tell its sender nothing.
+"""Write permission at the router: access rules drop what they do not allow, and tell its sender nothing.
 
 Only a service that shows a certificate is checked, as access rules go by it: with a second session for a moment, a few
 seconds after a link is up or a vehicle appears, and then seldom. Rules change when a router starts again.
@@ -69,7 +69,7 @@ class WritePermission:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Whether the router refuses a vehicle, of those of which that is known."""
+        """Answer of the router for each vehicle where it is known: true if access rules refuse it."""
         return dict(self._refused)
 
     def start(self) -> None:

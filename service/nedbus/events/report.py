@@ -50,7 +50,7 @@ class VehicleReport:
 
     @property
     def is_silent(self) -> bool:
-        """Whether it is not heard, so that only this is known of it."""
+        """True while it is not heard, so that nothing else is known of it."""
         return not _SILENT.isdisjoint(self.kinds)
 
     def is_forgotten(self, now: float) -> bool:

@@ -57,7 +57,7 @@ class Story:
 
     @property
     def is_bad(self) -> bool:
-        """Whether it keeps the vehicle from its task."""
+        """True if it keeps the vehicle from its task."""
         return self.begin is None or self.begin.severity == "bad"
 
     @property

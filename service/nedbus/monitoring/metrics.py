@@ -35,8 +35,8 @@ _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily,
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
 _OTHER: Final = ("other", "other")
-# Each metric by its name: its type, its labels, and its help text.
-_METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
+
+METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # of a service
     "nedbus_start_time_seconds": (_GAUGE, (), "When the service started"),
     "nedbus_sessions": (_GAUGE, ("role",), "Zenoh sessions at the embedded router, or routers of a client"),
@@ -89,6 +89,7 @@ _METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     "nedbus_source_restarts": (_COUNTER, _SOURCE, "Times that a source failed, and began again"),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
 }  # fmt: skip
+"""Each metric by its name: its type, its labels, and its help text."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ def build_info(version: str) -> core.Metric:
 def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[core.Metric]:
     """Yield metrics by name with their series: the values of the labels, and a value, or buckets and sum."""
     for name, rows in series.items():
-        kind, labels, text = _METRICS[name]
+        kind, labels, text = METRICS[name]
         metric = kind(name, text, labels=labels)
         for row in rows:
             metric.add_metric(*row)
