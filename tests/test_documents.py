@@ -378,3 +378,14 @@ def test_reference_has_every_metric() -> None:
         f"| `{name}" in page for name in re.findall(r"\b(nedbus_[a-z_]+?)(?:_bucket|_sum|_count)?\b[{\[ )]", alerts)
     )
     assert "| `nedbus_stream_age_seconds` | gauge | `vehicle, topic, source` |" in page
+
+
+def test_contributing_names_files_that_exist() -> None:
+    """Each path with a folder in CONTRIBUTING is there, from the root, the service, the contract or the tests."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    paths = re.findall(r"`((?:\w+/)+[\w.-]*)`", text)
+    folders = ("service/nedbus", "service/nedbus/web", "service/nedbus/cli", "schemas")
+    roots = [ROOT, *(ROOT / folder for folder in folders)]
+    rooms = {f"{room}/" for room in ("publishing", "receiving", "discovery", "health")}
+    assert len(paths) > 60
+    assert [path for path in paths if path not in rooms and not any((root / path).exists() for root in roots)] == []
