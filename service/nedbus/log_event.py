@@ -26,7 +26,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     # the process
     "router": Event("a router listens, or cannot do all that its file says", limited=False),
     "client": Event("the service is a client of a router", limited=False),
-    "http": Event("metrics and health are served, and who can read them", limited=False),
+    "http": Event("metrics and health are served, and their possible readers", limited=False),
     "setting": Event("a setting, or a variable of the environment, looks wrong", limited=False),
     "reload": Event("SIGHUP arrived: what it changed, or why it changes nothing", limited=False),
     "ending": Event("a signal ends the process, or it cannot end in time", limited=False),

@@ -179,7 +179,7 @@ def test_vehicle_that_moved_is_heard() -> None:
 def test_expected_vehicles() -> None:
     """Those that are missing are named, and how many are heard; a vehicle of a script counts when it is heard."""
     one = report(flying())
-    assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: nobody publishes it"]
+    assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one], Expectation(("1", "7")), heard=["7"]) == []
     assert faults_of([one], Expectation(vehicles=3), heard=["7"]) == ["2 of 3 vehicles are heard: 1, 7"]
     assert faults_of([], Expectation(vehicles=1)) == ["0 of 1 vehicles are heard"]

@@ -314,7 +314,7 @@ def test_events_live(run_nedbus: Start, bus: nedbus.Bus, raw: Session, endpoint:
             fields["xy_valid"] = True
             wait_for(lambda: "xy valid again after" in follower.out, what="its end")
         wait_for(lambda: "silent: no vehicle_local_position for" in follower.out, what="silence")
-    wait_for(lambda: "gone: nobody publishes vehicle_local_position" in follower.out, what="the end of the publisher")
+    wait_for(lambda: "gone: no publisher of vehicle_local_position" in follower.out, what="the end of the publisher")
     lines = [line.split(None, 2)[1:] for line in follower.out.splitlines()]
     assert [line[0] for line in lines] == ["7"] * len(lines)
     assert lines[0][1].startswith("BAD    xy not valid")
@@ -364,7 +364,7 @@ def test_shown_command_works(command: str, run_nedbus: Start, bus: nedbus.Bus, e
     if "health" in command:
         shown = run_command(*arguments, "-c", endpoint)
         assert (shown.exit_code, shown.err) == (
-            1, "nedbus: vehicle 1 is missing: nobody publishes it\nnedbus: vehicle 2 is missing: nobody publishes it\n"
+            1, "nedbus: vehicle 1 is missing: it has no publisher\nnedbus: vehicle 2 is missing: it has no publisher\n"
         )  # fmt: skip
     else:
         shown = run_command(*arguments, "-c", endpoint, *(("--duration", "1") if "events" in command else ()))

@@ -125,8 +125,8 @@ def test_expected_vehicles(endpoint: str, bus: nedbus.Bus, health: Judge) -> Non
         shown = health("--expect", "1,7, 8", "--vehicles", "3")
         assert (shown.exit_code, shown.out) == (1, "")
         assert shown.err.splitlines() == [
-            "nedbus: vehicle 7 is missing: nobody publishes it",
-            "nedbus: vehicle 8 is missing: nobody publishes it",
+            "nedbus: vehicle 7 is missing: it has no publisher",
+            "nedbus: vehicle 8 is missing: it has no publisher",
             "nedbus: 1 of 3 vehicles are heard: 1",
         ]
         publisher.publish(message(1))

@@ -319,7 +319,7 @@ def test_address_that_others_reach_is_warned_of(caplog: pytest.LogCaptureFixture
     """On loopback nobody else can read the pages; elsewhere the log says that others can."""
     for where, count in ((f"[::1]:{free_port()}", 0), (f"0.0.0.0:{free_port()}", 1)):
         with serve_pages(where, {}):
-            assert caplog.text.count(f"whoever reaches {where} can read them") == count
+            assert caplog.text.count(f"any client that reaches {where} can read them") == count
 
 
 def streams(count: int, topic: str = VLP) -> list[Stream]:

@@ -198,7 +198,7 @@ def test_router_whose_limit_is_not_told(tmp_path: Path) -> None:
             assert [(state.max_sessions, state.load) for state in ask(where)] == [(None, None)]
             assert router_in(where, "sessions that are connected: 1").state == "ok"
     with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
-        assert router_in(where, "joined; who else is connected this client is not told").state == "ok"
+        assert router_in(where, "joined; its other sessions are not shown to this client").state == "ok"
 
 
 def test_metrics_of_a_service_with_a_router(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ class WritePermission:
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
                 self._denials.clear()
-                self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - nobody is to be surprised
+                self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
             elif vehicles - known[1]:
                 due = min(due, now + _FIRST[0])
             known = routers, vehicles

@@ -46,7 +46,7 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         yield Finding("mavlink", link, "wrong", f"nothing arrives within {listen:g} s", advice)
     elif not systems:
         seen = f"{senders.total()} packets from {list_names(sorted(senders))} that are not MAVLink"
-        advice = "who sends there? take another port, or the baud rate of the vehicle"
+        advice = "does another program send there? take another port, or the baud rate of the vehicle"
         yield Finding("mavlink", link, "wrong", seen, advice)
     for system, counts in sorted(systems.items()):
         yield _judge_system(f"{link} system {system}", link, counts, listen)

@@ -24,7 +24,7 @@ _SYNCHRONISE: Final = "run NTP or PTP on both hosts: 'timedatectl' says whether 
 def check_routers(seen: Observation) -> Iterator[Finding]:
     """Yield the number of sessions of each router, and whether it is nearly full."""
     if not seen.routers:
-        yield Finding("router", "", "ok", "joined; who else is connected this client is not told")
+        yield Finding("router", "", "ok", "joined; its other sessions are not shown to this client")
     for router in seen.routers:
         text = f"sessions that are connected: {router.sessions:,}"
         if router.max_sessions is not None:
@@ -124,7 +124,7 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
         state: State = "wrong" if address in seen.ages else "warning"  # of a replay some begin later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
     if stream is not None and stream.error:
-        advice = "who publishes this key, and is it nedbus? a newer layout needs a newer nedbus here"
+        advice = "is the publisher of this key nedbus? a newer layout needs a newer nedbus here"
         yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:_MAX_TEXT]}", advice)
     beating = len(seen.publishers.get(key, ()))
     sending = max(len(stream.publishers), len(stream.clocks)) if stream is not None else 0

@@ -73,7 +73,7 @@ def _missing(
 ) -> Iterator[str]:
     for name in expected.expect:
         if name not in vehicles and name not in heard:
-            yield f"vehicle {name} is missing: nobody publishes it"
+            yield f"vehicle {name} is missing: it has no publisher"
     flying = {name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard)
     if expected.vehicles is not None and len(flying) < expected.vehicles:
         names = f": {', '.join(sorted(flying)[:20])}" if flying else ""

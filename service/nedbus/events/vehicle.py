@@ -123,7 +123,7 @@ class Vehicle:
         if known is not None:
             since = self.conditions.pop((known, "")).since
         age = max(0.0, time - since)
-        text = f"silent: no {stream} for {age:.1f} s" if silent == "silent" else f"gone: nobody publishes {stream}"
+        text = f"silent: no {stream} for {age:.1f} s" if silent == "silent" else f"gone: no publisher of {stream}"
         self.emit(Finding(silent, "begin", "bad", text, numbers={"age": age}), stream, time, changed=since)
 
     def state(self, time: float) -> State:

@@ -71,7 +71,7 @@ def web(
         write_stderr(f"open {url} in a browser; Ctrl-C ends it")
         if not is_loopback(host):
             write_stderr(
-                f"whoever reaches {http} can see all vehicles, without a password; nothing can be changed there"
+                f"any client that reaches {http} can see all vehicles, without a password; nothing can be changed there"
             )
 
     if file is not None:
@@ -159,7 +159,9 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
         "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
     )
     if not is_loopback(split_http(where)[0]):
-        _log.warning("whoever reaches %s can read them; nothing can be changed there", where, extra=about("http"))
+        _log.warning(
+            "any client that reaches %s can read them; it can change nothing", where, extra=about("http")
+        )
     try:
         yield
     finally:

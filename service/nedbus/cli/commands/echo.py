@@ -51,7 +51,7 @@ def echo(
         typer.Option(
             "--max-rate",
             metavar="HZ",
-            help="Messages a second of each stream, thinned by its publisher: for links that carry no more",
+            help="Messages a second of each stream, downsampled by its publisher: for links that carry no more",
         ),
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,

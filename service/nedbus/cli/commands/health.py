@@ -28,7 +28,7 @@ def health(
     bus: Bus,
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, whoever publishes it, by an answer")
+        str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, of any publisher, by an answer")
     ] = None,
     services: Annotated[
         int | None, typer.Option("--services", metavar="N", min=1, help="Expect N services, on all hosts together")

@@ -80,7 +80,7 @@ def enroll(
 @pki.command("list")
 @command
 def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False) -> None:
-    """Show who has a certificate, and until when."""
+    """Show all certificates of a folder, and their expiry."""
     now = dt.datetime.now(dt.UTC)
     rows: list[dict[str, Any]] = [
         {
