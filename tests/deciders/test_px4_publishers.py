@@ -82,6 +82,20 @@ def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) 
     assert send(streams, stream, 31, 202.2) == (0, False)
 
 
+def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: StreamRegistry) -> None:
+    """A link that breaks takes both; what waits of them cannot be told apart, and the key is free at once."""
+    stream = streams.register(str(key()))
+    for session in ("a", "b"):
+        streams.add_publisher(px4(session), 0.0)
+    for session in ("a", "b"):
+        streams.publishers.remove(px4(session), 10.0)
+    assert not streams.publishers.has(key())
+    with pytest.raises(NotAcceptedError, match="alike"):
+        send(streams, stream, 1, 10.9)
+    streams.publishers.report(11.0)
+    assert send(streams, stream, 2, 11.0) == (0, False)
+
+
 def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
     """Two publishers of one session, and two sessions with different topics, are one vehicle each."""
     stream = streams.register(str(key()))

@@ -10,6 +10,7 @@ import pytest
 
 from nedbus import Health, Monitor, Sample, StreamHealth
 from nedbus.client import describe_stream, stream_state
+from nedbus.client.health.stream_health import _Window
 from nedbus_msgs import DOUBT_FLAGS, Address
 from tests.messages import VALID, VLP, message
 
@@ -47,6 +48,22 @@ def test_rate_and_jitter_are_of_the_last_second() -> None:
     assert health.nominal == 100.0
     assert health.age == pytest.approx(0.5)
     assert health.messages == 201
+
+
+def test_first_second_may_be_read_by_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages are added while the jitter of the first second is computed: nothing fails."""
+    stream = follow(0.0, 0.01, 0.02)
+    mean = vars(_Window)["mean"].fget
+
+    class Late(float):
+        """A mean in whose use another message arrives."""
+
+        def __rsub__(self, other: float) -> float:
+            stream.add(message(30_000), received=SECOND // 50)
+            return other - float(self)
+
+    monkeypatch.setattr(_Window, "mean", property(lambda window: Late(mean(window))))
+    assert stream.snapshot(SECOND // 50).jitter == pytest.approx(0.0)
 
 
 def test_silence_has_no_rate() -> None:

@@ -296,6 +296,17 @@ def test_publisher_of_an_older_nedbus(
         assert subscription.counts.lost == 0
 
 
+def test_more_streams_than_changes_are_kept(
+    endpoint: str, bus: nedbus.Bus, impatient: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them is read at full rate where none is downsampled, although most of their tokens were dropped."""
+    monkeypatch.setattr(Downsampler, "put", lambda *_: None)
+    monkeypatch.setattr("nedbus.transport.queries._MAX_CHANGES", 2)
+    publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(8)]
+    with nedbus.connect(endpoint) as other, other.subscribe(VLP, max_rate=10):
+        wait_for(lambda: all(map(is_read, publishers)), what="readers at full rate")
+
+
 def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, caplog: pytest.LogCaptureFixture) -> None:
     """One without a liveliness token is read whole by who asks for this one stream; a timestamp it need not have."""
     key = "nedbus/7/vehicle_local_position"

@@ -89,8 +89,8 @@ class _Window:
     @property
     def deviation(self) -> float:
         """The standard deviation of the intervals [s]."""
-        mean = self.mean
-        return math.sqrt(sum((each - mean) ** 2 for each in self.intervals) / len(self.intervals))
+        mean, intervals = self.mean, tuple(self.intervals)  # a copy: another thread may add to them
+        return math.sqrt(sum((each - mean) ** 2 for each in intervals) / len(intervals))
 
 
 class Histogram:

@@ -23,7 +23,7 @@ from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import AliveChanges, RawSample, Session, ask, while_open
+from nedbus.transport import AliveChanges, Answers, RawSample, Session, ask, ask_alive, while_open
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key
 
 from .decoder import MAX_KEYS, Arrival, Decoder
@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 DOWNSAMPLED_TIMEOUT: Final = 3.0
 """Seconds from the liveliness token of a stream on, after which it is read at full rate."""
 
-_LAST_TIMEOUT: Final = 2.0  # s for the last messages
+_TIMEOUT: Final = 2.0  # s for the last messages, and for all liveliness tokens
 _FULL_RATE_POLL: Final = 0.02  # s between two looks at streams that are read at full rate
 _FULL_RATE_RING: Final = 4096  # samples of one of these that may arrive until then
 _OVERTAKEN: Final = 2_000_000_000  # ns by which a downsampled message is older than one at full rate that overtook it
@@ -116,8 +116,10 @@ class MaxRateReceiver(Receiver):
         self._prefix, self._rate_queue, self._warned = prefix, queue, False
         self._full_rate: dict[str, zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = {}
         self._key_expr = selection.key_expr(prefix=prefix)
-        self._tokens = AliveChanges(session, selection.alive_key_expr(prefix=prefix))
-        self._last = ask(session, self._key_expr, timeout=_LAST_TIMEOUT)  # downsampling begins with the next message
+        self._alive_key_expr = selection.alive_key_expr(prefix=prefix)
+        self._tokens = AliveChanges(session, self._alive_key_expr)
+        self._all_tokens: Answers | None = None  # asked for when more changed than are kept
+        self._last = ask(session, self._key_expr, timeout=_TIMEOUT)  # downsampling begins with the next message
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
         super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, downsampled=True)
 
@@ -133,7 +135,13 @@ class MaxRateReceiver(Receiver):
         return min(pause, _FULL_RATE_POLL) if self._full_rate or not self._last.ended else pause
 
     def _follow_tokens(self, now: float) -> None:
-        for token, alive in self._tokens.take():
+        changes = self._tokens.take()
+        if self._tokens.missed and (self._all_tokens is None or self._all_tokens.ended):
+            self._tokens.missed = False
+            self._all_tokens = ask_alive(self._session, self._alive_key_expr, timeout=_TIMEOUT)
+        answers = [] if self._all_tokens is None else self._all_tokens.take()
+        known = [(str(reply.ok.key_expr), True) for reply in answers if reply.ok is not None]
+        for token, alive in known + changes:
             with suppress(AddressError):  # not one of nedbus
                 key = address_of_alive_key(token, prefix=self._prefix).key(prefix=self._prefix)
                 self._rate_queue.on_token(key, now, alive=alive)

@@ -73,10 +73,10 @@ class PublisherTable:
         if key is None:
             return
         key.tokens.pop(token.text, None)
-        if not key.tokens:
-            del self._keys[token.key]
-        elif key.alike_until == math.inf and not key.has_alike():
+        if key.alike_until == math.inf and not key.has_alike():
             key.alike_until = now + _SETTLE_TIME
+        if not key.tokens and key.alike_until <= now:  # else messages of several publishers may still arrive
+            del self._keys[token.key]
 
     def forget(self, key: TopicKey) -> None:
         """Forget the publishers of a key."""
@@ -100,7 +100,7 @@ class PublisherTable:
 
     def has(self, key: TopicKey) -> bool:
         """Return whether a key has a publisher."""
-        return key in self._keys
+        return key in self._keys and bool(self._keys[key].tokens)
 
     def only(self, key: TopicKey) -> PublisherToken | None:
         """Return the publisher of a key that has one; None if it has none, or several."""
@@ -109,6 +109,7 @@ class PublisherTable:
 
     def report(self, now: float) -> Absence:
         """Return what is not carried, and what is silent while other topics of its node arrive."""
+        self._keys = {name: key for name, key in self._keys.items() if key.tokens or now < key.alike_until}
         nodes = [(key, key.nodes()) for key in self._keys.values()]
         sending = {node for key, own in nodes if now - key.heard < _NODE_TIMEOUT for node in own}
         silent = {str(key.what) for key, own in nodes if sending & own and key.is_silent(now)}
