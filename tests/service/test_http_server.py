@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, nullcontext, suppress
@@ -141,6 +142,18 @@ def test_slow_clients_are_ended(monkeypatch: pytest.MonkeyPatch, sent: bytes, ea
         with repeating(drip) if each_second else nullcontext():
             for _ in range(20):
                 assert Pages(server.port).ask("/page") == (200, "a page\n")
+
+
+def test_close_waits_for_no_client() -> None:
+    """While 16 clients send nothing and others wait for a free thread, it closes at once."""
+    server = HttpServer("127.0.0.1:0", {})
+    with ExitStack() as clients:
+        for _ in range(20):
+            clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
+        time.sleep(0.5)  # until all threads are taken
+        begin = time.monotonic()
+        server.close()
+        assert time.monotonic() - begin < 2.0
 
 
 def test_more_clients_than_it_has_room_for(server: Pages) -> None:

@@ -7,6 +7,7 @@ import logging
 import re
 import resource
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -269,6 +270,17 @@ def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert not shows("sessions{")
         last.close()
         wait_for(lambda: shows("sessions{"), what="room")
+
+
+def test_exporter_ends_while_a_router_does_not_answer(small: str) -> None:
+    """Its end waits for no answer: after a signal a command has less time than a router has for it."""
+    kept: list[zenoh.Query] = []
+    with open_client([small], timeout=5.0) as silent, nedbus.connect(small) as bus:
+        silent.declare_queryable(f"@/{ZID}/router", kept.append)
+        with exporting(bus):
+            wait_for(lambda: kept, what="the question")
+            begin = time.monotonic()
+        assert time.monotonic() - begin < exporter._ROUTERS_TIMEOUT / 2
 
 
 def test_client_of_a_full_router(tmp_path: Path) -> None:

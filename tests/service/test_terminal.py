@@ -302,6 +302,24 @@ def test_signal_while_a_table_starts(
     assert shown == [False, True]
 
 
+@pytest.mark.parametrize(("height", "more"), [(12, 7), (2, 8)])
+def test_live_table_of_wrapped_rows_fits(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], height: int, more: int
+) -> None:
+    """Rows of several lines leave room for the number of those that are not shown, on the lowest terminal too."""
+    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: 60)
+    monkeypatch.setattr("nedbus.cli.output.table.shutil.get_terminal_size", lambda: os.terminal_size((60, height)))
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        with LiveTable(("VEHICLE/TOPIC", "HZ", "STATE"), ()) as table:
+            table.show([(ROWS[0][0], "100.0", ROWS[1][-1])] * 9)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    drawn = capsys.readouterr().out.splitlines()
+    assert f"{more} more" in drawn
+    assert len(drawn) <= max(height, 6)
+
+
 @pytest.mark.parametrize("command", ["echo", "hz"])
 def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
     """`echo` and `hz` say when the link to the router breaks, and when it is back; `hz` says so of each stream."""

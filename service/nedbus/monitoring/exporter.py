@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -69,6 +69,7 @@ class Exporter:
         self._monitor = Monitor()
         self._observer = Observer(bus, selection)
         self._routers: list[RouterState] = []
+        self._session: Session | None = None  # for the queries of routers
         self._sources: dict[Address, str] = {}
         self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
@@ -83,6 +84,10 @@ class Exporter:
                     self._look()
             finally:
                 stop.set()
+                with self._lock:
+                    session = self._session
+                if session is not None:
+                    session.close()  # which ends a query that a router does not answer
                 self._subscription.close()
             for task in tasks:
                 task.result()
@@ -149,16 +154,24 @@ class Exporter:
 
         In a session of its own: the answer of a router with 1,000 sessions, 183 kB, does not hold up messages.
         """
-        session: Session | None = None
-        with ExitStack() as closing:
-            while not stop.is_set():
-                states: list[RouterState] = []
-                with suppress(NedbusError):  # no room for this session, a broken link: then nothing is known
-                    session = session or closing.enter_context(self._bus.open_session(timeout=_SESSION_TIMEOUT))
-                    states = ask_routers(session, timeout=_ROUTERS_TIMEOUT)
-                self._routers = states[:_MAX_ROUTERS]
-                period = sum(state.sessions for state in states) / _SESSIONS_PER_SECOND
-                stop.wait(min(_MAX_ROUTERS_PERIOD, max(_ROUTERS_PERIOD, period)))
+        while not stop.is_set():
+            states: list[RouterState] = []
+            with suppress(NedbusError):  # no room for this session, a broken link: then nothing is known
+                if self._session is None:
+                    self._open_session(stop)
+                if self._session is not None:
+                    states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
+            self._routers = states[:_MAX_ROUTERS]
+            period = sum(state.sessions for state in states) / _SESSIONS_PER_SECOND
+            stop.wait(min(_MAX_ROUTERS_PERIOD, max(_ROUTERS_PERIOD, period)))
+
+    def _open_session(self, stop: threading.Event) -> None:
+        session = self._bus.open_session(timeout=_SESSION_TIMEOUT)
+        with self._lock:
+            if not stop.is_set():  # else `run` has looked for a session to close already
+                self._session = session
+                return
+        session.close()
 
     def _look(self) -> None:
         with self._lock:

@@ -67,7 +67,8 @@ class HttpServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop listening, at once also while a client waits for a free thread."""
+        self._server.stop_waiting()
         self._server.shutdown()
         self._server.server_close()
 
@@ -79,14 +80,20 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, host: str, port: int, pages: Mapping[str, Callable[[], Page]]) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.pages, self.is_local = pages, is_loopback(host)
-        self._free = threading.BoundedSemaphore(_MAX_REQUESTS)
+        self._free = threading.Semaphore(_MAX_REQUESTS)
+        self._is_closing = False
         super().__init__((host, port), _Handler)
 
     def process_request(self, request: Any, client_address: object) -> None:
-        if self._free.acquire(timeout=_CLIENT_TIMEOUT):
+        if not self._is_closing and self._free.acquire(timeout=_CLIENT_TIMEOUT):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
+
+    def stop_waiting(self) -> None:
+        """Accept no further client, and wait no longer for a free thread."""
+        self._is_closing = True
+        self._free.release()
 
     def process_request_thread(self, request: Any, client_address: object) -> None:
         try:

@@ -99,8 +99,11 @@ class LiveTable:
     def show(self, rows: Sequence[Sequence[str]]) -> None:
         """Show these rows, the first 50 at most, and on a terminal no more than it has lines."""
         width = terminal_width()
-        count = _MAX_ROWS if width is None else min(_MAX_ROWS, shutil.get_terminal_size().lines - 3)
-        text = to_table(self._head, rows, width=width, optional=self._optional, max_rows=count)
+        height = shutil.get_terminal_size().lines - 1
+        for count in range(_MAX_ROWS if width is None else max(1, min(_MAX_ROWS, len(rows), height)), 0, -1):
+            text = to_table(self._head, rows, width=width, optional=self._optional, max_rows=count)
+            if width is None or text.count("\n") < height:  # else with fewer: rows that are wrapped have several lines
+                break
         if width is None:
             write(text)
             return
