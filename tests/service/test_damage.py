@@ -30,7 +30,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, ChunkIndex, Footer
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
+from mcap.writer import MCAP0_MAGIC, Writer
 
 import nedbus
 from nedbus.errors import SourceError
@@ -327,6 +327,14 @@ def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
     reader = payloads_of(path)[1]
     assert len(reader.warnings) == 101
     assert reader.warnings[-1] == "there is more damage"
+
+
+def test_word_at_the_beginning_is_no_chunk(tmp_path: Path) -> None:
+    """The name of a compression right behind the magic is no chunk that begins before the file."""
+    path = tmp_path / "a.mcap"
+    path.write_bytes(MCAP0_MAGIC + bytes(3) + b"\x04\x00\x00\x00zstd" + bytes(100))
+    with pytest.raises(SourceError, match="no message can be read: cut or damaged: everything from byte 8 of 119 on"):
+        RecordingReader(path, vehicle="1")
 
 
 CHUNK = r"chunk 3 \(10\.\d to 10\.\d s\) at byte \d+ is damaged: its {} messages are left out"

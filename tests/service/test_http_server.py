@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, nullcontext, suppress
@@ -96,6 +95,21 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
     assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
+@pytest.mark.parametrize("sent", [b"", b"GET /page HTTP/1.0\r\nHost:"], ids=["silent", "half a request"])
+def test_silent_clients_block_nobody(server: Pages, sent: bytes) -> None:
+    """With 16 clients that send nothing, or half a request, the next one is answered, and the oldest has to go."""
+    address = "127.0.0.1", server.port
+    with ExitStack() as closing:
+        silent = [closing.enter_context(socket.create_connection(address, DEADLINE)) for _ in range(16)]
+        for client in silent:
+            client.sendall(sent)
+        for _ in range(20):
+            assert server.ask("/page") == (200, "a page\n")
+        assert silent[0].recv(1) == b""
+        silent[-1].sendall(b"\r\n\r\n" if sent else b"GET /page HTTP/1.0\r\n\r\n")
+        assert b"200 OK" in silent[-1].recv(1000)
+
+
 @pytest.mark.parametrize(
     ("sent", "answer"),
     [
@@ -144,16 +158,23 @@ def test_slow_clients_are_ended(monkeypatch: pytest.MonkeyPatch, sent: bytes, ea
                 assert Pages(server.port).ask("/page") == (200, "a page\n")
 
 
-def test_close_waits_for_no_client() -> None:
-    """While 16 clients send nothing and others wait for a free thread, it closes at once."""
-    server = HttpServer("127.0.0.1:0", {})
+def test_close_waits_for_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+    """While 16 clients do not read their answers and another waits for a free thread, it closes at once."""
+    monkeypatch.setattr(http_server, "_CLIENT_TIMEOUT", 10_000.0)  # far beyond the deadline of this test
+    made = threading.Semaphore(0)
+
+    def make() -> Page:
+        made.release()
+        return Page.text("x" * 20_000_000)  # more than the buffers of a connection hold
+
+    server = HttpServer("127.0.0.1:0", {"/large": make})
     with ExitStack() as clients:
-        for _ in range(20):
-            clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
-        time.sleep(0.5)  # until all threads are taken
-        begin = time.monotonic()
+        for _ in range(17):
+            client = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), DEADLINE))
+            client.sendall(b"GET /large HTTP/1.0\r\n\r\n")
+        for _ in range(16):
+            assert made.acquire(timeout=DEADLINE)
         server.close()
-        assert time.monotonic() - begin < 2.0
 
 
 def test_more_clients_than_it_has_room_for(server: Pages) -> None:

@@ -109,7 +109,8 @@ def on_bus(function: Callable[..., None]) -> Callable[..., None]:
 
 def selecting(default: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Give a command the options that select streams in place of its parameter `selection`; `default`: its topic."""
-    option = Annotated[str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {default})')]
+    shown = "all" if default == ANY else default
+    option = Annotated[str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {shown})')]
 
     def decorate(function: Callable[..., None]) -> Callable[..., None]:
         def run(options: dict[str, Any], own: dict[str, Any]) -> None:

@@ -74,6 +74,8 @@ class HttpServer:
 
 
 class _Server(ThreadingHTTPServer):
+    """Answer a limited number of clients at a time; beyond it, disconnect the one that has been silent for longest."""
+
     daemon_threads = True
     request_queue_size = 2 * _MAX_REQUESTS  # with Python's five the sixth that connects at once waits for a second
 
@@ -82,13 +84,20 @@ class _Server(ThreadingHTTPServer):
         self.pages, self.is_local = pages, is_loopback(host)
         self._free = threading.Semaphore(_MAX_REQUESTS)
         self._is_closing = False
+        self.silent: dict[socket.socket, None] = {}  # clients without a request yet, the oldest first
         super().__init__((host, port), _Handler)
 
     def process_request(self, request: Any, client_address: object) -> None:
-        if not self._is_closing and self._free.acquire(timeout=_CLIENT_TIMEOUT):
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        if not self._free.acquire(blocking=False):
+            for oldest in list(self.silent)[:1]:
+                with suppress(OSError):  # it has disconnected
+                    oldest.shutdown(socket.SHUT_RDWR)
+                self.silent.pop(oldest, None)
+            if self._is_closing or not self._free.acquire(timeout=_CLIENT_TIMEOUT):
+                self.shutdown_request(request)
+                return
+        self.silent[request] = None
+        super().process_request(request, client_address)
 
     def stop_waiting(self) -> None:
         """Accept no further client, and wait no longer for a free thread."""
@@ -99,6 +108,7 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
+            self.silent.pop(request, None)
             self._free.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
@@ -118,6 +128,12 @@ class _Handler(BaseHTTPRequestHandler):
             super().handle()
         finally:
             deadline.cancel()
+
+    def parse_request(self) -> bool:
+        """Parse the request; from now on its client is answered, however many others connect."""
+        is_valid = super().parse_request()
+        cast("_Server", self.server).silent.pop(self.connection, None)
+        return is_valid
 
     def do_GET(self) -> None:
         server = cast("_Server", self.server)

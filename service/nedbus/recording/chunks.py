@@ -45,6 +45,8 @@ _MAX_SMALL_CHUNK: Final = 2**26  # bytes that any chunk may unpack to: ROS 2 wri
 _MAX_CHUNK: Final = 2**30  # bytes that a chunk may unpack to
 _MAX_RATIO: Final = 100  # to which a chunk that is not small may be compressed
 _MAX_WARNINGS: Final = 100
+_ZSTD: Final = b"\x04\x00\x00\x00zstd"  # in every chunk of ours
+_SEARCH_BYTES: Final = 2**20  # that are searched at a time
 _EPOCH: Final = 10**17  # ns: a later time is a date, an earlier one counts from a vehicle's start
 
 
@@ -134,9 +136,13 @@ class ChunkFile:
         while True:
             opcode, end = self._read_head(offset)
             if not self._is_plausible(opcode, offset, end):
-                rest = f"everything from byte {offset} of {self._size} on"
-                self.warn(f"cut or damaged: {rest} is left out", lost=True)
-                return
+                found = self._find_chunk(offset + 1)
+                lost = f"bytes {offset} to {found}" if found else f"everything from byte {offset} of {self._size} on"
+                self.warn(f"cut or damaged: {lost} is left out", lost=True)
+                if found is None:
+                    return
+                offset = found
+                continue
             if opcode in {Opcode.DATA_END, Opcode.FOOTER}:
                 return
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
@@ -171,6 +177,21 @@ class ChunkFile:
         if opcode == Opcode.MESSAGE_INDEX:
             return length >= 6 and struct.unpack_from("<I", body, 2) == (length - 6,)
         return opcode != Opcode.CHUNK or _chunk_length(body) == length
+
+    def _find_chunk(self, start: int) -> int | None:
+        """Return the offset of the next chunk of a recording of ours, None if there is none."""
+        before = _RECORD_HEAD.size + _CHUNK_HEAD.size - 4  # bytes of a chunk before the name of its compression
+        while block := self._read(start, _SEARCH_BYTES):
+            found = block.find(_ZSTD)
+            if found < 0:
+                start += max(1, len(block) - len(_ZSTD) + 1)
+                continue
+            offset = start + found - before
+            opcode, end = self._read_head(offset) if offset > 0 else (0, 0)
+            if opcode == Opcode.CHUNK and self._is_plausible(opcode, offset, end):
+                return offset
+            start += found + 1
+        return None
 
     def _count_messages(self, end: int, only: Collection[int] | None) -> int | None:
         """Return the number of messages that the indexes behind a chunk list, None where there are none."""

@@ -159,9 +159,7 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
         "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
     )
     if not is_loopback(split_http(where)[0]):
-        _log.warning(
-            "any client that reaches %s can read them; it can change nothing", where, extra=about("http")
-        )
+        _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
     try:
         yield
     finally:
