@@ -83,14 +83,14 @@ class ConnectError(NedbusError, ConnectionError):
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
         text = (
             f"nothing answers at {' or '.join(endpoints)} ({tried}): start 'nedbus serve' or a Zenoh router there, or"
-            " name another endpoint with --connect or NEDBUS_CONNECT; a router that has no room for more sessions"
-            " refuses without a word: 'nedbus doctor' tells more"
+            " name another endpoint with --connect or NEDBUS_CONNECT; a router with no room for more sessions does not"
+            " answer either: 'nedbus doctor' finds the cause"
         )
         if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
             text += (
-                "; so does one that does not accept a certificate: check that tls_ca is the router's authority, that it"
-                " signed tls_certificate, that neither has expired, and that the host in the endpoint is one of the"
-                " router certificate's"
+                ". Over TLS, check that tls_ca is the router's authority, that it signed tls_certificate (a router may"
+                " ask for one), that neither has expired, and that the host in the endpoint is one of the router"
+                " certificate's"
             )
         super().__init__(text)
 

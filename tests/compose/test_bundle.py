@@ -87,7 +87,7 @@ def test_bundles_run_beside_the_secure_stack(
     recorder.wait_for_more(100)
     assert {sample.vehicle for sample in recorder.samples} == {"wing"}
     assert list(reader.vehicles()) == ["wing"]
-    assert "1 vehicles" in bundles["wing"].compose("exec", "-T", "nedbus", "nedbus", "health")
+    assert "1 vehicle," in bundles["wing"].compose("exec", "-T", "nedbus", "nedbus", "health")
 
     pki_command("rules", str(rules), "--add", "stranger")
     restart_router(secure)

@@ -445,6 +445,6 @@ def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: s
     wait_for(bus.latest, what="the first service")
     healthy = run_command("health", NEDBUS_CONNECT=endpoint)
     assert healthy.exit_code == 0, healthy.err
-    assert healthy.out.startswith("1 services, 1 sources, ")
+    assert healthy.out.startswith("1 service, 1 source, ")
     second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     wait_for(lambda: "is published by another process too" in second.err, what="the warning")

@@ -199,8 +199,8 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
-        (("events", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: name one of LOG: 1\n"),
-        (("why", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: name one of LOG: 1\n"),
+        (("events", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: there is no vehicle 7; name one of LOG: 1\n"),
+        (("why", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: there is no vehicle 7; name one of LOG: 1\n"),
         (("why", "LOG", "--at", "noon"), 2, "nedbus: --at: 'noon': no time: EXPECTED\n"),
         (("why", "LOG", "--at", "nan"), 2, "nedbus: --at: 'nan': no time: EXPECTED\n"),
         (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': no time of a day: EXPECTED\n"),
@@ -268,7 +268,10 @@ def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, 
     assert at
     assert run_command("why", "-c", endpoint, "-v", "1", "--at", at[0]).out.startswith("1: ")
     shown = run_command("why", "-c", endpoint, "-v", "7")
-    assert (shown.exit_code, shown.err) == (2, "nedbus: --vehicle: name one of the network: 1, 2\n")
+    assert (shown.exit_code, shown.err) == (
+        2,
+        "nedbus: --vehicle: there is no vehicle 7; name one of the network: 1, 2\n",
+    )
 
 
 def test_why_live_of_what_held_before(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, tmp_path: Path) -> None:

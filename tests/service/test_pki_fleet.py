@@ -196,7 +196,7 @@ def test_documented_commands_lead_from_nothing_to_a_vehicle_that_is_read(run_ned
 
     def is_read() -> bool:
         try:
-            return "1 vehicles" in run(reader)
+            return "1 vehicle," in run(reader)
         except AssertionError:
             return False
 

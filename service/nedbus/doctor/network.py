@@ -41,8 +41,8 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
     yield reading
     vehicle = seen.vehicle
     if vehicle is None:
-        advice = "with --vehicle it is: 'nedbus doctor --vehicle 1'"
-        yield Finding("write", "", "unknown", "whether a vehicle may be written is not probed", advice)
+        advice = "test it with 'nedbus doctor --vehicle 1'"
+        yield Finding("write", "", "unknown", "write access was not tested", advice)
     elif seen.verdict == "allowed":
         yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe came back")
     elif seen.verdict == "denied":  # no fault of a reader

@@ -294,4 +294,5 @@ def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) 
     if vehicle is not None and vehicle in names:
         return vehicle
     shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
-    raise ConfigError("--vehicle", f"name one of {where}: {shown}")
+    unknown = "" if vehicle is None else f"there is no vehicle {to_text(vehicle, 64)}; "
+    raise ConfigError("--vehicle", f"{unknown}name one of {where}: {shown}")

@@ -140,8 +140,9 @@ class _Report:
     @property
     def summary(self) -> str:
         newest = to_age(min(self.vehicles.values())) if self.vehicles else "unknown, no service tells how"
-        counts = f"{self.services} services, {self.sources} sources, {len(self.vehicles)} vehicles"
-        return f"{counts}, newest message {newest} old"
+        counts = {"service": self.services, "source": self.sources, "vehicle": len(self.vehicles)}
+        shown = ", ".join(f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items())
+        return f"{shown}, newest message {newest} old"
 
 
 def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float, wanted: Expectation) -> _Report:

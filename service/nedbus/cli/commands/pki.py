@@ -162,7 +162,7 @@ def rules(
     for line in [*(f"+ {name}" for name in added), *(f"- {name}" for name in removed)]:
         write(line)
     changed = "the router takes it when it starts again" if added or removed else "no change"
-    write_stderr(f"{file} names {len(wanted)} vehicles: {changed}")
+    write_stderr(f"{file} names {len(wanted)} vehicle{'s' * (len(wanted) != 1)}: {changed}")
 
 
 def _read_names(source: Path) -> list[str]:
