@@ -38,7 +38,7 @@ from tests.processes import Process, Start, Zygote, unmeasured
 from tests.replays import convert_replay
 from tests.waits import wait_for
 
-from .service.test_events_command import write_flight
+from .service.commands.test_events_command import write_flight
 
 SERVERS: Final = ("serve", "router", "export", "web", "foxglove", "ros2")
 ENDLESS: Final = (*SERVERS, "echo", "hz", "events")

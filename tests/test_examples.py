@@ -15,7 +15,7 @@ from tests.processes import Process, Start
 from tests.replays import convert_replay
 from tests.waits import wait_for
 
-from .service.test_cli import flying
+from .service.commands.test_cli import flying
 
 __all__ = ["flying"]  # a fixture
 

@@ -171,3 +171,18 @@ def test_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         alive.remove(token, 0.0)
     alive.add(others[1], "", 0.0)
     assert alive.is_alive(others[1])
+
+
+def test_tokens_of_all_keys_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over all keys the number of publishers has a limit, and those that have gone do not count."""
+    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_TOKENS", 3)
+    alive = PublisherTable()
+    tokens = [px4("a", f"topic_{number}") for number in range(5)]
+    for token in tokens:
+        alive.add(token, "", 0.0)
+    assert [alive.is_alive(token) for token in tokens] == [True, True, True, False, False]
+    alive.remove(tokens[0], 0.0)
+    alive.forget(tokens[1].key)
+    for token in tokens[3:]:
+        alive.add(token, "", 0.0)
+        assert alive.is_alive(token)

@@ -26,9 +26,8 @@ from tests.listening import Listener, status_of_source
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.processes import Process, Start
+from tests.service.bridges.test_ros2 import Peer, flight, peer, plain_session
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
-
-from .test_ros2 import Peer, flight, peer, plain_session
 
 __all__ = ["peer"]  # a fixture
 

@@ -24,7 +24,7 @@ from tests.command_line import Ended, run_command
 from tests.messages import VALID, VLP, message
 from tests.ports import free_port
 from tests.processes import Start
-from tests.service.answering import answering, reply_with
+from tests.service.commands.answering import answering, reply_with
 from tests.ulogs import UlogWriter
 from tests.waits import DEADLINE, wait_for
 

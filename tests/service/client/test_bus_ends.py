@@ -23,10 +23,10 @@ from nedbus.transport import Session, open_router
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
 from tests.processes import Start
+from tests.service.commands.answering import answering
+from tests.service.delivery.publishing import publish, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
-from .answering import answering
-from .publishing import publish, wait_for_subscriber
 from .test_bus import BOTH
 
 _STEPS: Final = 100  # more than there are in a read that waits

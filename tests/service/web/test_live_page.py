@@ -17,15 +17,14 @@ from tests.first_message import LAYOUTS, ROS2_TYPE, type_hash
 from tests.messages import VLP
 from tests.ports import free_endpoint
 from tests.processes import Start
+from tests.service.bridges.test_ros2 import Peer, peer
+from tests.service.sources.test_mavlink import Fly, fly, port
+from tests.service.sources.test_px4_zenoh import Px4
 from tests.waits import DEADLINE, repeating, wait_for
-
-from .test_mavlink import Fly, fly, port
-from .test_px4_zenoh import Px4
-from .test_ros2 import Peer, peer
 
 __all__ = ["fly", "peer", "port"]  # fixtures
 
-PAGE = (Path(__file__).parents[2] / "docs" / "live.md").read_text()
+PAGE = (Path(__file__).parents[3] / "docs" / "live.md").read_text()
 BLOCKS = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
 COMMANDS = [line.partition("#")[0].strip() for block in BLOCKS for line in block.splitlines()]
 COMMANDS = [each for each in COMMANDS if "msg=" not in each]  # test_px4_real.py has definitions of PX4

@@ -17,7 +17,7 @@ from tests.ports import free_endpoint
 from tests.processes import Start
 from tests.ulogs import write_log
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def check(*arguments: object, command: tuple[str, ...] = ("check",)) -> list[str]:

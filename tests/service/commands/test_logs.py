@@ -27,12 +27,11 @@ from tests.command_line import run_command
 from tests.hasty import start_hasty
 from tests.messages import VLP, message
 from tests.processes import Start
+from tests.service.sources.test_px4_zenoh import Px4
 from tests.waits import wait_for, wait_for_reader
 
-from .test_px4_zenoh import Px4
-
 REPLAY = "sim:?duration=1&speed=max"
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SERVICE = ROOT / "service" / "nedbus"
 EVIL = 'a\x1b[2J\n{"event": "forged"}\u2028'
 VEHICLES = 2 * BURST + 10

@@ -347,7 +347,7 @@ def test_events_live_of_one_vehicle(run_nedbus: Start, bus: nedbus.Bus, raw: Ses
         assert {line.split()[1] for line in follower.out.splitlines()} == {"8"}
 
 
-PAGE = Path(__file__).parents[2] / "docs" / "events.md"
+PAGE = Path(__file__).parents[3] / "docs" / "events.md"
 BASH = re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
 SHOWN = re.findall(r"^nedbus ([^#\n]+?) *(?:#.*)?$", BASH, re.MULTILINE)
 

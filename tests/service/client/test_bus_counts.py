@@ -22,10 +22,10 @@ from nedbus.client.receiving.decoder import Decoder
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
 from tests.messages import VLP, message
+from tests.service.commands.answering import answering, reply_with
+from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 
-from .answering import answering, reply_with
-from .publishing import numbered, publish, take, wait_for_subscriber
 from .test_bus import BOTH, SCHEMA
 
 KEY = f"nedbus/1/{VLP}"

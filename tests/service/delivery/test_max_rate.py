@@ -22,9 +22,9 @@ from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
 from tests.messages import VLP, message
 from tests.processes import Start
+from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
-from .answering import answering, reply_with
 from .downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from .publishing import is_read, take, wait_for_subscriber
 

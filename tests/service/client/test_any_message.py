@@ -13,9 +13,8 @@ import nedbus
 from nedbus.transport import Session
 from tests.contract.test_messages import write_wheels
 from tests.processes import Start
+from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader
-
-from .answering import answering, reply_with
 
 COUNT = 500
 

@@ -224,7 +224,7 @@ def test_plugins_of_a_router_file_are_not_loaded(tmp_path: Path, caplog: pytest.
         open_router(config_file=file)
     for name in ("storage.json5", "rest-reader.json5"):  # as shipped, for zenohd alone
         with pytest.raises(ConfigError, match="this router loads no plugins"):
-            open_router(config_file=Path(__file__).parents[2] / "config" / name)
+            open_router(config_file=Path(__file__).parents[3] / "config" / name)
 
 
 def test_help_names_every_source() -> None:

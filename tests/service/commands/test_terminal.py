@@ -33,7 +33,7 @@ from tests.ports import free_endpoint, free_port
 from tests.processes import Start, Zygote, unmeasured
 from tests.waits import DEADLINE, repeating, wait_for
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 EVIL = "\x1b]0;owned\x07\x1b[2J\u202e\x9b31m\nforged line"
 
 

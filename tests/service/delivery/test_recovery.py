@@ -24,9 +24,9 @@ from nedbus_msgs import encode
 from tests.first_message import encoding_of
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
+from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader, wait_for_router
 
-from .answering import answering, reply_with
 from .lossy import Lossy, LossyQueue
 from .publishing import publish, wait_for_subscriber
 

@@ -26,10 +26,9 @@ from nedbus import Mode
 from nedbus.transport import Session, ask_alive_keys
 from nedbus_msgs import DEFAULT, Address, encode
 from tests.messages import VLP, message
+from tests.service.commands.answering import answering, reply_with
+from tests.service.delivery.publishing import publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
-
-from .answering import answering, reply_with
-from .publishing import publish, take, wait_for_subscriber
 
 BOTH: list[Mode] = ["latest", "every"]
 SCHEMA = "nedbus/@schema/VehicleLocalPosition"

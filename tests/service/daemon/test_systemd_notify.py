@@ -296,7 +296,7 @@ def test_ready_is_repeated_until_it_is_taken(systemd: Systemd) -> None:
 
 # The units as shipped, judged by systemd's own tools; tests/compose/test_systemd.py starts them
 
-UNITS = Path(__file__).parents[2] / "packaging" / "systemd"
+UNITS = Path(__file__).parents[3] / "packaging" / "systemd"
 EXECUTABLE = "/opt/nedbus/bin/nedbus"
 EXPOSURE = 2.0  # of 10: what systemd calls OK
 with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing")

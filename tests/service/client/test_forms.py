@@ -20,9 +20,8 @@ from nedbus_msgs.arrays import DTYPE, to_array, to_message
 from tests.first_message import LAYOUTS, downgrade
 from tests.messages import VLP, message
 from tests.ports import free_endpoint
+from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for, wait_for_reader
-
-from .publishing import numbered, publish, take, wait_for_subscriber
 
 COUNT = 900  # fewer than half a window: here one thread publishes and reads
 

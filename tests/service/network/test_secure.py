@@ -29,9 +29,9 @@ from tests.http_pages import Pages
 from tests.messages import VLP, message
 from tests.ports import free_endpoint, free_port
 from tests.processes import Process, Start
-from tests.service.publishing import take
-from tests.service.test_max_rate import Clock, clock, publish, wait_for_demand
-from tests.service.test_px4_zenoh import Px4
+from tests.service.delivery.publishing import take
+from tests.service.delivery.test_max_rate import Clock, clock, publish, wait_for_demand
+from tests.service.sources.test_px4_zenoh import Px4
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 from tests.zenohd import EITHER, start_zenohd
 

@@ -4,7 +4,7 @@ The chunks of a recording have CRCs, so that every message that is read equals t
 A log has no checksums: a bit inside a value cannot be noticed by anybody.
 There the rule is that only messages that were hit differ, and that damage of the structure is noticed.
 
-`DAMAGE_TRIES=10000 pytest tests/service/test_damage.py` tries more, on the real logs of ../shared as well.
+`DAMAGE_TRIES=10000 pytest tests/service/sources/test_damage.py` tries more, on the real logs of ../shared as well.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ from tests.processes import Start
 from tests.waits import DEADLINE, wait_for
 from tests.zenohd import EITHER, start_zenohd
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CONFIG = certificates.CONFIG / "router-secure.json5"
 FLEET = [str(number) for number in range(1, 201)]
 SAMPLE = ("1", "99", "200")

@@ -30,7 +30,7 @@ from .test_alignment import array_of, write
 
 # pandas, polars and matplotlib take a second, which only these tests need: they are imported there.
 
-DOCS = Path(__file__).parents[2] / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 COLORS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")  # of the streams of a plot, in order
 
 

@@ -23,11 +23,10 @@ from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, d
 from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
 from tests.command_line import run_command
 from tests.messages import VLP, message
+from tests.service.delivery.downsampling import MS, Clock, clock, wait_for_demand
+from tests.service.delivery.lossy import LossyQueue
+from tests.service.delivery.publishing import take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for, wait_for_reader
-
-from .downsampling import MS, Clock, clock, wait_for_demand
-from .lossy import LossyQueue
-from .publishing import take, wait_for_subscriber
 
 __all__ = ["clock"]  # a fixture
 

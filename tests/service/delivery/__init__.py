@@ -1,0 +1,1 @@
+"""Delivery: recovery, downsampling, slow readers, heartbeats."""

@@ -1,0 +1,1 @@
+"""Routers, certificates and access rules."""

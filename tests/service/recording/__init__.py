@@ -1,0 +1,1 @@
+"""Recordings, arrays, plots, and events of logs."""

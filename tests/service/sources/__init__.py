@@ -1,0 +1,1 @@
+"""Sources: MAVLink, PX4 over Zenoh, logs, the simulator."""
