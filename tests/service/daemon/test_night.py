@@ -145,9 +145,9 @@ def test_everything_is_told_once_and_in_order(run_nedbus: Start, browser: Browse
             wait_for_event(events, *HELD_UP[1])
         assert told_by(events) == [*TOLD, *CUT, *HELD_UP]
         shown = [each for each in (*TOLD, *CUT, *HELD_UP) if each[2] != "end"]
-        wait_for(lambda: len(page.rows("who")) >= len(shown), what="all events on the page", seconds=PATIENCE)
-        marks = sorted(page.rows("who"), key=lambda mark: mark["time"])
-        assert [mark["who"] for mark in marks] == [vehicle for vehicle, *_ in shown]
+        wait_for(lambda: len(page.rows("vehicle")) >= len(shown), what="all events on the page", seconds=PATIENCE)
+        marks = sorted(page.rows("vehicle"), key=lambda mark: mark["time"])
+        assert [mark["vehicle"] for mark in marks] == [vehicle for vehicle, *_ in shown]
     shown_health = run_command("health", "-c", endpoint, "--within", "300", "--expect", ",".join(VEHICLES))
     assert shown_health.exit_code == 1
     faults = [line.partition(": ")[2] for line in shown_health.err.splitlines()]
