@@ -1,7 +1,8 @@
 """Zenoh itself: sessions, routers, TLS, queries, and the keys of rmw_zenoh."""
 
+from .alive_tokens import AliveTokens, alive_keys
 from .endpoints import DEFAULT_ENDPOINT, check_endpoints, dial_endpoint, split_endpoint
-from .queries import MAX_ANSWERS, AliveChanges, Answers, alive_keys, ask, ask_alive, ask_alive_keys, query
+from .queries import MAX_ANSWERS, Answers, ask, query
 from .rmw_zenoh import (
     BRIDGED_ENCODING,
     LONGEST_TOKEN,
@@ -44,11 +45,11 @@ from .zenoh_ext import (
 
 __all__ = [
     "BRIDGED_ENCODING", "DEFAULT_ENDPOINT", "LEASE", "LONGEST_TOKEN", "MAX_ANSWERS", "NO_HASH", "PX4_TYPES",
-    "UPLINK_POLL", "AliveChanges", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
+    "UPLINK_POLL", "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
     "RetransmitRequest", "RouterConfig", "RouterState", "Session", "SourceInfo", "Tls", "TopicKey", "Uplinks",
-    "Verdict", "alive_keys", "ask", "ask_alive", "ask_alive_keys", "ask_routers", "check_endpoints", "check_pem",
-    "dial_endpoint", "entity_name", "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload",
-    "is_forked", "log_refusals", "node_token", "open_client", "open_router", "probe_writes", "publisher_token",
-    "px4_publishers_key_expr", "query", "read_router_config", "request_samples", "require_unforked",
-    "router_endpoints", "router_max_sessions", "split_endpoint", "subscription_token", "translate_error", "while_open",
+    "Verdict", "alive_keys", "ask", "ask_routers", "check_endpoints", "check_pem", "dial_endpoint", "entity_name",
+    "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",
+    "node_token", "open_client", "open_router", "probe_writes", "publisher_token", "px4_publishers_key_expr", "query",
+    "read_router_config", "request_samples", "require_unforked", "router_endpoints", "router_max_sessions",
+    "split_endpoint", "subscription_token", "translate_error", "while_open",
 ]  # fmt: skip

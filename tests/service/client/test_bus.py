@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from typing import cast
 
@@ -23,10 +23,12 @@ import zenoh
 
 import nedbus
 from nedbus import Mode
-from nedbus.transport import Session, ask_alive_keys
+from nedbus.transport import Session, alive_tokens
+from nedbus.transport.queries import Answers
 from nedbus_msgs import DEFAULT, Address, encode
 from tests.messages import VLP, message
 from tests.service.commands.answering import answering, reply_with
+from tests.service.delivery.downsampling import Link
 from tests.service.delivery.publishing import publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for
 
@@ -101,11 +103,12 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
     """
     asked: list[str] = []
 
-    def ask(session: Session, key_expr: str, *, timeout: float) -> tuple[list[str], bool]:
-        asked.append(key_expr)
-        return ask_alive_keys(session, key_expr, timeout=timeout)
+    def ask(session: Session, key_expr: str, timeout: float) -> Answers:
+        asked.extend([key_expr] if "*" in key_expr else [])  # publishers ask for one
+        return ask_router(session, key_expr, timeout)
 
-    monkeypatch.setattr("nedbus.client.discovery.vehicle_directory.ask_alive_keys", ask)
+    ask_router = alive_tokens._ask
+    monkeypatch.setattr(alive_tokens, "_ask", ask)
     with nedbus.connect(endpoint) as other:
         for count, vehicle in enumerate("789", 1):
             other.publisher("estimator_local_position", vehicle=vehicle, instance=2)
@@ -123,7 +126,7 @@ def test_more_vehicles_come_than_are_kept_until_somebody_asks(
     endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Then all are asked for once more: none is missing, and none that has gone is still there."""
-    monkeypatch.setattr("nedbus.transport.queries._MAX_CHANGES", 4)
+    monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 4)
     gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
     gone.undeclare()
@@ -133,16 +136,33 @@ def test_more_vehicles_come_than_are_kept_until_somebody_asks(
     wait_for(partial(has_vehicles, bus, len(tokens)), what="all of them")
 
 
-def test_incomplete_list_of_vehicles_is_said(
-    bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+INCOMPLETE = "not all liveliness tokens are known"
+
+
+def test_more_vehicles_than_are_kept_are_said(
+    endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """With more tokens than are kept, or a router that is too slow to list them, what is known is no whole list."""
-    monkeypatch.setattr(
-        "nedbus.client.discovery.vehicle_directory.ask_alive_keys",
-        lambda *_, timeout: ([f"nedbus/1/@alive/{VLP}"], False),
-    )
-    assert list(bus.vehicles()) == list(bus.vehicles()) == ["1"]
-    assert len([text for text in caplog.messages if "not all liveliness tokens are known" in text]) == 1
+    """Once, while it is so: two of three are no whole list."""
+    monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
+    for number in range(3):
+        bus.publisher(VLP, vehicle=str(number))
+    with nedbus.connect(endpoint) as other:
+        wait_for(lambda: other.vehicles() and INCOMPLETE in caplog.text, what="a warning")
+        assert len(other.vehicles()) == 2
+    assert caplog.text.count(INCOMPLETE) == 1
+
+
+def test_router_that_is_too_slow_to_list_vehicles_is_said(
+    endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The list that it gave is incomplete, and becomes complete by itself."""
+    publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
+    with closing(Link(endpoint)) as link, nedbus.connect(link.endpoint) as other:
+        link.flows.clear()
+        assert other.vehicles(timeout=0.05) == other.vehicles(timeout=0.05) == {}
+        assert caplog.text.count(INCOMPLETE) == 1
+        link.flows.set()
+        wait_for(partial(has_vehicles, other, len(publishers)), what="all of them")
 
 
 def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
@@ -246,7 +266,7 @@ def test_answers_that_are_too_many_are_left_out(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The bytes that are kept of one question are bounded, and the log says how many answers were left out."""
-    monkeypatch.setattr("nedbus.transport.queries._MAX_BYTES", 10_500)
+    monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
     with answering(raw, "nedbus/@service/*/status", services_of(many)):

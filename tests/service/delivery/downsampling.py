@@ -20,10 +20,12 @@ MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP link to a router; `carried` counts its bytes."""
+    """A TCP link to a router; `carried` counts its bytes, and nothing passes while `flows` is not set."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
+        self.flows = threading.Event()
+        self.flows.set()
         self.broken = False
         self._to = endpoint.removeprefix("tcp/").split(":")
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -39,6 +41,7 @@ class Link:
                 each.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
+        self.flows.set()
         self._sockets.append(self._listener)
         self.cut()
         for each in self._sockets:
@@ -59,6 +62,7 @@ class Link:
     def _carry(self, source: socket.socket, target: socket.socket) -> None:
         with suppress(OSError):  # closed
             while data := source.recv(4096):
+                self.flows.wait()
                 self.carried += len(data)
                 target.sendall(data)
 

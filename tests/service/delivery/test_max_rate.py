@@ -301,7 +301,7 @@ def test_more_streams_than_changes_are_kept(
 ) -> None:
     """Each of them is read at full rate where none is downsampled, although most of their tokens were dropped."""
     monkeypatch.setattr(Downsampler, "put", lambda *_: None)
-    monkeypatch.setattr("nedbus.transport.queries._MAX_CHANGES", 2)
+    monkeypatch.setattr("nedbus.transport.alive_tokens._MAX_CHANGES", 2)
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(8)]
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, max_rate=10):
         wait_for(lambda: all(map(is_read, publishers)), what="readers at full rate")

@@ -23,7 +23,7 @@ from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import AliveChanges, Answers, RawSample, Session, ask, ask_alive, while_open
+from nedbus.transport import AliveTokens, RawSample, Session, ask, while_open
 from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key
 
 from .decoder import MAX_KEYS, Arrival, Decoder
@@ -116,9 +116,7 @@ class MaxRateReceiver(Receiver):
         self._prefix, self._rate_queue, self._warned = prefix, queue, False
         self._full_rate: dict[str, zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = {}
         self._key_expr = selection.key_expr(prefix=prefix)
-        self._alive_key_expr = selection.alive_key_expr(prefix=prefix)
-        self._tokens = AliveChanges(session, self._alive_key_expr)
-        self._all_tokens: Answers | None = None  # asked for when more changed than are kept
+        self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
         self._last = ask(session, self._key_expr, timeout=_TIMEOUT)  # downsampling begins with the next message
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
         super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, downsampled=True)
@@ -135,13 +133,7 @@ class MaxRateReceiver(Receiver):
         return min(pause, _FULL_RATE_POLL) if self._full_rate or not self._last.ended else pause
 
     def _follow_tokens(self, now: float) -> None:
-        changes = self._tokens.take()
-        if self._tokens.missed and (self._all_tokens is None or self._all_tokens.ended):
-            self._tokens.missed = False
-            self._all_tokens = ask_alive(self._session, self._alive_key_expr, timeout=_TIMEOUT)
-        answers = [] if self._all_tokens is None else self._all_tokens.take()
-        known = [(str(reply.ok.key_expr), True) for reply in answers if reply.ok is not None]
-        for token, alive in known + changes:
+        for token, alive in self._tokens.take(timeout=_TIMEOUT):
             with suppress(AddressError):  # not one of nedbus
                 key = address_of_alive_key(token, prefix=self._prefix).key(prefix=self._prefix)
                 self._rate_queue.on_token(key, now, alive=alive)
