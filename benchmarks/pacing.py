@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.ulogs import write_log
+from tests.flights.ulogs import write_log
 
 import nedbus
 

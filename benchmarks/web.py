@@ -31,8 +31,8 @@ import math, sys, time
 import numpy as np
 import nedbus
 from benchmarks.compare.fields import FIELDS
-from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE
-from tests.first_message import encode_array
+from tests.flights.first_message import FIELD_TYPES, PAYLOAD_SIZE
+from tests.flights.first_message import encode_array
 vehicles, rate, endpoint = int(sys.argv[1]), float(sys.argv[2]), sys.argv[3]
 messages = np.repeat(nedbus.to_array([nedbus.VehicleLocalPosition(**FIELDS)]), vehicles)
 for name in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):

@@ -14,10 +14,10 @@ import pytest
 
 import nedbus
 from nedbus.transport import Session, open_router
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start, Zygote, unmeasured
 
 from .blocking import blocking
-from .ports import free_endpoint
-from .processes import Process, Start, Zygote, unmeasured
 
 # Examples of each property: 25, or 100 with `--hypothesis-profile=all`. A machine that is busy fails none.
 hypothesis.settings.register_profile(

@@ -31,11 +31,11 @@ from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS, parse_source
 from nedbus.transport import open_router
 from nedbus_msgs import MESSAGES, TOPICS
-from tests.command_line import run_command
 from tests.documents import BLOCKS, PAGES, ROOT, Block, check_options, nedbus_commands, parse_command, shape_of
-from tests.ports import free_endpoint, free_port
-from tests.processes import Process, Start, Zygote, unmeasured
-from tests.replays import convert_replay
+from tests.flights.replays import convert_replay
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Process, Start, Zygote, unmeasured
 from tests.waits import wait_for
 
 from .service.commands.test_events_command import write_flight

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import nedbus
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
-from tests.replays import convert_replay
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.replays import convert_replay
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
 from tests.waits import wait_for
 
 from .service.commands.test_cli import flying

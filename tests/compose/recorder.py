@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 import nedbus
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address, Message, upgrade_with
-from tests.replays import open_replay
+from tests.flights.replays import open_replay
 from tests.waits import DEADLINE, wait_for
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from tests.ports import free_endpoint
-from tests.processes import Process
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = dict(os.environ)  # as it was before any test: NEDBUS_BASE_IMAGE, NEDBUS_ROUTER_IMAGE

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.messages import VLP
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.flights.messages import VLP
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
 from .certificates import FILES, USER, hand_out, join, make_certificates

@@ -9,7 +9,7 @@ import pytest
 
 import nedbus
 from nedbus_msgs import Address
-from tests.messages import VLP
+from tests.flights.messages import VLP
 from tests.waits import DEADLINE, wait_for
 
 from .conftest import Record, StartStack

@@ -16,8 +16,8 @@ import pytest
 import nedbus
 from nedbus.transport import open_client, query
 from nedbus_msgs import Address
-from tests.messages import VLP
-from tests.ports import free_endpoint
+from tests.flights.messages import VLP
+from tests.peers.ports import free_endpoint
 from tests.waits import DEADLINE, wait_for
 
 from .conftest import StartStack

@@ -11,7 +11,7 @@ import zenoh
 
 import nedbus
 from nedbus_msgs import Address, encode
-from tests.messages import VLP, message
+from tests.flights.messages import VLP, message
 from tests.waits import DEADLINE, wait_for
 
 from .conftest import Record, StartStack

@@ -10,7 +10,7 @@ import pytest
 import nedbus
 from nedbus import Mode
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Message
-from tests.messages import VLP
+from tests.flights.messages import VLP
 from tests.waits import DEADLINE, wait_for
 
 from .conftest import StartStack

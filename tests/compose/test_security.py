@@ -10,8 +10,8 @@ import pytest
 import nedbus
 from nedbus.pki import make_authority, make_certificate
 from nedbus_msgs import Address
-from tests.messages import VLP, message
-from tests.processes import Process
+from tests.flights.messages import VLP, message
+from tests.peers.processes import Process
 from tests.waits import wait_for
 
 from .certificates import FILES, USER, hand_out, join, make_certificates

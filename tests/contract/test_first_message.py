@@ -18,7 +18,7 @@ from nedbus_msgs import NedbusError, VehicleLocalPosition
 from nedbus_msgs import decode as decode_payload
 from nedbus_msgs.arrays import DTYPE
 from tests.contract.strategies import DATA, FLIGHTS, REAL
-from tests.first_message import (
+from tests.flights.first_message import (
     LAYOUTS,
     decode_row,
     describe,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from nedbus_msgs import DOUBT_FLAGS, FLAGS, VehicleLocalPosition, describe_flags, message_doubts
-from tests.first_message import FIELD_TYPES, row_of
+from tests.flights.first_message import FIELD_TYPES, row_of
 
 from .strategies import FLAG_FIELDS, messages
 

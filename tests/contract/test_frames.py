@@ -27,8 +27,8 @@ from nedbus_msgs import (
     yaw_enu_to_ned,
     yaw_ned_to_enu,
 )
-from tests.first_message import row_of
-from tests.ulogs import LOGS
+from tests.flights.first_message import row_of
+from tests.flights.ulogs import LOGS
 
 RADIUS = 6_371_000.0
 

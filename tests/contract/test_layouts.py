@@ -12,7 +12,7 @@ from hypothesis import given
 from pydantic import ValidationError
 
 from nedbus_msgs import DEFAULT, LayoutError, VehicleLocalPosition
-from tests.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
+from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 
 from .strategies import DATA, bits, messages
 

@@ -35,9 +35,9 @@ from nedbus_msgs import (
     upgrade_fields,
 )
 from nedbus_msgs.arrays import arrays_of
-from tests.first_message import decode_cdr, encode_cdr
-from tests.processes import Start
-from tests.ulogs import UlogWriter
+from tests.flights.first_message import decode_cdr, encode_cdr
+from tests.flights.ulogs import UlogWriter
+from tests.peers.processes import Start
 
 from .strategies import DATA
 

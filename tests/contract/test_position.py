@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs import InvalidMessageError, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import to_array
-from tests.first_message import FIELD_TYPES, describe, encode_fields, json_schema
+from tests.flights.first_message import FIELD_TYPES, describe, encode_fields, json_schema
 
 from .strategies import BREAKING, KEEPING, WITHIN, bits, fields, messages
 

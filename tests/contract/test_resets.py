@@ -11,10 +11,10 @@ from typing import cast
 import pytest
 
 from nedbus_msgs import Continuous, MapProjection, ResetTracker, VehicleLocalPosition
-from tests.first_message import upgrade
-from tests.messages import VLP
-from tests.replays import open_replay
-from tests.ulogs import LOGS
+from tests.flights.first_message import upgrade
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
+from tests.flights.ulogs import LOGS
 
 PLAIN: dict[str, object] = {
     "x": 0.0, "y": 0.0, "z": 0.0, "vx": 0.0, "vy": 0.0, "vz": 0.0, "heading": 0.0, "dist_bottom": 1.0,

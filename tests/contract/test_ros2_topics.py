@@ -17,7 +17,15 @@ from nedbus_msgs import (
     ros2_types,
     split_ros2_topic,
 )
-from tests.first_message import ROS2_TYPE, decode_cdr, downgrade, encode_cdr, layout_of_type_hash, type_hash, upgrade
+from tests.flights.first_message import (
+    ROS2_TYPE,
+    decode_cdr,
+    downgrade,
+    encode_cdr,
+    layout_of_type_hash,
+    type_hash,
+    upgrade,
+)
 
 NAMESPACES = st.lists(st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,9}", fullmatch=True), max_size=3).map("/".join)
 ADDRESSES = st.sampled_from(sorted(TOPICS)).flatmap(

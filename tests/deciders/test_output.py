@@ -10,7 +10,7 @@ from nedbus.daemon.output import SourceOutput
 from nedbus.events import Account
 from nedbus.sources import SourceMessage
 from nedbus_msgs import BY_TOPIC, Address
-from tests.messages import VLP
+from tests.flights.messages import VLP
 
 HOME, POSITION, OTHER = Address("1", "home_position"), Address("1", VLP), Address("2", VLP)
 ATTITUDE = Address("1", "vehicle_attitude")

@@ -9,8 +9,8 @@ from nedbus.sources.px4.publishers import PublisherTable
 from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
 from nedbus_msgs import DecodeError, dds_type
-from tests.first_message import ROS2_TYPE, type_hash
-from tests.messages import VLP
+from tests.flights.first_message import ROS2_TYPE, type_hash
+from tests.flights.messages import VLP
 
 GID = bytes.fromhex("aabbcc00000000000000000000000000")  # of every PX4 in SITL
 # From ../shared/data/px4/gps_loss_zenoh.jsonl.gz.

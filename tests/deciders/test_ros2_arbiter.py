@@ -9,7 +9,7 @@ import pytest
 from nedbus.bridges.ros2_arbiter import TAKE_OVER_DELAY, Decision, Ros2Arbiter
 from nedbus.errors import AddressError
 from nedbus_msgs import Address
-from tests.messages import VLP
+from tests.flights.messages import VLP
 
 ONE = Address("1", VLP)
 TOPIC = f"fmu/out/{VLP}"

@@ -17,8 +17,8 @@ from nedbus.events import Account
 from nedbus.sources import Rejection, ReplayRun, Source, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT, Address, Definition, VehicleLocalPosition, decode
-from tests.first_message import encode_fields
-from tests.messages import VLP
+from tests.flights.first_message import encode_fields
+from tests.flights.messages import VLP
 
 ONE, TWO = Address("1", VLP), Address("2", VLP)
 Script = list[SourceMessage | Rejection | float | None]

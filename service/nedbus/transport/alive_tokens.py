@@ -56,7 +56,7 @@ class AliveTokens:
 
     @property
     def is_asking(self) -> bool:
-        """Whether an answer has not come yet: another `take` gets it."""
+        """True while an answer has not come: another `take` gets it."""
         return self._answers is not None
 
     def ask(self) -> None:

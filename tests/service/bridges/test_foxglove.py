@@ -19,11 +19,11 @@ from nedbus.bridges import FoxgloveServer
 from nedbus.bridges.foxglove_messages import orientation_of
 from nedbus_msgs import Address, MapProjection, to_global
 from nedbus_msgs.messages.vehicle_attitude import VehicleAttitude
-from tests.command_line import run_command
-from tests.first_message import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
-from tests.messages import VLP, message
-from tests.ports import free_port
-from tests.processes import Start
+from tests.flights.first_message import CURRENT, ROS2_TYPE, decode_cdr, message_definition, upgrade
+from tests.flights.messages import VLP, message
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_port
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
 X, Y, Z = LATITUDE, LONGITUDE, _ = b"\x09", b"\x11", b"\x19"  # before the doubles 1, 2 and 3 of a message of protobuf

@@ -34,13 +34,13 @@ from nedbus_msgs import (
     split_ros2_topic,
     upgrade_with,
 )
-from tests.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, type_hash, upgrade
-from tests.listening import Listener
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
-from tests.replays import open_replay
-from tests.ulogs import LOGS
+from tests.flights.first_message import LAYOUTS, ROS2_TYPE, decode_cdr, downgrade, type_hash, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import open_replay
+from tests.flights.ulogs import LOGS
+from tests.peers.listening import Listener
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
 PEER = str(Path(__file__).with_name("ros2_peer.py"))

@@ -18,10 +18,10 @@ import nedbus
 from nedbus.recording import RecordingReader
 from nedbus_msgs import BY_TOPIC, MESSAGES, TOPICS, describe, upgrade_with
 from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
-from tests.command_line import run_command
-from tests.processes import Start
-from tests.replays import convert_replay, open_replay
-from tests.ulogs import LOGS
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import LOGS
+from tests.peers.command_line import run_command
+from tests.peers.processes import Start
 from tests.waits import DEADLINE
 
 REJECTED: Final = {  # a bool that PX4 did not set

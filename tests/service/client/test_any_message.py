@@ -12,7 +12,7 @@ import pytest
 import nedbus
 from nedbus.transport import Session
 from tests.contract.test_messages import write_wheels
-from tests.processes import Start
+from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 

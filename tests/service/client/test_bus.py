@@ -26,7 +26,7 @@ from nedbus import Mode
 from nedbus.transport import Session, alive_tokens
 from nedbus.transport.queries import Answers
 from nedbus_msgs import DEFAULT, Address, encode
-from tests.messages import VLP, message
+from tests.flights.messages import VLP, message
 from tests.service.commands.answering import answering, reply_with
 from tests.service.delivery.downsampling import Link
 from tests.service.delivery.publishing import publish, take, wait_for_subscriber

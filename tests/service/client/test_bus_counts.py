@@ -21,7 +21,7 @@ from nedbus.client import Housekeeping, PublisherRegistry, QueryServer, Rejectio
 from nedbus.client.receiving.decoder import Decoder
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
-from tests.messages import VLP, message
+from tests.flights.messages import VLP, message
 from tests.service.commands.answering import answering, reply_with
 from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader

@@ -20,9 +20,9 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue, Receiver
 from nedbus.transport import Session, open_router
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.flights.messages import VLP, message
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 from tests.service.commands.answering import answering
 from tests.service.delivery.publishing import publish, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for

@@ -17,9 +17,9 @@ from nedbus.client.publishing.flow_control import CACHE, WINDOW
 from nedbus.transport import Session, open_router
 from nedbus_msgs import Address, Row, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.first_message import LAYOUTS, downgrade
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
+from tests.flights.first_message import LAYOUTS, downgrade
+from tests.flights.messages import VLP, message
+from tests.peers.ports import free_endpoint
 from tests.service.delivery.publishing import numbered, publish, take, wait_for_subscriber
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 

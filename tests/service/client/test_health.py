@@ -12,7 +12,7 @@ from nedbus import Health, Monitor, Sample, StreamHealth
 from nedbus.client import describe_stream, stream_state
 from nedbus.client.health.stream_health import _Window
 from nedbus_msgs import DOUBT_FLAGS, Address
-from tests.messages import VALID, VLP, message
+from tests.flights.messages import VALID, VLP, message
 
 SECOND = 1_000_000_000
 Fields = Mapping[str, object]

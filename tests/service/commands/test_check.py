@@ -12,10 +12,10 @@ from nedbus.errors import ConfigError
 from nedbus.pki import make_authority, make_certificate
 from nedbus.settings import load_settings
 from nedbus.sources import parse_source
-from tests.command_line import run_command
-from tests.ports import free_endpoint
-from tests.processes import Start
-from tests.ulogs import write_log
+from tests.flights.ulogs import write_log
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 
 ROOT = Path(__file__).parents[3]
 

@@ -18,11 +18,11 @@ from nedbus.client import Subscription, connect_with
 from nedbus.settings import Settings
 from nedbus.transport import open_router
 from nedbus_msgs import ANY
-from tests.command_line import fork_command, run_command
-from tests.first_message import LAYOUTS, json_schema
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start, Zygote, unmeasured
+from tests.flights.first_message import LAYOUTS, json_schema
+from tests.flights.messages import VLP, message
+from tests.peers.command_line import fork_command, run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start, Zygote, unmeasured
 from tests.waits import DEADLINE, wait_for
 
 COMMANDS = [str(each.name) for each in app.registered_commands]

@@ -11,10 +11,10 @@ import pytest
 
 from nedbus.cli.output.progress import what_to_type
 from nedbus.transport import DEFAULT_ENDPOINT
-from tests.command_line import run_command
-from tests.ports import free_endpoint, free_port
-from tests.processes import Start
-from tests.ulogs import write_log
+from tests.flights.ulogs import write_log
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Start
 from tests.waits import wait_for
 
 from .test_terminal import OnTerminal, on_terminal

@@ -28,13 +28,13 @@ from nedbus.pki import Certificate
 from nedbus.settings import load_settings
 from nedbus.transport import NO_HASH, Session, TopicKey, open_client, open_router, publisher_token
 from nedbus_msgs import dds_type, encode, status_key
-from tests.certificates import files_of, pki, secure_endpoint, tls_of, write_config
-from tests.command_line import run_command
-from tests.first_message import ROS2_TYPE
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint, free_port
-from tests.processes import Start
-from tests.ulogs import write_log
+from tests.flights.first_message import ROS2_TYPE
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import write_log
+from tests.peers.certificates import files_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, repeating, wait_for
 
 __all__ = ["pki"]

@@ -22,10 +22,10 @@ import pytest
 import nedbus
 from nedbus.transport import Session
 from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
-from tests.command_line import Ended, fork_command, run_command
-from tests.messages import VLP, message
-from tests.processes import Forked, Start, Zygote
-from tests.replays import open_replay
+from tests.flights.messages import VLP, message
+from tests.flights.replays import open_replay
+from tests.peers.command_line import Ended, fork_command, run_command
+from tests.peers.processes import Forked, Start, Zygote
 from tests.waits import DEADLINE, wait_for
 
 from .test_cli import flying

@@ -19,11 +19,11 @@ import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
 from nedbus.transport import Session
-from tests.command_line import Ended, run_command
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Start
-from tests.ulogs import LOGS, UlogWriter
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import LOGS, UlogWriter
+from tests.peers.command_line import Ended, run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 from tests.waits import repeating, wait_for, wait_for_reader
 
 REAL = LOGS.parent / "px4" / "twelve_messages.ulg"

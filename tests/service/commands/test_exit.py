@@ -13,8 +13,8 @@ from contextlib import suppress
 import pytest
 
 import nedbus
-from tests.messages import VLP, message
-from tests.processes import Start
+from tests.flights.messages import VLP, message
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, repeating, wait_for
 
 LIMIT = 9.0  # s from the end of the script, when it said so: Zenoh needs 10 s where it is stuck, and the promise is 2 s

@@ -20,12 +20,12 @@ from nedbus.daemon import Daemon
 from nedbus.settings import load_settings
 from nedbus.transport import Session
 from nedbus_msgs import Address
-from tests.command_line import Ended, run_command
-from tests.messages import VALID, VLP, message
-from tests.ports import free_port
-from tests.processes import Start
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import UlogWriter
+from tests.peers.command_line import Ended, run_command
+from tests.peers.ports import free_port
+from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with
-from tests.ulogs import UlogWriter
 from tests.waits import DEADLINE, wait_for
 
 Judge = Callable[..., Ended]

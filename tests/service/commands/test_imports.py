@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.processes import Start
+from tests.peers.processes import Start
 
 
 def test_what_is_not_used_is_not_loaded(start: Start) -> None:

@@ -23,10 +23,10 @@ from nedbus.cli.output.logs import JournalFormatter, JsonFormatter, TextFormatte
 from nedbus.log_event import EVENTS, about
 from nedbus.transport import Session
 from nedbus_msgs import Address, encode
-from tests.command_line import run_command
-from tests.hasty import start_hasty
-from tests.messages import VLP, message
-from tests.processes import Start
+from tests.flights.messages import VLP, message
+from tests.peers.command_line import run_command
+from tests.peers.hasty import start_hasty
+from tests.peers.processes import Start
 from tests.service.sources.test_px4_zenoh import Px4
 from tests.waits import wait_for, wait_for_reader
 

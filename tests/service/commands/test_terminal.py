@@ -26,11 +26,11 @@ from nedbus.cli.output.streams import printable, to_text
 from nedbus.cli.output.table import LiveTable, to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
-from tests.command_line import fork_command, run_command
-from tests.hasty import start_hasty
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint, free_port
-from tests.processes import Start, Zygote, unmeasured
+from tests.flights.messages import VALID, VLP, message
+from tests.peers.command_line import fork_command, run_command
+from tests.peers.hasty import start_hasty
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Start, Zygote, unmeasured
 from tests.waits import DEADLINE, repeating, wait_for
 
 ROOT = Path(__file__).parents[3]

@@ -20,13 +20,13 @@ import zenoh
 import nedbus
 from nedbus.transport import Session, Uplinks, open_router
 from nedbus_msgs import Provenance, VehicleLocalPosition
-from tests.command_line import run_command
-from tests.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
-from tests.replays import open_replay
-from tests.ulogs import LOGS, UlogWriter, write_log
+from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import open_replay
+from tests.flights.ulogs import LOGS, UlogWriter, write_log
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
 
 Serve = Callable[..., tuple[Process, nedbus.Bus]]

@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing, nullcontext, suppress
 import pytest
 
 from nedbus.monitoring import HttpServer, Page, http_server
-from tests.http_pages import Pages
+from tests.peers.http_pages import Pages
 from tests.waits import DEADLINE, repeating
 
 GO, BUSY = threading.Event(), threading.Semaphore(0)

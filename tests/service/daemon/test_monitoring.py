@@ -31,13 +31,13 @@ from nedbus.settings import load_settings
 from nedbus.transport import Session
 from nedbus_msgs import Address, VehicleLocalPosition, encode
 from nedbus_msgs.messages import VehicleStatus
-from tests.command_line import run_command
-from tests.http_pages import Pages, read_families
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint, free_port
-from tests.processes import Process, Start
-from tests.prometheus import start_promtool
-from tests.ulogs import UlogWriter, write_log
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import UlogWriter, write_log
+from tests.peers.command_line import run_command
+from tests.peers.http_pages import Pages, read_families
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Process, Start
+from tests.peers.prometheus import start_promtool
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 
 # A service where the extra `metrics` is not installed.

@@ -14,11 +14,11 @@ import nedbus
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import BY_TOPIC, Address, Provenance
 from nedbus_msgs.codecs.arrays import arrays_of
-from tests.browser import PATIENCE, browser, open_tabs
-from tests.command_line import run_command
-from tests.messages import VALID, VLP
-from tests.ports import free_port
-from tests.processes import Process, Start
+from tests.flights.messages import VALID, VLP
+from tests.peers.browser import PATIENCE, browser, open_tabs
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
 from tests.waits import wait_for
 
 __all__ = ["browser"]  # a fixture

@@ -21,11 +21,11 @@ from nedbus.transport import Session
 from nedbus_msgs import encode
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleStatus
-from tests.messages import VALID, VLP, message
-from tests.ports import free_endpoint, free_port
-from tests.processes import Process, Start
-from tests.prometheus import ALERTS, PACKAGING, Prometheus, start_promtool
-from tests.ulogs import write_log
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import write_log
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Process, Start
+from tests.peers.prometheus import ALERTS, PACKAGING, Prometheus, start_promtool
 from tests.waits import repeating, wait_for
 
 PEER = str(Path(__file__).parents[1] / "sources" / "mavlink_peer.py")

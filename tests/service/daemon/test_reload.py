@@ -14,9 +14,9 @@ import nedbus
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
 from nedbus.settings import load_settings
-from tests.messages import VLP
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
+from tests.flights.messages import VLP
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
 
 

@@ -15,8 +15,8 @@ from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import open_client, open_router
 from nedbus.transport.endpoints import explain_endpoints
-from tests.command_line import run_command
-from tests.ports import free_endpoint
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
 from tests.waits import wait_for
 
 

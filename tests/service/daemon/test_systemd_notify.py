@@ -21,8 +21,8 @@ from nedbus.daemon import Daemon
 from nedbus.daemon.output import SourceOutput
 from nedbus.settings import load_settings
 from nedbus.transport import open_router
-from tests.ports import free_endpoint, free_port
-from tests.processes import Start
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, repeating, wait_for
 
 Datagram = dict[str, str]

@@ -11,7 +11,7 @@ import pytest
 
 import nedbus
 from nedbus.client.publishing import downsampler
-from tests.messages import message
+from tests.flights.messages import message
 from tests.waits import wait_for
 
 from .publishing import take

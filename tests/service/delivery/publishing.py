@@ -10,7 +10,7 @@ import zenoh
 
 import nedbus
 from nedbus_msgs.arrays import MessageArray, to_array
-from tests.messages import message
+from tests.flights.messages import message
 from tests.waits import DEADLINE, wait_for
 
 

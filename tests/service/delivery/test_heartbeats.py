@@ -10,7 +10,7 @@ import nedbus
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import Heartbeats, Session, follow_heartbeats, open_client
 from nedbus_msgs import decode
-from tests.messages import VLP
+from tests.flights.messages import VLP
 from tests.waits import wait_for
 
 from .downsampling import Link, wait_for_demand

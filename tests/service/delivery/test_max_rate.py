@@ -20,8 +20,8 @@ from nedbus.client.rate_gate import rate_step
 from nedbus.client.receiving import MaxRateQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
-from tests.messages import VLP, message
-from tests.processes import Start
+from tests.flights.messages import VLP, message
+from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 

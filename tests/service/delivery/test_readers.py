@@ -15,9 +15,9 @@ import nedbus
 from nedbus.client.publishing.flow_control import WINDOW
 from nedbus.transport import LEASE, open_router
 from nedbus.transport.session import COMMON_SETTINGS
-from tests.messages import VLP
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.flights.messages import VLP
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for
 
 from .publishing import is_read, numbered, publish, take, wait_for_subscriber

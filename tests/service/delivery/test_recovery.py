@@ -21,9 +21,9 @@ from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
 from nedbus_msgs import encode
-from tests.first_message import encoding_of
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
+from tests.flights.first_message import encoding_of
+from tests.flights.messages import VLP, message
+from tests.peers.ports import free_endpoint
 from tests.service.commands.answering import answering, reply_with
 from tests.waits import DEADLINE, wait_for, wait_for_reader, wait_for_router
 

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from tests.ports import free_port
-from tests.processes import Start
+from tests.peers.ports import free_port
+from tests.peers.processes import Start
 
 
 @pytest.mark.slow

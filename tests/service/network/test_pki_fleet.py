@@ -35,14 +35,14 @@ from nedbus.pki import (
 )
 from nedbus.transport import open_client, open_router
 from nedbus_msgs import AddressError
-from tests import certificates
-from tests.certificates import secure_endpoint, tls_of, write_config
-from tests.command_line import run_command
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.flights.messages import VLP, message
+from tests.peers import certificates
+from tests.peers.certificates import secure_endpoint, tls_of, write_config
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
+from tests.peers.zenohd import EITHER, start_zenohd
 from tests.waits import DEADLINE, wait_for
-from tests.zenohd import EITHER, start_zenohd
 
 ROOT = Path(__file__).parents[3]
 CONFIG = certificates.CONFIG / "router-secure.json5"

@@ -27,12 +27,12 @@ from nedbus.settings import load_settings
 from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, router, router_max_sessions
 from nedbus.transport.router import allow_sessions
 from nedbus.transport.router_state import read_state
-from tests.certificates import CONFIG
-from tests.certificates import write_config as write_shipped
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.peers.certificates import CONFIG
+from tests.peers.certificates import write_config as write_shipped
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
+from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
-from tests.zenohd import start_zenohd
 
 ZID = "1ae1e25d2f7221abc366ddc8a944c8a4"
 

@@ -22,18 +22,18 @@ from nedbus.pki import write_access_rules
 from nedbus.transport import Session, open_client, open_router
 from nedbus_msgs import Address, define, encode, field_type
 from nedbus_msgs.arrays import to_array
-from tests.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
-from tests.command_line import run_command
-from tests.hasty import start_hasty
-from tests.http_pages import Pages
-from tests.messages import VLP, message
-from tests.ports import free_endpoint, free_port
-from tests.processes import Process, Start
+from tests.flights.messages import VLP, message
+from tests.peers.certificates import CONFIG, flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.command_line import run_command
+from tests.peers.hasty import start_hasty
+from tests.peers.http_pages import Pages
+from tests.peers.ports import free_endpoint, free_port
+from tests.peers.processes import Process, Start
+from tests.peers.zenohd import EITHER, start_zenohd
 from tests.service.delivery.publishing import take
 from tests.service.delivery.test_max_rate import Clock, clock, publish, wait_for_demand
 from tests.service.sources.test_px4_zenoh import Px4
 from tests.waits import DEADLINE, wait_for, wait_for_reader
-from tests.zenohd import EITHER, start_zenohd
 
 __all__ = ["clock", "pki"]
 

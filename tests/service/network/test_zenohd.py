@@ -18,13 +18,13 @@ import zenoh
 import nedbus
 from nedbus.transport import Session, open_client
 from nedbus_msgs import decode, encode
-from tests.certificates import flags_of, pki, secure_endpoint, tls_of, write_config
-from tests.command_line import run_command
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
+from tests.flights.messages import VLP, message
+from tests.peers.certificates import flags_of, pki, secure_endpoint, tls_of, write_config
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
+from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, wait_for
-from tests.zenohd import start_zenohd
 
 __all__ = ["pki"]
 

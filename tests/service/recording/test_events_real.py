@@ -1,7 +1,7 @@
 """Events of real flight logs, beside a table of what happened in them that was made without nedbus.
 
-The peers are eight logs of PX4 1.12 to 1.17 (six flights and two simulations), and `tests/events_table.py`, which reads
-them with pyulog and tells first differences of single topics.
+The peers are eight logs of PX4 1.12 to 1.17 (six flights and two simulations), and `events_table.py`, which reads them
+with pyulog and tells first differences of single topics.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import pytest
 from nedbus.events import Event, Story, tell
 from nedbus.sources import read_account
 from nedbus.sources.account import FileAccount
-from tests import events_table
-from tests.events_table import Row
-from tests.ulogs import LOGS
+from tests.flights.ulogs import LOGS
+from tests.service.recording.events_table import Row
+
+from . import events_table
 
 TABLE: Final = json.loads(events_table.TABLE.read_text())
 NAMES: Final = [name for name in TABLE if name != "from"]

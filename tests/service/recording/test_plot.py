@@ -16,10 +16,10 @@ from nedbus.events import Event
 from nedbus.sources import read_account
 from nedbus_msgs import Address
 from nedbus_msgs.arrays import MessageArray, to_array
-from tests.command_line import run_command
-from tests.messages import VLP, message
-from tests.replays import convert_replay
-from tests.ulogs import LOGS
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay
+from tests.flights.ulogs import LOGS
+from tests.peers.command_line import run_command
 
 REAL = sorted(LOGS.parent.glob("*/*.ulg"))
 

@@ -20,11 +20,11 @@ from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import DEFAULT, Address, MapProjection, Provenance, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.command_line import run_command
-from tests.first_message import FIELD_TYPES, upgrade
-from tests.messages import VLP, message
-from tests.replays import convert_replay, open_replay
-from tests.ulogs import UlogWriter
+from tests.flights.first_message import FIELD_TYPES, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import UlogWriter
+from tests.peers.command_line import run_command
 
 from .test_alignment import array_of, write
 

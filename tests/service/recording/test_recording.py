@@ -28,12 +28,12 @@ from nedbus.sources import SourceMessage, convert
 from nedbus.transport import Session
 from nedbus_msgs import ANY, DEFAULT, Address, Provenance, VehicleLocalPosition, encode
 from nedbus_msgs.arrays import to_array
-from tests.command_line import run_command
-from tests.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
-from tests.messages import VLP, message
-from tests.processes import Start
-from tests.replays import convert_replay, open_replay
-from tests.ulogs import UlogWriter, write_log
+from tests.flights.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import UlogWriter, write_log
+from tests.peers.command_line import run_command
+from tests.peers.processes import Start
 from tests.waits import DEADLINE, wait_for, wait_for_reader
 
 ADDRESS = Address("7", VLP)

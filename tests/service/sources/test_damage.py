@@ -37,12 +37,12 @@ from nedbus.errors import SourceError
 from nedbus.recording import RecordingReader, RecordingWriter
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import MessageArray, to_array
-from tests.command_line import run_command
-from tests.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.replays import convert_replay, open_replay
-from tests.ulogs import LOGS, UlogWriter
+from tests.flights.first_message import ROS2_TYPE, downgrade, encode_cdr, message_definition, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import LOGS, UlogWriter
+from tests.peers.command_line import run_command
+from tests.peers.ports import free_endpoint
 
 _log = logging.getLogger(__name__)
 

@@ -23,12 +23,12 @@ import nedbus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import parse_source
 from nedbus.sources.mavlink.vehicle import ORIGIN
-from tests.first_message import upgrade
-from tests.listening import Listener, status_of_source
-from tests.messages import VLP
-from tests.ports import free_port
-from tests.processes import Process, Start
-from tests.replays import open_replay
+from tests.flights.first_message import upgrade
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
+from tests.peers.listening import Listener, status_of_source
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
 from tests.waits import DEADLINE, wait_for
 
 from . import mavlink_peer

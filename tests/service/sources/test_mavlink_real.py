@@ -14,8 +14,8 @@ from nedbus.sources import SourceMessage
 from nedbus.sources.mavlink.vehicle import STREAMS, Vehicle
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import BY_TOPIC, upgrade_with
-from tests.messages import VLP
-from tests.replays import open_replay
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
 
 from .test_px4_real import PX4, read_datagrams
 

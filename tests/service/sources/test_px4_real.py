@@ -28,15 +28,15 @@ from nedbus.sources.mavlink.vehicle import Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus.transport import Attachment, Session
 from nedbus_msgs import ANY, TOPICS, Address, VehicleLocalPosition, get_topic, split_ros2_topic
-from tests.first_message import decode_cdr, encode_cdr, upgrade
-from tests.listening import Listener, status_of_source
-from tests.messages import VLP
-from tests.ports import free_endpoint
-from tests.processes import Start
-from tests.replays import open_replay
-from tests.ulogs import LOGS
+from tests.flights.first_message import decode_cdr, encode_cdr, upgrade
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
+from tests.flights.ulogs import LOGS
+from tests.peers.listening import Listener, status_of_source
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
+from tests.peers.zenohd import start_zenohd
 from tests.waits import DEADLINE, repeating, wait_for
-from tests.zenohd import start_zenohd
 
 from .test_mavlink import port
 from .test_px4_zenoh import is_read

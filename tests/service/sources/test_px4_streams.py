@@ -8,8 +8,8 @@ from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.px4.streams import NotAcceptedError, StreamRegistry, track_sequence
 from nedbus.transport import Attachment, TopicKey
 from nedbus_msgs import DecodeError, dds_type
-from tests.first_message import ROS2_TYPE, type_hash
-from tests.messages import VLP
+from tests.flights.first_message import ROS2_TYPE, type_hash
+from tests.flights.messages import VLP
 
 GID = bytes(range(16))
 

@@ -20,12 +20,20 @@ from nedbus.errors import ConfigError
 from nedbus.sources import SourceMessage, parse_source
 from nedbus.transport import NO_HASH, Attachment, Session, TopicKey, publisher_token
 from nedbus_msgs import ANY, VehicleLocalPosition, dds_type, define_msg, encode_with, hash_of, ros2_type
-from tests.command_line import run_command
-from tests.first_message import LAYOUTS, ROS2_TYPE, downgrade, encode_cdr, message_definition, type_hash, upgrade
-from tests.listening import Listener, status_of_source
-from tests.messages import VLP, message
-from tests.ports import free_endpoint
-from tests.processes import Process, Start
+from tests.flights.first_message import (
+    LAYOUTS,
+    ROS2_TYPE,
+    downgrade,
+    encode_cdr,
+    message_definition,
+    type_hash,
+    upgrade,
+)
+from tests.flights.messages import VLP, message
+from tests.peers.command_line import run_command
+from tests.peers.listening import Listener, status_of_source
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Process, Start
 from tests.service.bridges.test_ros2 import Peer, flight, peer, plain_session
 from tests.waits import DEADLINE, repeating, wait_for, wait_for_reader
 

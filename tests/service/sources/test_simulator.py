@@ -21,9 +21,9 @@ from nedbus_msgs import (
     to_global,
     upgrade_with,
 )
-from tests.first_message import FIELD_TYPES, upgrade
-from tests.messages import VLP
-from tests.replays import open_replay
+from tests.flights.first_message import FIELD_TYPES, upgrade
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
 
 
 def simulate(options: str) -> list[SourceMessage]:

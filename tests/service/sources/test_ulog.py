@@ -13,10 +13,10 @@ from pyulog import ULog
 from nedbus.errors import SourceError
 from nedbus.sources import ReplayRun
 from nedbus_msgs import DEFAULT, VehicleLocalPosition
-from tests.first_message import FIELD_TYPES, LAYOUTS, upgrade
-from tests.messages import VLP, message
-from tests.replays import open_replay
-from tests.ulogs import LOGS, UlogWriter, write_log
+from tests.flights.first_message import FIELD_TYPES, LAYOUTS, upgrade
+from tests.flights.messages import VLP, message
+from tests.flights.replays import open_replay
+from tests.flights.ulogs import LOGS, UlogWriter, write_log
 
 # Counted with pyulog: messages of all local position topics, layout, addresses.
 REAL = {

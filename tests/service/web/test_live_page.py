@@ -13,10 +13,10 @@ import pytest
 
 import nedbus
 from nedbus.transport import open_client
-from tests.first_message import LAYOUTS, ROS2_TYPE, type_hash
-from tests.messages import VLP
-from tests.ports import free_endpoint
-from tests.processes import Start
+from tests.flights.first_message import LAYOUTS, ROS2_TYPE, type_hash
+from tests.flights.messages import VLP
+from tests.peers.ports import free_endpoint
+from tests.peers.processes import Start
 from tests.service.bridges.test_ros2 import Peer, peer
 from tests.service.sources.test_mavlink import Fly, fly, port
 from tests.service.sources.test_px4_zenoh import Px4

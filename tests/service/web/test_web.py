@@ -30,10 +30,10 @@ from nedbus.web.server import LiveFleet
 from nedbus.web.stream import COLUMNS, History
 from nedbus.web.style import DARK, LIGHT, Style
 from nedbus_msgs import Address, Selection
-from tests.messages import VALID, VLP
-from tests.ports import free_endpoint
+from tests.flights.messages import VALID, VLP
+from tests.peers.ports import free_endpoint
+from tests.service.web.page import QUAD, WING, Shown, Sky, flying, models_of, sky
 from tests.waits import wait_for
-from tests.web import QUAD, WING, Shown, Sky, flying, models_of, sky
 
 __all__ = ["sky"]  # a fixture
 

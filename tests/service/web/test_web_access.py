@@ -20,10 +20,10 @@ from websockets.sync.client import ClientConnection, connect
 
 from nedbus.monitoring import Page
 from nedbus.web.server import WebServer, Where
-from tests.ports import free_port
-from tests.processes import Start
+from tests.peers.ports import free_port
+from tests.peers.processes import Start
+from tests.service.web.page import in_thread
 from tests.waits import DEADLINE, wait_for
-from tests.web import in_thread
 
 PATHS = ("/", "/metrics", "/healthz")
 

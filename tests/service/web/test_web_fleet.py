@@ -12,8 +12,8 @@ from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import TRUTH
 from nedbus.web.stream import COLUMNS, POINTS, Stream
 from nedbus_msgs import Address, MapProjection
-from tests.messages import VLP
-from tests.web import NOON, QUAD, WING, Sky, addresses_of, sky
+from tests.flights.messages import VLP
+from tests.service.web.page import NOON, QUAD, WING, Sky, addresses_of, sky
 
 __all__ = ["sky"]  # a fixture
 

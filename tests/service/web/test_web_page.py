@@ -16,12 +16,12 @@ import nedbus
 from nedbus.transport import Session
 from nedbus.web import Where
 from nedbus_msgs import Address
-from tests.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
-from tests.messages import VALID, VLP, message
-from tests.ports import free_port
-from tests.processes import Process, Start
+from tests.flights.messages import VALID, VLP, message
+from tests.peers.browser import PATIENCE, VEHICLE, Tab, browser, open_tabs
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
+from tests.service.web.page import flying, serving_live, write_flight
 from tests.waits import repeating, wait_for, wait_for_reader
-from tests.web import flying, serving_live, write_flight
 
 __all__ = ["browser"]  # a fixture
 

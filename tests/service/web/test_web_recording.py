@@ -17,9 +17,9 @@ from nedbus.web.playback import Player, Recording
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleAttitude
-from tests.messages import VALID, VLP, message
+from tests.flights.messages import VALID, VLP, message
+from tests.service.web.page import Shown, write_flight
 from tests.waits import wait_for
-from tests.web import Shown, write_flight
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import Process, Start
+from tests.peers.processes import Process, Start
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 ARCHIVE = ROOT.parent / "shared" / "bin" / "zenohd-1.10.2.tar.xz"
 # Whatever `start` starts is Python: this one becomes another program.
 BECOME = "import os, sys; os.execv(sys.argv[1], sys.argv[1:])"

@@ -12,7 +12,7 @@ from hypothesis import given
 
 from nedbus.events import ALL, KEPT, KINDS, RECENT, WINDOW, Event
 from nedbus_msgs import Address
-from tests.messages import VALID, message
+from tests.flights.messages import VALID, message
 
 from .flight import ARMED, DISARMED, GOOD_GPS, POSITION, Flight
 

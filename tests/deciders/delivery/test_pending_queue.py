@@ -23,7 +23,7 @@ from nedbus.client.receiving.pending_queue import CAPACITY
 from nedbus.transport import RawSample
 from nedbus_msgs import DEFAULT, codec_of, encode
 from nedbus_msgs.messages import VehicleAttitude
-from tests.first_message import encoding_of
+from tests.flights.first_message import encoding_of
 from tests.waits import DEADLINE
 
 from .raw_samples import INVALID, OTHER_KEY, VALID, Payload, drain, junk, make_queue, put, raw, timestamps

@@ -1,7 +1,7 @@
 """Python processes within milliseconds: one that has imported nedbus forks for each that is asked for.
 
 What is forked is a process like any other, with an exit code, signals and streams of its own; what it saves is half a
-second of imports. No session is open here, so that Zenoh works in each. `tests/processes.py` is the asking side.
+second of imports. No session is open here, so that Zenoh works in each. `tests/peers/processes.py` is the asking side.
 """
 
 from __future__ import annotations

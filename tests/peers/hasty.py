@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from tests.processes import Process, Start
+from tests.peers.processes import Process, Start
 
 _SCRIPT: Final = """
 import sys

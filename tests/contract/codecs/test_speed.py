@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import Start
+from tests.peers.processes import Start
 
-FLIGHTS = Path(__file__).parents[1] / "data" / "flights.json"
+FLIGHTS = Path(__file__).parents[2] / "data" / "flights.json"
 
 # Coverage would slow down nedbus_msgs but not the baseline: this runs in a process without it.
 PROGRAM = """

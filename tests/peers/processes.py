@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from .waits import DEADLINE
+from tests.waits import DEADLINE
 
 _SAID = 10_000  # characters of a process's output that a failure shows
 
@@ -56,15 +56,15 @@ class Forked:
 
 
 class Zygote:
-    """A process of `tests/zygote.py`; one for each worker of pytest, from its first test that starts a process."""
+    """A process of `zygote.py`; one for each worker of pytest, from its first test that starts a process."""
 
     def __init__(self) -> None:
         self._requests, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.zygote", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.peers.zygote", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
-                cwd=Path(__file__).parents[1],
+                cwd=Path(__file__).parents[2],
                 # Coverage begins in the forked process, if at all; what has threads cannot be forked.
                 env=unmeasured() | {"OPENBLAS_NUM_THREADS": "1"},
             )

@@ -15,12 +15,11 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from nedbus_msgs import DecodeError, EncodeError, LayoutError, VehicleLocalPosition
-from tests.first_message import LAYOUTS, decode_cdr, downgrade, encode_cdr
-
-from .strategies import DATA, messages
+from tests.contract.strategies import DATA, messages
+from tests.flights.first_message import LAYOUTS, decode_cdr, downgrade, encode_cdr
 
 VECTORS = DATA / "cdr_vectors.jsonl"
-SHARED_VECTORS = Path(__file__).parents[3] / "shared" / "data" / "cdr_vectors.jsonl"
+SHARED_VECTORS = Path(__file__).parents[4] / "shared" / "data" / "cdr_vectors.jsonl"
 
 STORE = get_typestore(Stores.EMPTY)
 

@@ -9,8 +9,7 @@ from typing import Self, cast
 import nedbus
 from nedbus.sources import Absence, LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.transport import Session
-
-from .waits import DEADLINE
+from tests.waits import DEADLINE
 
 
 class Listener:

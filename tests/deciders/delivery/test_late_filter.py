@@ -10,7 +10,7 @@ import zenoh
 import nedbus
 from nedbus.bridges.late_filter import DRIFT, MAX_LATENESS, STEADY, LateFilter
 from nedbus_msgs import Address
-from tests.messages import message
+from tests.flights.messages import message
 
 ONE = Address("1", "vehicle_local_position")
 SECOND = 10**9

@@ -8,7 +8,7 @@ import pytest
 
 from nedbus.events import Account, Event, Times, about, report_of, spans_of, state_at, tell
 from nedbus_msgs import Address
-from tests.messages import VALID, VLP
+from tests.flights.messages import VALID, VLP
 
 MAIN = Address("1", VLP)
 GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indicator": 0, "spoofing_state": 0}

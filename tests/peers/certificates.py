@@ -9,9 +9,9 @@ import pytest
 
 import nedbus
 from nedbus.pki import make_authority, make_certificate
-from tests.ports import free_endpoint
+from tests.peers.ports import free_endpoint
 
-CONFIG: Final = Path(__file__).parents[1] / "config"
+CONFIG: Final = Path(__file__).parents[2] / "config"
 """The shipped configurations of routers."""
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from nedbus.events import Account, Event
 from nedbus_msgs import Address, get_topic
-from tests.messages import VALID, VLP, message
+from tests.flights.messages import VALID, VLP, message
 
 POSITION: Final = Address("1", VLP)
 GOOD_GPS: Final[dict[str, Any]] = {

@@ -20,9 +20,8 @@ from nedbus_msgs import (
     encode,
 )
 from nedbus_msgs.arrays import to_message
-from tests.first_message import FIELD_TYPES, PAYLOAD_SIZE, decode_array, decode_row, downgrade, encode_row
-
-from .strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
+from tests.contract.strategies import DATA, FLIGHTS, MANY, REAL, bits, messages
+from tests.flights.first_message import FIELD_TYPES, PAYLOAD_SIZE, decode_array, decode_row, downgrade, encode_row
 
 GOLDEN = json.loads((DATA / "golden.json").read_text())
 

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from nedbus_msgs import DecodeError, VehicleLocalPosition
 from nedbus_msgs.arrays import DTYPE, to_array
-from tests.first_message import (
+from tests.contract.strategies import BREAKING, BROKEN, FLIGHTS, KEEPING, REAL, messages, pack_full_width
+from tests.flights.first_message import (
     PAYLOAD_SIZE,
     decode_array,
     decode_cdr_array,
@@ -23,8 +24,6 @@ from tests.first_message import (
     to_row,
     valid_mask,
 )
-
-from .strategies import BREAKING, BROKEN, FLIGHTS, KEEPING, REAL, messages, pack_full_width
 
 # On both sides of each length at which arrays are decoded, encoded or validated in another way.
 SIZES = [1, 2, 19, 20, 21, 255, 256, 257, 1000]

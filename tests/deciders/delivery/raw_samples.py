@@ -15,8 +15,8 @@ from nedbus import Mode
 from nedbus.client.receiving import Decoder, LayoutLookup, PendingQueue
 from nedbus.transport import RawSample
 from nedbus_msgs import encode
-from tests.first_message import encoding_of
-from tests.messages import message
+from tests.flights.first_message import encoding_of
+from tests.flights.messages import message
 
 KEY = "nedbus/1/vehicle_local_position"
 OTHER_KEY = "nedbus/2/vehicle_local_position"

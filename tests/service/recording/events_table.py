@@ -1,6 +1,6 @@
 """Tell what happened in PX4 logs by first differences of single topics, with pyulog and NumPy, and nothing of nedbus.
 
-    python -m tests.events_table FOLDER...    # writes tests/data/events.json anew, of all logs in these folders
+    python -m tests.service.recording.events_table FOLDER...    # writes tests/data/events.json anew, of all logs there
 
 It was written from PX4's definitions of the messages, by somebody who had not seen `nedbus.events`. Each row is a
 difference between two messages of a topic that follow each other (instance 0); the first message gives none. Down is
@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from pyulog import ULog
 
-TABLE: Final = Path(__file__).parent / "data" / "events.json"
+TABLE: Final = Path(__file__).parents[2] / "data" / "events.json"
 TOPICS: Final = (
     "vehicle_local_position", "vehicle_gps_position", "sensor_gps", "estimator_status_flags", "vehicle_status",
     "failsafe_flags", "battery_status", "vehicle_land_detected",
@@ -296,7 +296,7 @@ def rows_of(path: Path) -> list[Row]:
 
 def to_json(logs: Mapping[str, Sequence[Row]]) -> str:
     """Return the file: a row a line, below how it was made."""
-    how = "python -m tests.events_table LOGS: first differences of single topics, with pyulog; see its docstring"
+    how = f"python -m {__spec__.name} LOGS: first differences of single topics, with pyulog; see its docstring"
     texts = ["{" + f'"from": {json.dumps(how)}']
     texts += [
         f"{json.dumps(name)}: [\n" + ",\n".join(f"  {json.dumps(row)}" for row in rows) + "]"

@@ -26,7 +26,8 @@ from nedbus_msgs import (
     encode,
 )
 from nedbus_msgs.arrays import DTYPE, to_array, to_message
-from tests.first_message import (
+from tests.contract.strategies import BROKEN, bits, messages, pack_full_width
+from tests.flights.first_message import (
     CURRENT,
     FIELD_TYPES,
     decode_array,
@@ -42,8 +43,6 @@ from tests.first_message import (
     row_of,
     valid_mask,
 )
-
-from .strategies import BROKEN, bits, messages, pack_full_width
 
 GOOD = VehicleLocalPosition(timestamp=5, vxy_max=math.inf, eph=math.inf)
 # Values for any field, valid or not, whatever its type.

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from nedbus_msgs import VehicleLocalPosition
-from tests.first_message import FIELD_TYPES, LAYOUTS, downgrade
+from tests.flights.first_message import FIELD_TYPES, LAYOUTS, downgrade
 
-LOGS = Path(__file__).parents[2] / "shared" / "data" / "ulog"
+LOGS = Path(__file__).parents[3] / "shared" / "data" / "ulog"
 """Real flight logs, which tests marked `logs` read where they are."""
 _NAMES = {"uint64": "uint64_t", "uint8": "uint8_t", "bool": "bool", "float32": "float", "float64": "double"}
 _CODES = {"uint64_t": "Q", "uint8_t": "B", "bool": "?", "float": "f", "double": "d"}

@@ -12,11 +12,11 @@ from urllib.parse import quote
 
 import pytest
 
-from tests.ports import free_port
-from tests.processes import Process, Start
+from tests.peers.ports import free_port
+from tests.peers.processes import Process, Start
 from tests.waits import wait_for
 
-PACKAGING: Final = Path(__file__).parents[1] / "packaging"
+PACKAGING: Final = Path(__file__).parents[2] / "packaging"
 ALERTS: Final = PACKAGING / "prometheus" / "alerts.yml"
 # Whatever `start` starts is Python: this one reads a file as its input and becomes another program.
 _BECOME: Final = "import os, sys; os.dup2(os.open(sys.argv[1], os.O_RDONLY), 0); os.execv(sys.argv[2], sys.argv[2:])"

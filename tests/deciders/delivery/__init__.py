@@ -1,0 +1,1 @@
+"""Delivery: queues, accounts, acknowledgements and flow control."""

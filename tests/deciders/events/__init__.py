@@ -1,0 +1,1 @@
+"""Events of a flight, by the clock of the test."""

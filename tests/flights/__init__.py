@@ -1,0 +1,1 @@
+"""Messages and logs that tests send and read."""
