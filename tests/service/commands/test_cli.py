@@ -239,9 +239,9 @@ def test_invalid_option_is_a_usage_error(endpoint: str, arguments: list[str], te
     ids=" ".join,
 )
 def test_address_of_http_has_one_name(endpoint: str, arguments: list[str]) -> None:
-    """Each command that serves HTTP or a WebSocket listens at --http; --listen is for endpoints of Zenoh alone."""
+    """Each command that serves HTTP or a WebSocket listens at --http, which is checked before it connects anywhere."""
     assert run_command(*arguments, NEDBUS_CONNECT=endpoint).exit_code == 2
-    wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=endpoint)
+    wrong = run_command(arguments[0], "--http", "8765", NEDBUS_CONNECT=free_endpoint())
     assert wrong.exit_code == 2
     assert "--http: '8765' is not an address: write HOST:PORT" in wrong.err
 

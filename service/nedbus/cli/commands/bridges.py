@@ -85,20 +85,24 @@ def web(
 
 @on_bus
 @selecting(ANY)
-def export(bus: Bus, selection: Selection, *, http: HttpOption = "127.0.0.1:9464") -> None:
+def export(open_bus: Callable[[], Bus], selection: Selection, *, http: HttpOption = "127.0.0.1:9464") -> None:
     """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
     from nedbus.monitoring import Exporter
 
-    exporter = Exporter(bus, selection, version=__version__)
-    with serve_pages(http, exporter.pages):
-        run_until_stopped(exporter.run)
+    _split("--http", http)
+    with open_bus() as bus:
+        exporter = Exporter(bus, selection, version=__version__)
+        with serve_pages(http, exporter.pages):
+            run_until_stopped(exporter.run)
 
 
 @on_bus
-def foxglove(bus: Bus, *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}") -> None:
+def foxglove(
+    open_bus: Callable[[], Bus], *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
+) -> None:
     """Serve live vehicles to Foxglove, until Ctrl-C: plots of every field, poses in 3D, positions on the map."""
     host, port = _split("--http", http)
-    with bridges.FoxgloveServer(bus, host=host, port=port) as server:
+    with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
         write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
 
