@@ -39,11 +39,10 @@ from .functions import (
 )
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .model.definition import Definition, Row
+from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row
 from .model.layouts import upgrade_fields, upgrade_with
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, field_type
-from .model.registry import BY_TOPIC, MESSAGES, TOPICS
 from .model.rules import UnitQuaternion
 from .model.schema import json_schema_of, layout_table_of, schema_of
 from .provenance import Provenance, encoding_of, message_name_of, provenance_of

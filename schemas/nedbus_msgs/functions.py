@@ -9,9 +9,8 @@ from typing_extensions import TypeVar
 from .codecs.msgpack import Newer, codec_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import DEFAULT_TOPIC
-from .model.definition import Definition
+from .model.definition import BY_TOPIC, MESSAGES, Definition
 from .model.message import Message
-from .model.registry import BY_TOPIC, MESSAGES
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 _FIRST: Final = cast("type[Any]", VehicleLocalPosition)

@@ -10,7 +10,7 @@ from typing import Final, cast
 
 from .errors import AddressError
 from .model.declaration import Topic
-from .model.registry import MESSAGES, TOPICS
+from .model.definition import MESSAGES, TOPICS
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"

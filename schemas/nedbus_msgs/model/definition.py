@@ -1,18 +1,19 @@
-"""Definition of a message in one object, made from the class in its file; everything else is derived from it."""
+"""The definition of a message in one object, and the table of all; everything about a message is derived from it."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
 from nedbus_msgs.errors import LayoutError
 
-from .declaration import ALL, DEFAULT_TOPIC, EVERY, RELEASES, Layout, Older, Topic
-from .px4_types import FieldType, field_type, type_of_marks
-from .rules import Rule
+from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
+from .px4_types import FieldType, field_type
 from .validation import Validation, Values
 
 if TYPE_CHECKING:
@@ -66,59 +67,39 @@ class Plan(NamedTuple):
 
 
 class Definition(Generic[M_co]):
-    """Everything that is known of one message.
+    """Everything that is known of one message, of the class in its file.
 
     `name`: PX4's name of it, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: PX4's type of every field of the model, in its order.
-    `topics`: by name. `layouts`: by name, oldest first; `current` is the one with the fields of the model.
-    `wire_layouts`: those that a payload may have, by its first value, the number of the layout.
+    `topics` and `older` fields: by name. `rules`: those between its fields.
     `always`: the fields that it has in every log, however old.
-    `aliases`: names of ROS 2 types that hold layouts of this message under another name, by layout.
     """
 
-    def __init__(
-        self,
-        model: type[M_co],
-        *,
-        topics: Iterable[Topic] = (),
-        layouts: Mapping[str, str] | None = None,
-        wire: Mapping[int, str] | None = None,
-        rules: Sequence[Rule] = (),
-        older: Mapping[str, Older] | None = None,
-        aliases: Mapping[str, Sequence[str]] | None = None,
-        always: str = "timestamp",
-    ) -> None:
+    def __init__(self, model: type[M_co]) -> None:
         self.name = model.__name__
         self.model = model
         self.types: Mapping[str, FieldType] = {
-            name: type_of_marks(field.metadata) for name, field in model.__pydantic_fields__.items()
+            name: next(mark for mark in field.metadata if isinstance(mark, FieldType))
+            for name, field in model.__pydantic_fields__.items()
         }
         self.names = tuple(self.types)
         self.all_fields = frozenset(self.names)
-        self.topics = {topic.name: topic for topic in topics}
-        self.rules = rules
-        self.aliases = aliases or {}
-        self.always = frozenset(always.split())
-        self._older = older or {}
-        self._wire, self._texts = wire, layouts or {}
+        self.topics = {topic.name: topic for topic in model.TOPICS}
+        self.older = {old.name: old for old in model.OLDER}
+        self.rules = model.RULES
+        self.always = frozenset(model.ALWAYS.split())
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
         """PX4's layouts by name, oldest first; the last one is the model's own."""
-        numbers = {name: number for number, name in (self._wire or {}).items()}
         found: dict[str, Layout] = {}
-        for name, text in self._texts.items():
-            try:
-                types = self.types if text == EVERY else self._types_of(text, found)
-            except (KeyError, ValueError) as exc:
-                raise LayoutError(f"layout {name} of {self.name}: {exc}: no field or layout is called so") from None
-            found[name] = Layout(name, numbers.get(name), types)
-        if not self._wire:
-            name = next(
-                (name for name, layout in found.items() if [*layout.types.items()] == [*self.types.items()]), ALL
-            )
-            found.pop(name, None)
-            found[name] = Layout(name, 0, self.types)
+        for layout in self.model.LAYOUTS:
+            found[layout.name] = replace(layout, types=self._types_of(layout.text, found))
+        if all(layout.wire is None for layout in found.values()):
+            fields = list(self.types.items())
+            own = next((layout for layout in found.values() if list(layout.types.items()) == fields), None)
+            own = replace(found.pop(own.name) if own else Layout(ALL, "*"), wire=0, types=self.types)
+            found[own.name] = own
         return found
 
     @cached_property
@@ -190,10 +171,10 @@ class Definition(Generic[M_co]):
     def meaning(self, name: str) -> str:
         """Return unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
-        return (field.description if field else self._older[name].doc if name in self._older else "") or ""
+        return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 
     def explain_unknown_field(self, name: str) -> str:
-        """Return what to say of a name that no field has: the names that may have been meant, if there are any."""
+        """Return the error text for a name that no field has, with the names that may have been meant."""
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
         schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
@@ -207,15 +188,17 @@ class Definition(Generic[M_co]):
         return attrgetter("DEFINITION"), (self.model,)
 
     def _types_of(self, text: str, before: Mapping[str, Layout]) -> Mapping[str, FieldType]:
-        """Parse the fields of a layout, or its changes: `1.13, without a b, c: d e` has d and e behind c."""
+        """Return the fields of a layout, given its text and the layouts before it."""
+        if text == "*":
+            return self.types
         base, *changes = (part.strip() for part in text.split(","))
         if not changes:
             return dict(map(self._field, text.split()))
         fields = list(before[base].types.items())
         for change in changes:
             if change.startswith("without "):
-                for gone in change.split()[1:]:
-                    fields.remove((gone, dict(fields)[gone]))
+                gone = change.split()[1:]
+                fields = [field for field in fields if field[0] not in gone]
             else:
                 after, _, names = change.partition(":")
                 place = [name for name, _ in fields].index(after) + 1
@@ -223,51 +206,65 @@ class Definition(Generic[M_co]):
         return dict(fields)
 
     def _field(self, text: str) -> tuple[str, FieldType]:
-        """Parse `name`, or `name:type` where the type is not the model's."""
+        """Return name and type of `name`, or of `name:type` where the type is not the model's."""
         name, _, kind = text.partition(":")
-        if kind:
-            return name, field_type(kind)
-        if name in self.types:
-            return name, self.types[name]
-        old = self._older[name]
-        base, index = old.new[0]
-        return name, old.type or (self.types[base] if index is None else FieldType(self.types[base].base))
+        if kind or name in self.types:
+            return name, field_type(kind) if kind else self.types[name]
+        old = self.older[name]
+        base, index = old.places[0]
+        return name, field_type(old.type or (str(self.types[base]) if index is None else self.types[base].base))
 
     def _down(self, name: str, kind: FieldType, values: Mapping[str, Any]) -> object:
         if self.types.get(name) is kind:
             return values[name]
         value = values.get(name, kind.absent)
-        if old := self._older.get(name):
-            base, index = old.new[0]
+        if old := self.older.get(name):
+            base, index = old.places[0]
             value = values[base] if index is None else values[base][index]
             value = old.down(value) if old.down else value
         least, greatest = kind.limits
         return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
-    def make_plan(self, names: Sequence[str]) -> Plan:
-        """Make what `plan` returns, and keeps."""
-        older = {name: self._older[name] for name in names if name in self._older}
-        direct: dict[str, str] = {name: name for name in names if name in self.types}
-        converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
-        parts: dict[str, list[str | None]] = {}
-        for name, old in older.items():
-            for base, index in old.new:
-                if base in direct or base in converted:
-                    continue
-                if index is not None:
-                    parts.setdefault(base, [None] * self.types[base].count)[index] = name
-                elif old.up:
-                    converted[base] = name, old.up
-                else:
-                    direct[base] = name
-        in_order = {name: direct[name] for name in self.types if name in direct}
-        return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
-
 
 @lru_cache(256)  # all messages of a stream have the same names
 def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
-    return definition.make_plan(names)
+    direct: dict[str, str] = {name: name for name in names if name in definition.types}
+    converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
+    parts: dict[str, list[str | None]] = {}
+    for old in (definition.older[name] for name in names if name in definition.older):
+        for base, index in old.places:
+            if base in direct or base in converted:
+                continue
+            if index is not None:
+                parts.setdefault(base, [None] * definition.types[base].count)[index] = old.name
+            elif old.up:
+                converted[base] = old.name, old.up
+            else:
+                direct[base] = old.name
+    in_order = {name: direct[name] for name in definition.types if name in direct}
+    return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:
     return tuple.__new__(definition.row, values)
+
+
+_messages: Final[dict[str, Definition[Any]]] = {}
+_topics: Final[dict[str, Topic]] = {}
+_by_topic: Final[dict[str, Definition[Any]]] = {}
+
+MESSAGES: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_messages)
+"""The definitions by name of the message: those with a file in `nedbus_msgs.messages`."""
+TOPICS: Final[Mapping[str, Topic]] = MappingProxyType(_topics)
+"""The topics of all messages by name."""
+BY_TOPIC: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_by_topic)
+"""The definition of the messages on each topic."""
+
+
+def register(definition: Definition[Any]) -> None:
+    """Make a message known; raise ValueError if another one has its name or one of its topics."""
+    if taken := [name for name in (definition.name, *definition.topics) if name in _messages or name in _topics]:
+        raise ValueError(f"{definition.name}: there is a message with {', '.join(taken)} already")
+    _messages[definition.name] = definition
+    for topic in definition.topics.values():
+        _topics[topic.name], _by_topic[topic.name] = topic, definition

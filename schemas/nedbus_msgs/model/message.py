@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from .definition import Definition
-from .px4_types import FieldType, Uint64
-from .registry import register
+from .declaration import Layout, Older, Topic
+from .definition import Definition, register
+from .px4_types import FieldType, Timestamp
+from .rules import Rule
 
 _M = TypeVar("_M", bound="Message")
-_PARTS: Final = ("LAYOUTS", "RULES", "WIRE", "OLDER", "ALIASES", "ALWAYS")
 _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
@@ -29,10 +29,17 @@ class Message(BaseModel):
     """
 
     model_config = ConfigDict(
-        frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings", defer_build=True, protected_namespaces=()
-    )
+        frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings", defer_build=True, protected_namespaces=(),
+        ignored_types=(int,),  # constants
+    )  # fmt: skip
+    TOPICS: ClassVar[Sequence[Topic]] = ()
+    LAYOUTS: ClassVar[Sequence[Layout]] = ()
+    OLDER: ClassVar[Sequence[Older]] = ()
+    RULES: ClassVar[Sequence[Rule]] = ()
+    ALWAYS: ClassVar[str] = "timestamp"
     DEFINITION: ClassVar[Definition[Any]]
-    timestamp: Uint64
+
+    timestamp: Timestamp = Field(description="Time since boot [us]")
 
     if not TYPE_CHECKING:
 
@@ -50,12 +57,10 @@ class Message(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Define the message, and make it known, if this class says what its topics are."""
+        """Define and register the message, if this class names its topics."""
         super().__pydantic_init_subclass__(**kwargs)
-        said = vars(cls)
-        if "TOPICS" in said:
-            parts = {name.lower(): said[name] for name in _PARTS if name in said}
-            cls.DEFINITION = Definition(cls, topics=said["TOPICS"], **parts)
+        if "TOPICS" in vars(cls):
+            cls.DEFINITION = Definition(cls)
             register(cls.DEFINITION)
 
     @model_validator(mode="wrap")

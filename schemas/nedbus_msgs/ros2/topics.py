@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from nedbus_msgs.model.registry import TOPICS
+from nedbus_msgs.model.definition import TOPICS
 from nedbus_msgs.topics import Address, get_topic
 
 _PX4_PATH: Final = ("fmu", "out")

@@ -9,9 +9,8 @@ from hashlib import sha256
 from typing import Any, Final
 
 from nedbus_msgs.model.declaration import Layout
-from nedbus_msgs.model.definition import Definition
+from nedbus_msgs.model.definition import MESSAGES, Definition
 from nedbus_msgs.model.px4_types import BASES, FieldType
-from nedbus_msgs.model.registry import MESSAGES
 
 PACKAGE: Final = "px4_msgs/msg"
 ARRAY: Final = 48  # of type_description_interfaces/msg/FieldType, for an array of fixed size
@@ -38,7 +37,7 @@ def ros2_types() -> Mapping[str, Definition[Any]]:
     """Return the message of each ROS 2 type that holds a known one; PX4's translation node has types of its own."""
     types = {ros2_type(definition): definition for definition in MESSAGES.values()}
     for definition in MESSAGES.values():
-        types |= {alias: definition for names in definition.aliases.values() for alias in names}
+        types |= {alias: definition for layout in definition.layouts.values() for alias in layout.aliases}
     return types
 
 
@@ -90,5 +89,5 @@ def _by_hash() -> Mapping[str, tuple[Definition[Any], Layout]]:
         hash_of(layout, name).removeprefix(_RIHS01): (definition, layout)
         for definition in MESSAGES.values()
         for layout in definition.layouts.values()
-        for name in (ros2_type(definition), *definition.aliases.get(layout.name, ()))
+        for name in (ros2_type(definition), *layout.aliases)
     }
