@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from nedbus_msgs import Definition, hash_of, ros2_type
-from nedbus_msgs.model.rules import FiniteWhile, NotLater, Rule, UnitQuaternion
+from nedbus_msgs.model.rules import FiniteWhile, NotLater, Rule
 
 from .markdown import section, table
 
@@ -59,7 +59,7 @@ def rows_of(rule: Rule) -> list[list[str]]:
         return [[names(fields), f"must be finite while `{flag}` is true"] for flag, fields in rule.flags.items()]
     if isinstance(rule, NotLater):
         return [[f"`{rule.fields[0]}`", f"must not be later than `{rule.fields[1]}`"]]
-    return [[names(rule.fields), getattr(rule, "reason", UnitQuaternion.reason)]]
+    return [[names(rule.fields), rule.reason]]
 
 
 def names(fields: Iterable[str]) -> str:

@@ -12,7 +12,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from .declaration import Layout, Older, Topic
 from .definition import Definition, register
 from .px4_types import FieldType, Timestamp
-from .rules import Rule
+from .rules import Rule, violations
 
 _M = TypeVar("_M", bound="Message")
 _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
@@ -88,7 +88,7 @@ class Message(BaseModel):
         except OverflowError:
             raise self._error(validation.overflows(values)) from None
         if not validation.passes_rules(row):
-            broken = list(validation.violations(values))
+            broken = list(violations(self.DEFINITION.rules, values))
             if broken:
                 raise self._error(broken)
         return self

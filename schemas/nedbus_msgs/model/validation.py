@@ -36,7 +36,7 @@ class Validation:
         names = tuple(types)
         self.passes_rules = passes_all(rules, lambda name: f"values[{names.index(name)}]")
         self.values_of = getter(names)
-        self._types, self._rules = types, rules
+        self._types = types
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
         tuples = core_schema.tuple_positional_schema([_schema(kind) for kind in types.values()])
         self._validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
@@ -110,11 +110,6 @@ class Validation:
             for number in values[name] if self._types[name].length else (values[name],):
                 if math.isfinite(number) and abs(number) > FLOAT32_MAX:
                     yield name, f"is beyond the range of float32 (+-{FLOAT32_MAX:.9g})"
-
-    def violations(self, values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
-        """Yield the field and the reason for every rule that the values of all fields violate."""
-        for rule in self._rules:
-            yield from rule.violations(values)
 
 
 def _schema(kind: FieldType) -> core_schema.CoreSchema:
