@@ -21,7 +21,6 @@ from nedbus_msgs.model.definition import Definition, M
 from nedbus_msgs.model.layouts import upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType
-from nedbus_msgs.model.rules import evaluated
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
@@ -86,11 +85,10 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
-    name_values, template_of_fields = validation.name, validation.template
+    name_values, template, flatten = validation.name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
     tags, tag_mask, packed = _forms(types, head)
     size, pack_flat = packed.size, packed.pack
-    flatten = _flattener([kind.length is not None for kind in types.values()])
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
 
     def pack(row: Values) -> bytes:
@@ -147,8 +145,8 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         row = decode_full_width(payload)
         if row is None:
             return decode_any(payload, newer)
-        values = template_of_fields.copy()
-        values.update(zip(template_of_fields, row, strict=True))
+        values = template.copy()
+        values.update(zip(template, row, strict=True))
         return fill(model.__new__(model), values, all_fields)
 
     def decode_row(payload: bytes, *, newer: Newer | None = None) -> M:  # for type checkers
@@ -183,15 +181,6 @@ def _describe(detail: ErrorDetails, definition: Definition[Any]) -> str:
     if detail["type"] == "extra_forbidden":
         text = definition.explain_unknown_field(str(detail["loc"][0]))
     return f"{text} (is {detail['input']!r:.40})"
-
-
-def _flattener(is_array: Sequence[bool]) -> Callable[[Values], Values]:
-    """Return a function that returns the values of a row with those of its arrays in their place."""
-    parts, start = [], 0
-    for index in [index for index, each in enumerate(is_array) if each]:
-        parts += [f"*row[{start}:{index}]", f"*row[{index}]"]
-        start = index + 1
-    return evaluated(f"lambda row: ({', '.join(parts)}, *row[{start}:])") if parts else tuple
 
 
 def _offsets(types: Mapping[str, FieldType], offset: int) -> Iterator[tuple[str, int, int]]:
