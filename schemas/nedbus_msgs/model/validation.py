@@ -30,7 +30,9 @@ class Validation:
     `passes_rules`: return whether the values of all fields, which have the right types, pass the rules.
     `template`: the names of all fields, for a copy that is filled: that takes less time than a dict that grows.
     `values_of`: return the values of all fields in their order from a mapping that has them.
-    `flatten`: return the values of a row with those of its arrays in their place, as struct packs them.
+    `validate`: return the values of all fields; raise pydantic.ValidationError for a wrong type.
+    `flatten`: return the values of a row with those of its arrays in their place, as struct packs them; `unflatten`
+    returns them as a row.
     """
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
@@ -44,14 +46,14 @@ class Validation:
         self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
         # Not the schema of the model: Pydantic takes 20 ms for all messages, in which it swallows a Ctrl-C.
         tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
-        self._validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
+        self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
         self._struct = struct.Struct("=" + "".join(f"{kind.count}{BASES[kind.base].code}" for kind in kinds))
-        self.flatten, self._unflatten = _flat_forms([kind.length for kind in kinds])
+        self.flatten, self.unflatten = _flat_forms([kind.length for kind in kinds])
 
     def check_row(self, values: Values) -> Values | None:
         """Return the values of all fields, validated but not rounded; None if the model has to decide."""
         try:
-            row: Values = self._validate(values)
+            row: Values = self.validate(values)
         except ValidationError:
             return None
         return row if self.passes_rules(row) else None
@@ -87,7 +89,7 @@ class Validation:
     def name_rounded(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name, float32 fields rounded; raise OverflowError beyond their range."""
         packed = self._struct.pack(*self.flatten(row))
-        return self.name(self._unflatten(self._struct.unpack(packed)))
+        return self.name(self.unflatten(self._struct.unpack(packed)))
 
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the field and the reason for every number that is beyond the range of its float32 field."""
