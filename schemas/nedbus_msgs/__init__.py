@@ -11,7 +11,7 @@ from .errors import (
     NedbusError,
     UnknownLayoutError,
 )
-from .flags import DOUBT_FLAGS, FLAGS, Flag, describe_flags, message_doubts
+from .flags import DOUBT_FLAGS, FLAG_FIELDS, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
     MapProjection,
@@ -36,6 +36,9 @@ from .functions import (
     decode,
     definition_of,
     encode,
+    json_schema_of,
+    layout_table_of,
+    schema_of,
 )
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
@@ -44,7 +47,6 @@ from .model.layouts import upgrade_fields, upgrade_with
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, field_type
 from .model.rules import UnitQuaternion
-from .model.schema import json_schema_of, layout_table_of, schema_of
 from .provenance import Provenance, encoding_of, message_name_of, provenance_of
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
@@ -70,9 +72,9 @@ from .topics import (
 from .undeclared import define
 
 __all__ = [
-    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAGS",
+    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAG_FIELDS",
     "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address", "AddressError", "Codec",
-    "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType", "Flag", "GlobalPosition",
+    "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType", "GlobalPosition",
     "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError", "NedbusError",
     "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion",
     "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",

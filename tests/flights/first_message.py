@@ -34,6 +34,7 @@ from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import Newer
+from nedbus_msgs.model.layouts import require_fields
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts
@@ -104,7 +105,10 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None, message: ty
 
     Raises LayoutError for other fields than the layout's, pydantic.ValidationError for an invalid message.
     """
-    return upgrade_with(definition_of(message), fields, layout)
+    definition = definition_of(message)
+    if layout is not None:
+        require_fields(definition, fields, definition.get_layout(layout))
+    return upgrade_with(definition, fields)
 
 
 def downgrade(message: Message, layout: str) -> dict[str, object]:

@@ -15,17 +15,14 @@ from .definition import Definition, M
 from .px4_types import NAN
 
 
-def upgrade_with(definition: Definition[M], fields: Mapping[str, object], layout: str | None = None) -> M:
+def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
     """Return the message with these fields of any PX4 release; arrays are tuples.
 
-    With the name of a layout, the fields must be exactly that layout's.
-    Without, all known fields are used, by their present name, and unknown names are ignored.
+    Known fields are used, by their present name, and unknown names are ignored.
     A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
 
-    Raises LayoutError for other fields than the layout's, pydantic.ValidationError for an invalid message.
+    Raises pydantic.ValidationError for an invalid message.
     """
-    if layout is not None:
-        require_fields(definition, fields, definition.get_layout(layout))
     return definition.model(**upgrade_fields(definition, fields))
 
 

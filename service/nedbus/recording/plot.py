@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from nedbus.errors import ConfigError, OutputError
 from nedbus.events import SEVERITIES, Event, Severity, spans_of
 from nedbus.whole_file import whole_file
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address
+from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import missing_of
@@ -51,7 +51,9 @@ _SHORTEST: Final = 60.0  # points of a text that is worth shortening
 MAX_STREAMS: Final = len(_COLORS)
 """The number of streams that one plot can show."""
 
-_FLAGS: Final = [flag for flag in FLAGS.values() if flag.kind == "estimate"]
+_FLAGS: Final = (  # of the estimate
+    "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
+)  # fmt: skip
 _HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
 _COUNTERS: Final = {
     "xy_reset_counter": "xy", "z_reset_counter": "z", "vxy_reset_counter": "vxy", "vz_reset_counter": "vz",
@@ -210,9 +212,9 @@ def _rows(stream: _Stream, suffix: str) -> Iterator[_Row]:
     """Yield a row for each flag of a stream, for each kind of reset that occurred, and for resets of heading."""
     missing = missing_of(stream.messages)
     for flag in _FLAGS:
-        if flag.name not in missing:
-            shown = _WARNING_COLOR if flag.inverted else stream.color
-            yield _Row(flag.name + suffix, shown, _intervals(stream.seconds, stream.messages[flag.name]), ())
+        if flag not in missing:
+            shown = _WARNING_COLOR if flag == "dead_reckoning" else stream.color
+            yield _Row(flag + suffix, shown, _intervals(stream.seconds, stream.messages[flag]), ())
     for counter, name in _COUNTERS.items():
         times = stream.resets(counter)
         if counter not in missing and (name == "heading" or len(times)):
@@ -338,7 +340,7 @@ def _width(text: Any) -> float:
 
 def _explain_missing(streams: Sequence[_Stream]) -> str:
     """Return the rows that are not drawn, as the flight does not have them."""
-    drawn = [flag.name for flag in _FLAGS] + list(_COUNTERS)
+    drawn = [*_FLAGS, *_COUNTERS]
     missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
     return "\n".join(f"{address} does not have {', '.join(names)}" for address, names in missing.items() if names)
 

@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
+from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address
 
 from .fields import SAID, sensors_of
 
@@ -214,7 +214,7 @@ class Vehicle:
                     fields |= self._recall(name, now)
                 # The flags are from an earlier message: these fields may have become NaN since.
                 for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
-                    values = cast("Iterator[float]", (fields[name] for name in FLAGS[flag].fields))
+                    values = cast("Iterator[float]", (fields[name] for name in FLAG_FIELDS[flag]))
                     if fields.get(flag) and not all(map(math.isfinite, values)):
                         fields[flag] = False
             case "vehicle_global_position":
