@@ -236,7 +236,8 @@ def test_what_is_made_from_the_files_is_up_to_date() -> None:
 THIRTEENTH = '''
 """WheelEncoders: how far the wheels of a rover turned."""
 
-from nedbus_msgs.model import Float32x2, Layout, Message, Topic, field
+from nedbus_msgs.model import Layout, Message, Topic
+from nedbus_msgs.model.px4_types import Float32x2, field
 
 
 class WheelEncoders(Message):

@@ -2,7 +2,8 @@
 
 from typing import ClassVar
 
-from nedbus_msgs.model import Bool, Float32, Float32x14, InRange, Layout, Message, Topic, Uint8, Uint16, Uint32, field
+from nedbus_msgs.model import InRange, Layout, Message, Topic
+from nedbus_msgs.model.px4_types import Bool, Float32, Float32x14, Uint8, Uint16, Uint32, field
 
 
 class BatteryStatus(Message):

@@ -1,6 +1,7 @@
 """EstimatorStatusFlags: what an estimator fuses, and which faults it sees."""
 
-from nedbus_msgs.model import Bool, Layout, Message, NotLater, Older, Topic, Uint32, Uint64, field
+from nedbus_msgs.model import Layout, Message, NotLater, Older, Topic
+from nedbus_msgs.model.px4_types import Bool, Uint32, Uint64, field
 
 
 class EstimatorStatusFlags(Message):

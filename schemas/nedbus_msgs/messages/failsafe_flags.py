@@ -1,6 +1,7 @@
 """FailsafeFlags: what a mode lacks, and what may trigger a failsafe."""
 
-from nedbus_msgs.model import Bool, Layout, Message, Older, Topic, Uint8, Uint32, field
+from nedbus_msgs.model import Layout, Message, Older, Topic
+from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, field
 
 
 class FailsafeFlags(Message):

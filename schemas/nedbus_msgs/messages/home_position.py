@@ -1,6 +1,7 @@
 """HomePosition: where the vehicle returns to."""
 
-from nedbus_msgs.model import Bool, FiniteWhile, Float32, Float64, Layout, Message, Topic, Uint32, Within, field
+from nedbus_msgs.model import FiniteWhile, Layout, Message, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field
 
 
 class HomePosition(Message):

@@ -2,25 +2,8 @@
 
 import math
 
-from nedbus_msgs.model import (
-    Bool,
-    FiniteWhile,
-    Float32,
-    Float64,
-    Int32,
-    Layout,
-    Message,
-    NotLater,
-    NotNegative,
-    Older,
-    Topic,
-    Uint8,
-    Uint16,
-    Uint32,
-    Uint64,
-    Within,
-    field,
-)
+from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Uint16, Uint32, Uint64, field
 
 
 def _integer(value: float, scale: float) -> int:

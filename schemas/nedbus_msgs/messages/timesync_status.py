@@ -1,6 +1,7 @@
 """TimesyncStatus: how far a companion's clock is from the vehicle's."""
 
-from nedbus_msgs.model import Int64, Layout, Message, Topic, Uint8, Uint32, Uint64, field
+from nedbus_msgs.model import Layout, Message, Topic
+from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64, field
 
 
 class TimesyncStatus(Message):

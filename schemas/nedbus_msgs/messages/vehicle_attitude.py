@@ -1,6 +1,7 @@
 """VehicleAttitude: where the vehicle's body points."""
 
-from nedbus_msgs.model import Float32x4, Layout, Message, NotLater, Topic, Uint8, Uint64, UnitQuaternion, field
+from nedbus_msgs.model import Layout, Message, NotLater, Topic, UnitQuaternion
+from nedbus_msgs.model.px4_types import Float32x4, Uint8, Uint64, field
 
 
 class VehicleAttitude(Message):

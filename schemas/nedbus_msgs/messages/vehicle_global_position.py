@@ -1,20 +1,7 @@
 """VehicleGlobalPosition: where the vehicle is on the globe."""
 
-from nedbus_msgs.model import (
-    Bool,
-    FiniteWhile,
-    Float32,
-    Float64,
-    Layout,
-    Message,
-    NotLater,
-    NotNegative,
-    Topic,
-    Uint8,
-    Uint64,
-    Within,
-    field,
-)
+from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field
 
 
 class VehicleGlobalPosition(Message):

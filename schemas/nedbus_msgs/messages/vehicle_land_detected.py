@@ -1,6 +1,7 @@
 """VehicleLandDetected: whether the vehicle is on the ground."""
 
-from nedbus_msgs.model import Bool, Layout, Message, Topic, field
+from nedbus_msgs.model import Layout, Message, Topic
+from nedbus_msgs.model.px4_types import Bool, field
 
 
 class VehicleLandDetected(Message):

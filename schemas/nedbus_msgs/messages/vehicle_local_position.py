@@ -7,25 +7,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.model import (
-    FLOAT32_PI,
-    Bool,
-    FiniteWhile,
-    Float32,
-    Float32x2,
-    Float64,
-    Layout,
-    Message,
-    NotLater,
-    NotNegative,
-    Older,
-    Timestamp,
-    Topic,
-    Uint8,
-    Uint64,
-    Within,
-    field,
-)
+from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Timestamp, Uint8, Uint64, field
 
 
 class VehicleLocalPosition(Message):

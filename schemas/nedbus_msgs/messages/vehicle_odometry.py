@@ -1,18 +1,7 @@
 """VehicleOdometry: pose and twist in one message."""
 
-from nedbus_msgs.model import (
-    Float32x3,
-    Float32x4,
-    Int8,
-    Layout,
-    Message,
-    Older,
-    Topic,
-    Uint8,
-    Uint64,
-    UnitQuaternion,
-    field,
-)
+from nedbus_msgs.model import Layout, Message, Older, Topic, UnitQuaternion
+from nedbus_msgs.model.px4_types import Float32x3, Float32x4, Int8, Uint8, Uint64, field
 
 
 class VehicleOdometry(Message):

@@ -1,6 +1,7 @@
 """VehicleStatus: armed or not, which mode, which failsafe."""
 
-from nedbus_msgs.model import Bool, Layout, Message, Older, Topic, Uint8, Uint16, Uint32, Uint64, field
+from nedbus_msgs.model import Layout, Message, Older, Topic
+from nedbus_msgs.model.px4_types import Bool, Uint8, Uint16, Uint32, Uint64, field
 
 
 class VehicleStatus(Message):
