@@ -48,12 +48,11 @@ class Address:
         chunks = key.removeprefix(prefix + "/").split("/")
         if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
-        instance = None
-        if len(chunks) == 3:
-            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", chunks[2]):
-                raise AddressError("instance", chunks[2], f"0 to {_INSTANCES - 1}")
-            instance = int(chunks[2])
-        return cls(chunks[0], chunks[1], instance)
+        vehicle, topic, *instances = chunks
+        for instance in instances:
+            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", instance):
+                raise AddressError("instance", instance, f"0 to {_INSTANCES - 1}")
+        return cls(vehicle, topic, *map(int, instances))
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
@@ -120,10 +119,9 @@ class Selection:
         """Return the Zenoh key expression that matches the keys of these addresses."""
         if self.topic == ANY:
             return f"{prefix}/{self.vehicle}/**"
-        key, instances = f"{prefix}/{self.vehicle}/{self.topic}", get_topic(self.topic).instances
-        if self.instance is not None:
-            return f"{key}/{self.instance}"
-        return {True: f"{key}/{ANY}", False: key, None: f"{key}/**"}[instances]
+        any_instance = {True: f"/{ANY}", False: "", None: "/**"}[get_topic(self.topic).instances]
+        instance = any_instance if self.instance is None else f"/{self.instance}"
+        return f"{prefix}/{self.vehicle}/{self.topic}{instance}"
 
     def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression that matches the liveliness tokens of these addresses."""
@@ -132,11 +130,6 @@ class Selection:
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of these streams, downsampled to `rate` messages a second; "*" is any rate."""
         return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
-
-
-def alive_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key expression for the liveliness tokens of all addresses."""
-    return f"{prefix}/*/@alive/**"
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:

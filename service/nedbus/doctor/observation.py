@@ -27,7 +27,7 @@ from nedbus.transport import (
     query,
     while_open,
 )
-from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, address_of_alive_key, alive_key_expr, codec_of
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
 
 T = TypeVar("T")
 
@@ -120,7 +120,7 @@ class Observation:
         self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
         self.services = _ask_services(session, prefix)
         self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        tokens = alive_keys(session, alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        tokens = alive_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
         self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
         tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)

@@ -10,7 +10,7 @@ from operator import attrgetter
 from typing import Final
 
 from nedbus.transport import AliveTokens, Session
-from nedbus_msgs import Address, AddressError, address_of_alive_key, alive_key_expr
+from nedbus_msgs import Address, AddressError, Selection, address_of_alive_key
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class VehicleDirectory:
         """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(self._session, alive_key_expr(prefix=self._prefix))
+                self._tokens = AliveTokens(self._session, Selection().alive_key_expr(prefix=self._prefix))
                 self._tokens.ask()
             self._take(self._tokens, timeout)
             while self._tokens.is_asking:
