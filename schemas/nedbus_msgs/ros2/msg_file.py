@@ -1,4 +1,4 @@
-"""PX4's .msg files: fields with their types, units, ranges and meanings, and what is wrong with a text that is none."""
+"""Parser of PX4's .msg files: fields with their types, units, ranges and meanings; errors have line and column."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def hash_of_msg(name: str, text: str) -> str:
     parts = _parts(text)
     described = {part: [_describe(line, parts) for line in lines] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines} & parts.keys())
-    return type_hash(f"{PACKAGE}/{name}", described[""], [(f"{PACKAGE}/{each}", described[each]) for each in used])
+    return type_hash(*((f"{PACKAGE}/{each or name}", described[each]) for each in ["", *used]))
 
 
 def bases_of_msg(text: str) -> set[str]:

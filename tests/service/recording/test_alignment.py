@@ -15,7 +15,7 @@ import nedbus
 from nedbus.errors import AddressError, ConfigError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
-from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP
 
 BOOT = 1_700_000_000_000_000  # us, of a vehicle in 2023
