@@ -205,7 +205,7 @@ class Arrays(Generic[M]):
 
 @cache
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
-    """Return what makes arrays of the messages of a definition."""
+    """Return the arrays of the messages of a definition."""
     return Arrays(definition)
 
 

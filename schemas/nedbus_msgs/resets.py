@@ -150,7 +150,7 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
 
 
 def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point | None:
-    """Return how far a fixed point moves in the local frame when its origin changes."""
+    """Return the move of a fixed point in the local frame as its origin changes."""
     if name == "z":
         step = message.ref_alt - last.ref_alt
         return (step,) if math.isfinite(step) else None

@@ -91,7 +91,7 @@ class Address:
 class Selection:
     """The addresses with this topic, vehicle and instance; "*" and None stand for any.
 
-    Raises AddressError for what no address has.
+    Raises AddressError for a vehicle, topic or instance that no address can have.
     """
 
     topic: str = ANY
@@ -171,7 +171,7 @@ def ack_key(key_expr: str) -> str:
 def get_topic(name: object) -> Topic:
     """Return a topic by its name; one that has no file here may be any other of PX4's, with instances or without.
 
-    Raises AddressError for what is not lower_snake_case, and for a misspelling of a topic that has a file here.
+    Raises AddressError for a name that is not lower_snake_case, and for a misspelling of a topic that has a file here.
     """
     if not isinstance(name, str):
         raise AddressError("topic", name, 'one name: several topics need a call each, or "*" where all are read')

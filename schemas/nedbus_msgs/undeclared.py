@@ -34,7 +34,7 @@ def define(
 
     `meanings` has unit and meaning of fields.
 
-    Raises ValueError for what cannot be a message: a name that is none, no timestamp, too many fields, too many bytes.
+    Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r:.100} is no name of a message: expected CamelCase of at most 64 characters")

@@ -122,9 +122,9 @@ def test_value_beyond_an_older_type_is_not_provided_there(
     """A valid message can be sent to any workspace: what its type there does not hold is 0."""
     definition = MESSAGES[name]
     message = definition.model(timestamp=1, **{field: value})
-    fields = definition.downgrade(message.__dict__, definition.get_layout(layout))
+    fields = definition.downgrade(message.__dict__, definition.layouts[layout])
     assert fields[older] == 0
-    assert encode_with(definition, fields, definition.get_layout(layout))
+    assert encode_with(definition, fields, definition.layouts[layout])
 
 
 @pytest.mark.parametrize(

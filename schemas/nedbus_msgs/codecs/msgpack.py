@@ -161,7 +161,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
 
 
 def _forms(types: Mapping[str, FieldType], head: bytes) -> tuple[int, int, struct.Struct]:
-    """Return the tags of a payload, the mask of what is no value, and the values as a struct."""
+    """Return the tags of a payload, the mask of the bits that are no values, and the values as a struct."""
     forms = [full_width(kind) for kind in types.values()]
     template = head + b"".join(tags for tags, _, _ in forms)
     value_mask = int.from_bytes(bytes(len(head)) + b"".join(values for _, _, values in forms), "big")

@@ -1,4 +1,4 @@
-"""EstimatorStatusFlags: what an estimator fuses, and which faults it sees."""
+"""EstimatorStatusFlags: sensors that an estimator fuses, and faults that it sees."""
 
 from nedbus_msgs.model import Layout, Message, NotLater, Older, Topic
 from nedbus_msgs.model.px4_types import Bool, Uint32, Uint64, field

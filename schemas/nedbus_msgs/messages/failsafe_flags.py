@@ -1,4 +1,4 @@
-"""FailsafeFlags: what a mode lacks, and what may trigger a failsafe."""
+"""FailsafeFlags: missing requirements of modes, and triggers of failsafes."""
 
 from nedbus_msgs.model import Layout, Message, Older, Topic
 from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, field

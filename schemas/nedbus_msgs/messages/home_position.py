@@ -1,4 +1,4 @@
-"""HomePosition: where the vehicle returns to."""
+"""HomePosition: the place that the vehicle returns to."""
 
 from nedbus_msgs.model import FiniteWhile, Layout, Message, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field

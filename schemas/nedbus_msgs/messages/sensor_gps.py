@@ -1,4 +1,4 @@
-"""SensorGps: what a GNSS receiver says."""
+"""SensorGps: output of a GNSS receiver."""
 
 import math
 

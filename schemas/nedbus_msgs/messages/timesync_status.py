@@ -1,4 +1,4 @@
-"""TimesyncStatus: how far a companion's clock is from the vehicle's."""
+"""TimesyncStatus: offset of a companion's clock to the vehicle's."""
 
 from nedbus_msgs.model import Layout, Message, Topic
 from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64, field

@@ -1,4 +1,4 @@
-"""VehicleAttitude: where the vehicle's body points."""
+"""VehicleAttitude: orientation of the vehicle's body."""
 
 from nedbus_msgs.model import Layout, Message, NotLater, Topic, UnitQuaternion
 from nedbus_msgs.model.px4_types import Float32x4, Uint8, Uint64, field

@@ -1,4 +1,4 @@
-"""VehicleGlobalPosition: where the vehicle is on the globe."""
+"""VehicleGlobalPosition: latitude, longitude and altitude of the vehicle."""
 
 from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field

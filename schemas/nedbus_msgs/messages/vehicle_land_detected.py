@@ -1,4 +1,4 @@
-"""VehicleLandDetected: whether the vehicle is on the ground."""
+"""VehicleLandDetected: on the ground or in the air."""
 
 from nedbus_msgs.model import Layout, Message, Topic
 from nedbus_msgs.model.px4_types import Bool, field

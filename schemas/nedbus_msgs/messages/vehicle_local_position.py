@@ -1,4 +1,4 @@
-"""VehicleLocalPosition: where a vehicle is, how fast it moves, and how well that is known.
+"""VehicleLocalPosition: position and velocity of a vehicle, and their accuracy.
 
 Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
 """

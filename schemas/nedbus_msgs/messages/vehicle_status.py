@@ -1,4 +1,4 @@
-"""VehicleStatus: armed or not, which mode, which failsafe."""
+"""VehicleStatus: arming, mode and failsafe."""
 
 from nedbus_msgs.model import Layout, Message, Older, Topic
 from nedbus_msgs.model.px4_types import Bool, Uint8, Uint16, Uint32, Uint64, field

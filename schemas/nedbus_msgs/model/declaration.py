@@ -11,8 +11,6 @@ from .px4_types import FieldType
 
 DEFAULT_TOPIC: Final = "vehicle_local_position"
 """The topic of a call that names none."""
-EVERY: Final = "*"
-"""In place of the fields of a layout: those of the model."""
 RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
 """The releases of PX4 whose layouts are known, oldest first."""
 ALL: Final = "all"

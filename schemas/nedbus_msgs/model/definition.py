@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
-
-from nedbus_msgs.errors import LayoutError
 
 from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
 from .px4_types import FieldType, field_type
@@ -123,13 +121,6 @@ class Definition(Generic[M_co]):
         places: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
         return type(f"{self.name}Row", (Row,), {**places, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
-    def get_layout(self, name: str) -> Layout:
-        """Return a layout by its name; raise LayoutError for an unknown one."""
-        try:
-            return self.layouts[name]
-        except KeyError:
-            raise LayoutError(f"unknown layout {name!r}: choose from {', '.join(self.layouts)}") from None
-
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout of a release of PX4, or that with this name; None for a message that it does not have."""
         if release in self.layouts or release not in RELEASES:
@@ -143,12 +134,12 @@ class Definition(Generic[M_co]):
         return next((layout for layout in self.layouts.values() if given == layout.types.keys()), None)
 
     @cached_property
-    def known_types(self) -> Mapping[str, frozenset[FieldType]]:
+    def known_types(self) -> Mapping[str, Set[FieldType]]:
         """The types that each field has, or had in an older layout."""
-        known = {name: frozenset({kind}) for name, kind in self.types.items()}
+        known: dict[str, set[FieldType]] = {}
         for layout in self.layouts.values():
             for name, kind in layout.types.items():
-                known[name] = known.get(name, frozenset()) | {kind}
+                known.setdefault(name, set()).add(kind)
         return known
 
     def recorded_layout(self, provided: frozenset[str]) -> Layout:
@@ -161,7 +152,7 @@ class Definition(Generic[M_co]):
         return next((layout for layout in self.layouts.values() if layout.types.keys() == provided), self.current)
 
     def plan(self, names: Iterable[str]) -> Plan:
-        """Return how these fields, of any PX4 release, become those of the model; unknown names are ignored."""
+        """Return the mapping of these fields, of any PX4 release, to the model; unknown names are ignored."""
         return _plan(self, tuple(names))
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:

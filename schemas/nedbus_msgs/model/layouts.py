@@ -38,7 +38,7 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
 
 
 def _converted(convert: Callable[[Any], Any], value: object) -> object:
-    """Return a converted value; what is no number stays as it is, for the model to reject."""
+    """Return a converted value; anything but a number stays as it is, for the model to reject."""
     try:
         return convert(value)
     except (TypeError, OverflowError):

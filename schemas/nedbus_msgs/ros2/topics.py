@@ -18,20 +18,16 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
     `px4_1/fmu/out/estimator_local_position_0` is namespace `px4_1` and instance 0.
     The `_v1` of a versioned topic is ignored.
 
-    Raises AddressError for a name that is none of PX4's.
+    Raises AddressError for another name than PX4's.
     """
     *path, name = topic.strip("/").split("/")
     if tuple(path[-2:]) == _PX4_PATH:
         path = path[:-2]
-    found = _TOPIC.fullmatch(name)
-    if name in TOPICS or found is None:
-        uorb, instance = name, None
-    else:
-        uorb, instance = found[1], None if found[2] is None else int(found[2])
-    instances = get_topic(uorb).instances
-    if instance is None and instances:
-        instance = 0
-    return "/".join(path), uorb, instance
+    found = None if name in TOPICS else _TOPIC.fullmatch(name)
+    uorb, number = found.groups() if found else (name, None)
+    if number is None and get_topic(uorb).instances:
+        number = 0
+    return "/".join(path), uorb, None if number is None else int(number)
 
 
 def ros2_topic_of(address: Address, namespace: str) -> str:
