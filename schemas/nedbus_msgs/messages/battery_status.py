@@ -29,13 +29,7 @@ class BatteryStatus(Message):
             design_capacity average_time_to_full, nominal_voltage: internal_resistance_estimate ocv_estimate
             ocv_estimate_filtered volt_based_soc_estimate voltage_prediction prediction_error
             estimation_covariance_norm"""),
-        Layout("1.17", """
-            timestamp connected voltage_v current_a current_average_a discharged_mah remaining scale
-            time_remaining_s temperature cell_count source priority capacity cycle_count average_time_to_empty
-            manufacture_date state_of_health max_error id interface_error voltage_cell_v max_cell_voltage_delta
-            is_powering_off is_required warning faults full_charge_capacity_wh remaining_capacity_wh
-            over_discharge_count nominal_voltage internal_resistance_estimate ocv_estimate ocv_estimate_filtered
-            volt_based_soc_estimate voltage_prediction prediction_error estimation_covariance_norm"""),
+        Layout("1.17", "1.16, without serial_number warning, is_required: warning"),
     )  # fmt: skip
     RULES = (InRange("remaining", 0.0, 1.0, or_=-1.0),)
 

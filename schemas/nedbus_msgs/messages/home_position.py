@@ -19,7 +19,7 @@ class HomePosition(Message):
         Layout("1.15", "1.13, manual_home: update_count"),
         Layout("1.17", "1.15, z: roll pitch"),
         Layout("main", "*"),
-    )  # fmt: skip
+    )
     RULES = (
         Within("lat", 90.0),
         Within("lon", 180.0),

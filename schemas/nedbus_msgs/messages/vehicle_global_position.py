@@ -20,11 +20,9 @@ class VehicleGlobalPosition(Message):
         Topic("estimator_global_position", 2.0, "each EKF instance, when several run", instances=True),
     )
     LAYOUTS = (
-        Layout("1.13", """
-            timestamp timestamp_sample lat lon alt alt_ellipsoid delta_alt lat_lon_reset_counter alt_reset_counter
-            eph epv terrain_alt terrain_alt_valid dead_reckoning"""),
+        Layout("1.13", "1.16, without lat_lon_valid alt_valid delta_terrain terrain_reset_counter"),
         Layout("1.16", "*"),
-    )  # fmt: skip
+    )
     RULES = (
         NotLater("timestamp_sample", "timestamp"),
         Within("lat", 90.0),

@@ -14,11 +14,9 @@ class VehicleLandDetected(Message):
 
     TOPICS = (Topic("vehicle_land_detected", 1.0, "the land detector", on_change=True),)
     LAYOUTS = (
-        Layout("1.13", """
-            timestamp freefall ground_contact maybe_landed landed in_ground_effect in_descend has_low_throttle
-            vertical_movement horizontal_movement close_to_ground_or_skipped_check at_rest"""),
+        Layout("1.13", "1.14, without rotational_movement"),
         Layout("1.14", "*"),
-    )  # fmt: skip
+    )
 
     freefall: Bool = field("The vehicle falls freely")
 

@@ -32,18 +32,15 @@ class VehicleLocalPosition(Message):
         Topic("estimator_local_position", 2.0, "each EKF instance, when several run", instances=True),
     )
     LAYOUTS = (
-        Layout("1.13", """
-            timestamp timestamp_sample xy_valid z_valid v_xy_valid v_z_valid x y z delta_xy xy_reset_counter delta_z
-            z_reset_counter vx vy vz z_deriv delta_vxy vxy_reset_counter delta_vz vz_reset_counter ax ay az heading
-            delta_heading heading_reset_counter heading_good_for_control xy_global z_global ref_timestamp ref_lat
-            ref_lon ref_alt dist_bottom dist_bottom_valid dist_bottom_sensor_bitfield eph epv evh evv vxy_max vz_max
-            hagl_min hagl_max"""),
-        Layout("1.14", "1.13, evv: dead_reckoning"),
-        Layout("1.15", "1.14, heading: heading_var unaided_heading, heading_good_for_control: tilt_var"),
-        Layout("V0", """
-            1.15, without dist_bottom, dist_bottom_valid: dist_bottom dist_bottom_var delta_dist_bottom
-            dist_bottom_reset_counter""", wire=0,
-            aliases=("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0")),
+        Layout("1.13", "1.14, without dead_reckoning"),
+        Layout("1.14", "1.15, without heading_var unaided_heading tilt_var"),
+        Layout("1.15", """
+            V0, without dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter,
+            ref_alt: dist_bottom"""),
+        Layout(
+            "V0", "1.16, without hagl_max_z hagl_max_xy, hagl_min: hagl_max", wire=0,
+            aliases=("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0"),
+        ),
         Layout("1.16", "*", wire=1),
     )  # fmt: skip
     ALWAYS = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"

@@ -26,9 +26,8 @@ class VehicleOdometry(Message):
     )
     LAYOUTS = (
         Layout("1.13", """
-            timestamp timestamp_sample local_frame:uint8 x:float32 y:float32 z:float32 q q_offset:float32[4]
-            pose_covariance:float32[21] velocity_frame vx:float32 vy:float32 vz:float32 rollspeed:float32
-            pitchspeed:float32 yawspeed:float32 velocity_covariance:float32[21] reset_counter"""),
+            timestamp timestamp_sample local_frame x y z q q_offset:float32[4] pose_covariance:float32[21]
+            velocity_frame vx vy vz rollspeed pitchspeed yawspeed velocity_covariance:float32[21] reset_counter"""),
         Layout("1.14", "*"),
     )  # fmt: skip
     OLDER = (

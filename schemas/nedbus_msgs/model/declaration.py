@@ -53,7 +53,7 @@ class Layout:
     """One layout.
 
     `name`: the first PX4 release with it.
-    `text`: the names of its fields, `*` for those of the model, or its changes to an older layout:
+    `text`: the names of its fields, `*` for those of the model, or its difference from another layout:
     `1.13, without a b, c: d e` lacks a and b, and has d and e behind c; `d:uint8` has a type that is not the model's.
     `wire`: its number in payloads, if it has one.
     `aliases`: names of ROS 2 types that hold it beside that of the message.

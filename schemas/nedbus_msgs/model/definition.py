@@ -90,9 +90,7 @@ class Definition(Generic[M_co]):
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
         """PX4's layouts by name, oldest first; the last one is the model's own."""
-        found: dict[str, Layout] = {}
-        for layout in self.model.LAYOUTS:
-            found[layout.name] = replace(layout, types=self._types_of(layout.text, found))
+        found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
         if all(layout.wire is None for layout in found.values()):
             fields = list(self.types.items())
             own = next((layout for layout in found.values() if list(layout.types.items()) == fields), None)
@@ -178,14 +176,14 @@ class Definition(Generic[M_co]):
     def __reduce__(self) -> tuple[object, ...]:
         return attrgetter("DEFINITION"), (self.model,)
 
-    def _types_of(self, text: str, before: Mapping[str, Layout]) -> Mapping[str, FieldType]:
-        """Return the fields of a layout, given its text and the layouts before it."""
-        if text == "*":
-            return self.types
+    def _types_of(self, text: str) -> Mapping[str, FieldType]:
+        """Return the fields of a layout, given its text."""
         base, *changes = (part.strip() for part in text.split(","))
-        if not changes:
-            return dict(map(self._field, text.split()))
-        fields = list(before[base].types.items())
+        same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
+        if same or base == "*":
+            fields = list((self._types_of(same.text) if same else self.types).items())
+        else:
+            fields = list(map(self._field, base.split()))
         for change in changes:
             if change.startswith("without "):
                 gone = change.split()[1:]
