@@ -14,7 +14,6 @@ from typing import Any, Final, Generic, cast
 
 import msgpack
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
 from nedbus_msgs.model.definition import Definition, M
@@ -171,16 +170,13 @@ def _forms(types: Mapping[str, FieldType], head: bytes) -> tuple[int, int, struc
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:
     """Return a validation error in one line: each field, the reason, and its value."""
-    return "; ".join(_describe(detail, definition) for detail in error.errors(include_url=False))
-
-
-def _describe(detail: ErrorDetails, definition: Definition[Any]) -> str:
-    text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
-    if detail["type"] == "missing":
-        return text
-    if detail["type"] == "extra_forbidden":
-        text = definition.explain_unknown_field(str(detail["loc"][0]))
-    return f"{text} (is {detail['input']!r:.40})"
+    reasons = []
+    for detail in error.errors(include_url=False):
+        reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+        if detail["type"] == "extra_forbidden":
+            reason = definition.explain_unknown_field(str(detail["loc"][0]))
+        reasons.append(reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})")
+    return "; ".join(reasons)
 
 
 def _offsets(types: Mapping[str, FieldType], offset: int) -> Iterator[tuple[str, int, int]]:
@@ -214,7 +210,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
     for name, value in zip(names, values, strict=True):
         # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
         parts = value if isinstance(value, tuple) else (value,)
-        if isinstance(value, tuple) and any(isinstance(part, tuple) for part in parts):
+        if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: an array within an array")
         if any(isinstance(part, str) for part in parts):  # which the model accepts as "NaN", from JSON
             raise reject(f"{name}: text, where msgpack has numbers and bools")
