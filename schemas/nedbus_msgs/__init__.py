@@ -42,8 +42,7 @@ from .functions import (
 )
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row
-from .model.layouts import upgrade_fields, upgrade_with
+from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, field_type
 from .model.rules import UnitQuaternion

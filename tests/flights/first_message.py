@@ -34,7 +34,7 @@ from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import Newer
-from nedbus_msgs.model.layouts import require_fields
+from nedbus_msgs.model.definition import require_fields
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts

@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError
 from nedbus_msgs.model.declaration import Layout
-from nedbus_msgs.model.definition import Definition
-from nedbus_msgs.model.layouts import require_fields
+from nedbus_msgs.model.definition import Definition, require_fields
 from nedbus_msgs.model.px4_types import BASES
 from nedbus_msgs.model.validation import Validation
 

@@ -16,8 +16,7 @@ import msgpack
 from pydantic import ValidationError
 
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
-from nedbus_msgs.model.definition import Definition, M
-from nedbus_msgs.model.layouts import upgrade_with
+from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType
 from nedbus_msgs.model.validation import Values
