@@ -28,7 +28,7 @@ class VehicleLocalPosition(Message):
     TOPICS = (
         Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
         Topic("vehicle_local_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
-        Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)", cache=2000),
+        Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)"),
         Topic("estimator_local_position", 2.0, "each EKF instance, when several run", instances=True),
     )
     LAYOUTS = (

@@ -30,7 +30,6 @@ class Topic:
     `instances`: it has uORB instances, one per EKF or sensor; None for a topic of which that is not known.
     `plain_first`: in ROS 2 the topic of its instance 0 has no number, as PX4 calls it by default.
     `priority`: on a congested link, messages of a higher one go first.
-    `cache`: messages that a publisher keeps for readers that missed some; 20 s at the nominal rate unless it is given.
     """
 
     name: str
@@ -40,12 +39,11 @@ class Topic:
     on_change: bool = False
     plain_first: bool = False
     priority: Literal["data", "data_high"] = "data"
-    cache: int = 0
 
     @property
     def kept(self) -> int:
-        """Number of messages that a publisher keeps."""
-        return self.cache or max(_MIN_CACHE, round(_CACHE_SECONDS * self.rate))
+        """Number of messages that a publisher keeps for readers that missed some: 20 s at the nominal rate."""
+        return max(_MIN_CACHE, round(_CACHE_SECONDS * self.rate))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
