@@ -7,7 +7,7 @@ Any other valid msgpack encoding of the array is decoded as well.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, Generic, cast
@@ -85,7 +85,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
     name_values, template, flatten = validation.name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
-    tags, tag_mask, packed = _forms(types, head)
+    tags, tag_mask, packed, offsets = _forms(types, head)
     size, pack_flat = packed.size, packed.pack
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
 
@@ -153,18 +153,25 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         return cast("M", new_row(make_row, values))
 
     return Codec(
-        definition, size, tags, tag_mask, tuple(_offsets(types, len(head))),
+        definition, size, tags, tag_mask, offsets,
         encode, encode_fields, encode_row, decode, decode_row,
     )  # fmt: skip
 
 
-def _forms(types: Mapping[str, FieldType], head: bytes) -> tuple[int, int, struct.Struct]:
-    """Return the tags of a payload, the mask of the bits that are no values, and the values as a struct."""
-    forms = [full_width(kind) for kind in types.values()]
-    template = head + b"".join(tags for tags, _, _ in forms)
-    value_mask = int.from_bytes(bytes(len(head)) + b"".join(values for _, _, values in forms), "big")
-    packed = struct.Struct(f">{len(head)}x" + "".join(form for _, form, _ in forms))
-    return int.from_bytes(template, "big"), ((1 << 8 * len(template)) - 1) ^ value_mask, packed
+def _forms(
+    types: Mapping[str, FieldType], head: bytes
+) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
+    """Return tags, mask of the bits that are no values, values as a struct, and the offset of each value."""
+    tags, values, code = head, bytes(len(head)), f">{len(head)}x"
+    offsets: list[tuple[str, int, int]] = []
+    for name, kind in types.items():
+        own_tags, own_code, own_values = full_width(kind)
+        tags, values, code = tags + own_tags, values + own_values, code + own_code
+        tag = int(kind.base != "bool")  # bytes of it beside a value
+        step = tag + kind.size
+        offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
+    mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
+    return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
 
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:
@@ -176,15 +183,6 @@ def describe(error: ValidationError, definition: Definition[Any]) -> str:
             reason = definition.explain_unknown_field(str(detail["loc"][0]))
         reasons.append(reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})")
     return "; ".join(reasons)
-
-
-def _offsets(types: Mapping[str, FieldType], offset: int) -> Iterator[tuple[str, int, int]]:
-    for name, kind in types.items():
-        _, _, bits = full_width(kind)
-        step = kind.size + (kind.base != "bool")
-        first = len(bits) - kind.count * step + (kind.base != "bool")
-        yield from ((name, part, offset + first + part * step) for part in range(kind.count))
-        offset += len(bits)
 
 
 def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) -> dict[str, object]:
