@@ -40,9 +40,8 @@ _COLUMNS_FROM: Final = 20
 """Messages from which checking the rules column by column is faster than one message after the other."""
 
 
-def numpy_type(kind: FieldType) -> Any:
-    """Return NumPy's type of a field."""
-    return np.dtype((BASES[kind.base].code, (kind.length,)) if kind.length else BASES[kind.base].code)
+def _numpy_type(kind: FieldType) -> Any:
+    return np.dtype((BASES[kind.base].code, kind.length or ()))
 
 
 class Arrays(Generic[M]):
@@ -54,7 +53,7 @@ class Arrays(Generic[M]):
     def __init__(self, definition: Definition[M]) -> None:
         types = definition.types
         self.definition = definition
-        self.dtype = np.dtype([(name, numpy_type(kind)) for name, kind in types.items()])
+        self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
         # The same bytes as the dtype, and a payload without its tags: one name for each value, also of arrays.
@@ -190,7 +189,7 @@ class Arrays(Generic[M]):
         return np.dtype(
             {
                 "names": list(layout.types),
-                "formats": [numpy_type(kind).newbyteorder("<") for kind in layout.types.values()],
+                "formats": [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()],
                 "offsets": list(cdr.offsets.values()),
                 "itemsize": len(cdr.zeros),
             }

@@ -169,7 +169,7 @@ def ack_key(key_expr: str) -> str:
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by its name; one that has no file here may be any other of PX4's, with instances or without.
+    """Return a topic by its name; one without a file here is taken for another one of PX4's.
 
     Raises AddressError for a name that is not lower_snake_case, and for a misspelling of a topic that has a file here.
     """

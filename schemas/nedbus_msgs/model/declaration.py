@@ -26,8 +26,8 @@ class Topic:
 
     `rate`: the nominal rate at which PX4 publishes or logs it [Hz], 0 where there is none.
     `doc`: its publisher.
-    `on_change`: PX4 sends it whenever it changes, and at `rate` otherwise: bursts and pauses are no faults.
-    `instances`: it has uORB instances, one per EKF or sensor; None for a topic of which that is not known.
+    `on_change`: PX4 sends it at each change, and at `rate` otherwise: bursts and pauses are no faults.
+    `instances`: it has uORB instances, one per EKF or sensor; None if that is not known.
     `plain_first`: in ROS 2 the topic of its instance 0 has no number, as PX4 calls it by default.
     `priority`: on a congested link, messages of a higher one go first.
     """

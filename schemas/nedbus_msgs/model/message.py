@@ -19,7 +19,7 @@ _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 class Message(BaseModel):
-    """One message of one vehicle: a subclass in a file of `nedbus_msgs.messages` says which fields it has.
+    """One message of one vehicle; a subclass in a file of `nedbus_msgs.messages` declares its fields.
 
     A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
     bit for bit as it was made; a number beyond float32 (1e39) is rejected.
@@ -66,7 +66,7 @@ class Message(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Validate, and where that fails once more with what NumPy and JSON have in place of Python's values."""
+        """Validate; if that fails, validate once more with values of NumPy and JSON converted to Python's."""
         try:
             return validate(fields)
         except ValidationError:
