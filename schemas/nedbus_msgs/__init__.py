@@ -49,7 +49,6 @@ from .model.rules import UnitQuaternion
 from .provenance import Provenance, encoding_of, message_name_of, provenance_of
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
-from .ros2.topics import ros2_topic_of, split_ros2_topic
 from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
 from .topics import (
     ANY,
@@ -63,7 +62,9 @@ from .topics import (
     check_vehicle,
     get_topic,
     rejected_key_expr,
+    ros2_topic_of,
     schema_key,
+    split_ros2_topic,
     status_key,
     vehicle_name,
 )

@@ -1,4 +1,4 @@
-"""Addresses and selections of streams, and their key expressions."""
+"""Addresses and selections of streams, their key expressions, and their topics in ROS 2."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ _SIMILAR: Final = 0.9  # of two names from which one is taken for a misspelling 
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
 _RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is downsampled
+_ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
+_PX4_PATH: Final = ("fmu", "out")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -188,6 +190,31 @@ def _other_topic(name: str) -> Topic:
     if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
         raise AddressError("topic", name, f"{' or '.join(meant)}, of which it looks like a misspelling")
     return Topic(name, 0.0, "another topic of PX4's", instances=None)
+
+
+def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
+    """Return the namespace, the uORB topic and the instance that the name of a ROS 2 topic stands for.
+
+    `px4_1/fmu/out/estimator_local_position_0` is namespace `px4_1` and instance 0.
+    The `_v1` of a versioned topic is ignored.
+
+    Raises AddressError for another name than PX4's.
+    """
+    *path, name = topic.strip("/").split("/")
+    if tuple(path[-2:]) == _PX4_PATH:
+        path = path[:-2]
+    found = None if name in TOPICS else _ROS2_TOPIC.fullmatch(name)
+    uorb, number = found.groups() if found else (name, None)
+    if number is None and get_topic(uorb).instances:
+        number = 0
+    return "/".join(path), uorb, None if number is None else int(number)
+
+
+def ros2_topic_of(address: Address, namespace: str) -> str:
+    """Return the name of an address's ROS 2 topic, without a leading slash; an empty namespace stands for none."""
+    plain = address.instance is None or (address.instance == 0 and get_topic(address.topic).plain_first)
+    topic = address.topic if plain else f"{address.topic}_{address.instance}"
+    return "/".join(filter(None, (namespace.strip("/"), *_PX4_PATH, topic)))
 
 
 def vehicle_name(vehicle: str | int) -> str:
