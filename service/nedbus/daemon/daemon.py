@@ -8,9 +8,11 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
-from typing import Final
+from functools import partial
+from typing import Final, Literal
 
 from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
@@ -22,8 +24,7 @@ from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_ro
 from nedbus_msgs import codec_of, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
-from .status import Role, SourceMeasures
-from .worker import Worker
+from .worker import SourceMeasures, Worker
 from .workers import Workers
 from .write_permission import WritePermission, watch_permission
 
@@ -48,7 +49,7 @@ class Daemon:
         self.started = time.time()
         self._stop = threading.Event()
         self._changed = threading.Event()
-        self._workers: Workers | None = None
+        self._workers = Workers()
         self._planning = threading.Lock()  # `run` starts what is planned, `reload` changes it
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
@@ -58,7 +59,7 @@ class Daemon:
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
         self.max_sessions: int | None = None  # of the embedded router, when it is open
         self.ready = threading.Event()
-        self.role: Role = "client" if settings.is_client else "router"
+        self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
         self._plan = self._make_plan(settings)
 
@@ -85,7 +86,7 @@ class Daemon:
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
         """The status of each source now."""
-        return tuple(worker.status for worker in self._list_workers())
+        return tuple(worker.status for worker in self._workers.workers)
 
     @property
     def refused(self) -> Mapping[str, bool]:
@@ -95,12 +96,12 @@ class Daemon:
     @property
     def measures(self) -> list[SourceMeasures]:
         """Measurements of each source, for metrics."""
-        return [worker.measures for worker in self._list_workers()]
+        return [worker.measures for worker in self._workers.workers]
 
     @property
     def busy(self) -> float:
         """For how long the loop of a source has not gone round, of the slowest one [s]: for a watchdog."""
-        return max((worker.busy for worker in self._list_workers()), default=0.0)
+        return max((worker.busy for worker in self._workers.workers), default=0.0)
 
     @property
     def sessions(self) -> int:
@@ -123,12 +124,14 @@ class Daemon:
         """Return what this service remembers of the last seconds, and the state of each vehicle now."""
         return report_of(self.look(), self.id, socket.gethostname(), time.time(), within=within)
 
-    def _answer_events(self, within: str) -> dict[str, object]:
-        try:
-            seconds = float(within)
-        except ValueError:
-            seconds = 0.0
-        return asdict(self.report(within=seconds))
+    def _answer(self, parameter: Callable[[str], str | None]) -> dict[str, object]:
+        """Return the status, or the account if the query asks for that."""
+        within = parameter(QUESTION)
+        if within is None:
+            return asdict(self.status)
+        with suppress(ValueError):
+            return asdict(self.report(within=float(within)))
+        return asdict(self.report())
 
     def newest(self) -> list[Sample]:
         """Return the last message of each address that was published."""
@@ -162,9 +165,9 @@ class Daemon:
         plan = self._make_plan(settings)
         with self._planning:
             self._settings, self._plan = settings, plan
-            if self._workers is None:
+            if self._registry is None:
                 return "nothing runs yet"
-            started, stopped, kept = self._workers.apply(plan)
+            started, stopped, kept = self._workers.apply(plan, partial(self._make_worker, self._registry))
         self._changed.set()
         return f"{started} started, {stopped} stopped, {kept} unchanged"
 
@@ -173,43 +176,23 @@ class Daemon:
 
         Raises ListenError when the embedded router cannot listen, ConfigError for a mistake in its file.
         """
-        if self.role == "client":
-            self._log_client()
-        session = self._open()
+        session = self._session = self._open()
         if session is None:
             return True
-        if self.role == "router":
-            self._log_router()
-        self._session = session
         settings, queries, housekeeping = self._settings, QueryServer(session), Housekeeping()
-        registry = self._registry = PublisherRegistry(
-            session, queries, housekeeping, prefix=self._settings.prefix, is_client=self.role == "client"
-        )
+        is_client = self.role == "client"
         try:
-            key = status_key(self.id, prefix=self._settings.prefix)
-            queries.answer_json(key, lambda: asdict(self.status), **{QUESTION: self._answer_events})
-            router = session if self.role == "router" else None
+            registry = PublisherRegistry(session, queries, housekeeping, prefix=settings.prefix, is_client=is_client)
+            queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
             with self._planning:
-                self._workers = Workers(
-                    lambda planned, clock: Worker(
-                        planned.text,
-                        planned.source,
-                        registry,
-                        router=router,
-                        clock=clock,
-                        account=self.account,
-                        retry=not settings.until_done,
-                        on_end=self._changed.set,
-                    )
-                )
-                self._workers.apply(self._plan)
+                self._registry = registry
+                self._workers.apply(self._plan, partial(self._make_worker, registry))
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
-            self._wait(registry, Uplinks(session, settings.connect, tls=settings.tls) if router else None)
+            self._wait(registry, None if is_client else Uplinks(session, settings.connect, tls=settings.tls))
         finally:
             self._stop.set()
-            if self._workers is not None:
-                self._workers.end(_GRACE)
+            self._workers.end(_GRACE)
             queries.close()
             housekeeping.close()
             session.close()
@@ -217,8 +200,15 @@ class Daemon:
                 self._permission.close()
         return not any(source.state == "failed" for source in self.sources)
 
-    def _list_workers(self) -> list[Worker]:
-        return self._workers.workers if self._workers is not None else []
+    def _make_worker(self, registry: PublisherRegistry, planned: Planned) -> Worker:
+        return Worker(
+            planned,
+            registry,
+            router=self._session if self.role == "router" else None,
+            account=self.account,
+            retry=not self.until_done,
+            on_end=self._changed.set,
+        )
 
     def _make_plan(self, settings: Settings) -> list[Planned]:
         """Return the sources of these settings, opened; raise ConfigError, with its place, for the first mistake."""
@@ -227,21 +217,10 @@ class Daemon:
             raise mistakes[0]
         return plan
 
-    def _log_client(self) -> None:
-        """Log whose client it is, and what made it one: NEDBUS_CONNECT may be set for scripts."""
-        setter = self._settings.set_by("connect")
-        hint = "" if setter == "connect" else f", as set by {setter}: it starts no router of its own without --listen"
-        _log.info("client of %s%s", ", ".join(self.endpoints), hint, extra=about("client"))
-
-    def _log_router(self) -> None:
-        connect = self._settings.connect
-        joining = f", joining {', '.join(connect)}" if connect else ""
-        _log.info("router on %s%s", ", ".join(self.endpoints), joining, extra=about("router"))
-
     def _open(self) -> Session | None:
-        """Open the session; a client waits for its router for as long as it takes."""
+        """Open the session; a client waits for its router for as long as it takes, None if it is stopped meanwhile."""
+        settings, endpoints = self._settings, ", ".join(self.endpoints)
         if self.role == "router":
-            settings = self._settings
             session = open_router(
                 listen=settings.listen,
                 connect=settings.connect,
@@ -249,11 +228,16 @@ class Daemon:
                 tls=settings.tls if settings.connect else None,
             )
             self.max_sessions = router_max_sessions(settings.router_config)
+            joining = f", joining {', '.join(settings.connect)}" if settings.connect else ""
+            _log.info("router on %s%s", endpoints, joining, extra=about("router"))
             return session
+        setter = settings.set_by("connect")  # NEDBUS_CONNECT may be set for scripts
+        hint = "" if setter == "connect" else f", as set by {setter}: it starts no router of its own without --listen"
+        _log.info("client of %s%s", endpoints, hint, extra=about("client"))
         logged = False
         while not self._stop.is_set():
             try:
-                return open_client(self.endpoints, timeout=1.0, tls=self._settings.tls, stop=self._stop)
+                return open_client(self.endpoints, timeout=1.0, tls=settings.tls, stop=self._stop)
             except ConnectError as exc:
                 if not logged:
                     _log.warning("%s; still trying", exc, extra=about("link-broken"))
@@ -265,7 +249,7 @@ class Daemon:
         watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
-                finite = [worker for worker in self._list_workers() if is_finite(worker.source)]
+                finite = [worker for worker in self._workers.workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # A reader that missed the very last message learns it from a heartbeat.
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)

@@ -22,7 +22,7 @@ from nedbus import SourceStatus, StreamHealth, StreamStatus
 from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
-from nedbus.daemon.status import State
+from nedbus.daemon.worker import State
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, metrics, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_metrics

@@ -7,7 +7,6 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
 from typing import Any, Final, cast
 
 import zenoh
@@ -23,7 +22,7 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
 from .publisher import FLUSH_TIMEOUT, Publisher
-from .query_server import JSON, Answer, QueryServer, Reply
+from .query_server import JSON, QueryServer, Reply
 from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
@@ -87,12 +86,12 @@ class PublisherRegistry:
             if definition.name not in self._described:
                 self._described.add(definition.name)
                 key = schema_key(definition.name, prefix=self.prefix)
-                self._queries.answer_json(key, partial(schema_of, definition))
+                self._queries.answer_json(key, lambda _: schema_of(definition))
             if not self._vehicles:
                 self._housekeeping.add(self.heartbeats.send_due)
             if vehicle not in self._vehicles:
                 self._vehicles.add(vehicle)
-                self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._last_messages, vehicle))
+                self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._reply, vehicle))
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -139,15 +138,16 @@ class PublisherRegistry:
             if not any(each.vehicle == address.vehicle for each in self._publishers):
                 self._matched.pop(address.vehicle).close()
 
-    def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
+    def _reply(self, vehicle: str, query: zenoh.Query) -> None:
+        """Reply with the last messages of a vehicle."""
         for publisher in self.publishers:
             is_asked = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
             if is_asked and publisher.last is not None:
                 payload, stamp, encoding = publisher.last
-                yield Answer(publisher.key, payload, encoding, stamp, LIVE)
+                query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
 
 
-def _weakly(last_messages: Callable[[str, zenoh.Query], Iterable[Answer]], vehicle: str) -> Reply:
-    """Return an answer that does not keep the registry, its publishers and their bus alive."""
-    method = weakref.WeakMethod(last_messages)
-    return lambda query: alive(vehicle, query) if (alive := method()) is not None else ()
+def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:
+    """Return a reply that does not keep the registry, its publishers and their bus alive."""
+    method = weakref.WeakMethod(reply)
+    return lambda query: alive(vehicle, query) if (alive := method()) is not None else None
