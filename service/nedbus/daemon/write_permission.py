@@ -10,7 +10,6 @@ import logging
 import random
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
@@ -62,15 +61,15 @@ class WritePermission:
         self._prefix = prefix
         self._vehicles = vehicles
         self._stop = threading.Event()
-        self._denials: Counter[str] = Counter()  # of each vehicle, one after the other
-        self._refused: dict[str, bool] = {}
+        self._denials: dict[str, int] = {}  # in a row, of each vehicle of which anything is known
         self._tries = 0
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
 
     @property
-    def refused(self) -> Mapping[str, bool]:
+    def refused(self) -> dict[str, bool]:
         """Answer of the router for each vehicle where it is known: true if access rules refuse it."""
-        return dict(self._refused)
+        known = self._denials.copy().items()
+        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
 
     def start(self) -> None:
         """Check from now on: when the link is another one, when a vehicle is new, and now and then."""
@@ -87,7 +86,7 @@ class WritePermission:
             now = time.monotonic()
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
-                self._denials.clear()
+                self._denials = {vehicle: _BELIEVED * refused for vehicle, refused in self.refused.items()}
                 self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
             elif vehicles - known[1]:
                 due = min(due, now + _FIRST[0])
@@ -103,10 +102,17 @@ class WritePermission:
         except NedbusError as exc:  # the link or the session has gone, or a file is being replaced
             _log.debug("whether the router takes what is published cannot be told: %s", exc)
             verdicts = {}
-        for gone in [*(self._refused.keys() | self._denials.keys()) - vehicles]:
-            self._refused.pop(gone, None)
-            del self._denials[gone]
-        self._note(verdicts)
+        before = self.refused
+        self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
+        for vehicle, verdict in verdicts.items():
+            number = self._denials.get(vehicle, 0)
+            if verdict == "allowed":
+                self._denials[vehicle] = 0
+            elif verdict == "denied":
+                self._denials[vehicle] = number + 1
+            elif not number:  # else the router was slow: rules do not change under a link
+                self._denials.pop(vehicle, None)
+        self._log_changes(before)
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
             return _CONFIRM
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
@@ -130,21 +136,9 @@ class WritePermission:
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
-    def _note(self, verdicts: Mapping[str, Verdict]) -> None:
-        """Take the verdicts of one look, and log what is new."""
-        before = {vehicle for vehicle, refused in self._refused.items() if refused}
-        for vehicle, verdict in verdicts.items():
-            if verdict == "allowed":
-                self._denials[vehicle] = 0
-                self._refused[vehicle] = False
-            elif verdict == "denied":
-                self._denials[vehicle] += 1
-                if self._denials[vehicle] >= _BELIEVED:
-                    self._refused[vehicle] = True
-            elif not self._denials[vehicle]:  # else the router was slow: rules do not change under a link
-                self._refused.pop(vehicle, None)
-        now = {vehicle for vehicle, refused in self._refused.items() if refused}
-        if new := now - before:
+    def _log_changes(self, before: Mapping[str, bool]) -> None:
+        now = self.refused
+        if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
                 "the router refuses %s: nothing of it reaches anybody; do its access rules name it, with the"
                 " certificate %s? ('nedbus pki rules', docs/security.md); still trying",
@@ -152,7 +146,7 @@ class WritePermission:
                 self._tls.certificate,
                 extra=about("refused"),
             )
-        if mended := {vehicle for vehicle in before - now if self._refused.get(vehicle) is False}:
+        if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
             _log.info("the router takes %s now: all is well again", _name(mended), extra=about("accepted"))
 
 
@@ -165,7 +159,6 @@ def _routers_of(session: Session) -> set[str]:
         return set()
 
 
-def _name(vehicles: set[str]) -> str:
-    names = sorted(vehicles)
-    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-    return f"vehicle {', '.join(names[:_MAX_NAMED])}{more}"
+def _name(vehicles: Sequence[str]) -> str:
+    more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
+    return f"vehicle {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"

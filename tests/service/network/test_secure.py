@@ -401,7 +401,7 @@ def look(permission: WritePermission) -> Mapping[str, bool]:
         (["denied"], (None, 1)),
         (["denied", "denied", "denied"], (True, 30)),
         (["denied", "denied", "allowed"], (False, 600)),
-        (["denied", "denied", "allowed", "denied"], (False, 1)),
+        (["denied", "denied", "allowed", "denied"], (None, 1)),
         (["denied", "unknown", "denied", "denied"], (True, 60)),
         (["denied", "denied", "denied", "unknown"], (True, 60)),
         (["denied", "denied", "denied", "allowed"], (False, 600)),
