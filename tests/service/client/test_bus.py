@@ -248,7 +248,7 @@ def test_status_that_grows_when_it_is_read_fills_no_memory(
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
-    assert "18 services are left out: their answers are too large" in caplog.messages
+    assert "18 answers are left out: they are too large" in caplog.messages
 
 
 def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
@@ -27,7 +26,6 @@ _log = logging.getLogger(__name__)
 
 _MAX_FIELDS: Final = 256  # of a layout
 _MAX_LAYOUTS: Final = 32  # of an answer; there are five
-_MAX_SCHEMAS: Final = 100  # answers on one message: of many publishers all know the same
 _MAX_TEXT: Final = 300  # characters of a key that are logged, and of a reason that are kept
 _MAX_ANSWER_BYTES: Final = 2**18
 _MAX_ACCOUNT_BYTES: Final = 2**20  # of an answer about a thousand vehicles
@@ -55,53 +53,29 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 def find_services(session: Session, *, prefix: str, timeout: float, service: str = ANY) -> list[ServiceStatus]:
     """Return the status of every nedbus service, or of one; answers that would fill the memory are left out."""
     answers = query(session, status_key(service, prefix=prefix), timeout=timeout)
-    found = [(str(raw.key_expr), parse_status(content)) for raw, content in _parse(_accept(answers))]
+    found = [(key, parse_status(content)) for key, content in _parse(answers)]
     return [replace(status, service=key.split("/")[-2]) for key, status in found if status is not None]
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
     """Return what services remember of the last seconds; what cannot be parsed, or is too large, is left out."""
-    selector = f"{status_key(ANY, prefix=prefix)}?{QUESTION}={within:g}"
-    answers = _accept(query(session, selector, timeout=timeout), limit=_MAX_ACCOUNT_BYTES)
+    answers = query(session, f"{status_key(ANY, prefix=prefix)}?{QUESTION}={within:g}", timeout=timeout)
     found = (from_json(content) for _, content in _parse(answers, limit=_MAX_ACCOUNT_BYTES))
     return [report for report in found if report is not None]
-
-
-def _accept(answers: Sequence[RawSample], *, limit: int = _MAX_ANSWER_BYTES) -> list[RawSample]:
-    """Return the answers that may be parsed, and log how many would fill the memory."""
-    accepted: list[RawSample] = []
-    room = _MAX_MEMORY
-    for raw in answers:
-        text = raw.payload.to_bytes()
-        # Memory when it is parsed, at most, about: measured with CPython 3.11.
-        size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
-        if len(text) <= limit and size <= room:
-            accepted.append(raw)
-            room -= size
-    if left_out := len(answers) - len(accepted):
-        _log.warning("%d services are left out: their answers are too large", left_out, extra=about("incomplete"))
-    return accepted
 
 
 def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
     """Ask publishers for the fields of all layouts of these messages; of different answers for one the first counts."""
     found: dict[str, dict[int, dict[str, str]]] = {}
     keys = [schema_key(name, prefix=prefix) for name in messages]
-    read: Counter[str] = Counter()
-
-    def is_early(raw: RawSample) -> bool:
-        read[str(raw.key_expr)] += 1
-        return read[str(raw.key_expr)] <= _MAX_SCHEMAS
-
-    for raw, content in _parse(filter(is_early, query(session, *keys, timeout=_SCHEMA_TIMEOUT, newest=False))):
-        name = str(raw.key_expr).rpartition("/")[2]
+    for key, content in _parse(query(session, *keys, timeout=_SCHEMA_TIMEOUT, newest=False)):
         layouts = content.get("layouts") if isinstance(content, dict) else None
         for layout in layouts[:_MAX_LAYOUTS] if isinstance(layouts, list) else ():
             with suppress(ValidationError):
                 parsed = _LAYOUT.validate_python(layout)
                 fields = {field.name: field.type for field in parsed.fields}
                 if len(fields) == len(parsed.fields):
-                    found.setdefault(name, {}).setdefault(parsed.wire, fields)
+                    found.setdefault(key.rpartition("/")[2], {}).setdefault(parsed.wire, fields)
     return found
 
 
@@ -153,16 +127,25 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
 
 
-def _parse(answers: Iterable[RawSample], *, limit: int = _MAX_ANSWER_BYTES) -> Iterator[tuple[RawSample, object]]:
-    """Yield answers with their content; the first that is not JSON is logged, as a peer may send any number."""
-    logged = False
+def _parse(answers: Iterable[RawSample], *, limit: int = _MAX_ANSWER_BYTES) -> Iterator[tuple[str, object]]:
+    """Yield key and content of the answers that are JSON and fit in memory; one line of the log tells of the others."""
+    room, too_large, invalid = _MAX_MEMORY, 0, ""
     for raw in answers:
-        if len(raw.payload) > limit:
+        key, text = str(raw.key_expr), raw.payload.to_bytes()
+        # Memory when it is parsed, at most, about: measured with CPython 3.11.
+        size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
+        if len(text) > limit or size > room:
+            too_large += 1
             continue
+        room -= size
         try:
-            yield raw, json.loads(raw.payload.to_bytes())
+            content = json.loads(text)
         except (ValueError, RecursionError):
-            if not logged:
-                key = str(raw.key_expr)[:_MAX_TEXT]
-                _log.warning("%r: an answer that is not JSON", key, extra=about("invalid", reason="no JSON"))
-            logged = True
+            invalid = invalid or key
+        else:
+            yield key, content
+    if too_large:
+        _log.warning("%d answers are left out: they are too large", too_large, extra=about("incomplete"))
+    if invalid:
+        extra = about("invalid", reason="no JSON")
+        _log.warning("%r: an answer that is not JSON", invalid[:_MAX_TEXT], extra=extra)
