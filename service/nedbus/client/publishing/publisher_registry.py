@@ -7,6 +7,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
 from typing import Any, Final, cast
 
 import zenoh
@@ -45,8 +46,7 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries, self._housekeeping = session, queries, housekeeping
         self._publishers: dict[Address, Publisher] = {}
-        self._vehicles: set[str] = set()  # whose queries are answered
-        self._described: set[str] = set()  # names of messages whose schema is answered
+        self._answered: set[str] = set()  # keys of schemas and of vehicles, whose queries are answered
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
         self._lock = threading.Lock()
 
@@ -83,15 +83,14 @@ class PublisherRegistry:
             publisher = self._publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
-            if definition.name not in self._described:
-                self._described.add(definition.name)
-                key = schema_key(definition.name, prefix=self.prefix)
-                self._queries.answer_json(key, lambda _: schema_of(definition))
-            if not self._vehicles:
+            if not self._answered:
                 self._housekeeping.add(self.heartbeats.send_due)
-            if vehicle not in self._vehicles:
-                self._vehicles.add(vehicle)
-                self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._reply, vehicle))
+            schema, messages = schema_key(definition.name, prefix=self.prefix), f"{self.prefix}/{vehicle}/**"
+            if schema not in self._answered:
+                self._queries.answer_json(schema, lambda _: schema_of(definition))
+            if messages not in self._answered:
+                self._queries.answer(messages, _weakly(self._reply, vehicle))
+            self._answered |= {schema, messages}
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -110,13 +109,11 @@ class PublisherRegistry:
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether there is a subscriber for any of these addresses."""
-        probes = [self._session.declare_publisher(address.key(prefix=self.prefix)) for address in addresses]
-        try:
+        with ExitStack() as opened:
+            keys = (address.key(prefix=self.prefix) for address in addresses)
+            probes = [opened.enter_context(self._session.declare_publisher(key)) for key in keys]
             # Zenoh's stubs call the status a bool; it is an object, always true.
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
-        finally:
-            for probe in probes:
-                probe.undeclare()
 
     def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
         """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
