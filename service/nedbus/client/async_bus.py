@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from functools import partial, wraps
 from pathlib import Path
-from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
@@ -19,8 +19,6 @@ from .by_topic import by_topic_async, last_async
 from .publishing.publisher import Publisher
 from .sample import Mode, Sample
 from .subscription import AsyncSubscription
-
-_WAKE: Final = 1.0  # s after which a wait for a router looks for a Ctrl-C
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -122,14 +120,10 @@ class AsyncBus:
 
     async def __aenter__(self) -> Self:
         cancelled = threading.Event()
-        opening = asyncio.create_task(asyncio.to_thread(self._open_bus, cancelled))
         try:
-            while not opening.done():  # asyncio may sleep through a Ctrl-C that comes as it falls asleep: wake it
-                await asyncio.wait({opening}, timeout=_WAKE)
-            self._bus = opening.result()
+            self._bus = await asyncio.to_thread(self._open_bus, cancelled)
         except asyncio.CancelledError:
             cancelled.set()  # the thread would try on, and Python waits for it
-            opening.cancel()  # its result is not needed
             raise
         return self
 

@@ -50,9 +50,9 @@ class _Layout:
 _LAYOUT: Final = TypeAdapter(_Layout)
 
 
-def find_services(session: Session, *, prefix: str, timeout: float, service: str = ANY) -> list[ServiceStatus]:
-    """Return the status of every nedbus service, or of one; answers that would fill the memory are left out."""
-    answers = query(session, status_key(service, prefix=prefix), timeout=timeout)
+def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
+    """Return the status of every nedbus service; answers that would fill the memory are left out."""
+    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
     found = [(key, parse_status(content)) for key, content in _parse(answers)]
     return [replace(status, service=key.split("/")[-2]) for key, status in found if status is not None]
 
