@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -43,21 +43,22 @@ class Bus:
         self.prefix = prefix
         self.routers = tuple(routers)
         self._tls = tls
-        self._session = session
+        self._zenoh = session
         self._housekeeping = Housekeeping()
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(session, prefix=prefix)
+        self._directory = VehicleDirectory(prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
-        # In the reverse order: an open question for layouts ends with the session.
-        closes = self._layouts.close, session.close, self._housekeeping.close, self._queries.close
-        self._finalizer = Finalizer(self, partial(_close, self._receivers, closes))
+        closing = ExitStack()  # the last one first; an open query for layouts ends with the session
+        for close in (self._layouts.close, session.close, self._housekeeping.close, self._queries.close):
+            closing.callback(close)
+        closing.callback(_close_all, self._receivers)
+        self._finalizer = Finalizer(self, closing.close)
 
     @property
     def connected(self) -> bool:
         """True while there is a link to a router."""
-        self._require_open()
         return bool(self._session.info.routers_zid())
 
     @by_topic
@@ -83,7 +84,6 @@ class Bus:
 
         Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
-        self._require_open()
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
@@ -103,7 +103,6 @@ class Bus:
         It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
         The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
-        self._require_open()
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
         samples: list[Sample[Any]] = []
@@ -124,22 +123,18 @@ class Bus:
 
         The first call asks, and waits at most `timeout` seconds; from then on the bus follows their liveliness tokens.
         """
-        self._require_open()
-        return self._directory.vehicles(timeout=timeout)
+        return self._directory.vehicles(self._session, timeout=timeout)
 
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service on this network, as it reports it."""
-        self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
         """Return what each nedbus service remembers of the last seconds: events, and the states of its vehicles."""
-        self._require_open()
         return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
         """Follow the reports of messages that services on this network reject from now on."""
-        self._require_open()
         return Rejections(self._session, prefix=self.prefix, owner=self)
 
     def publisher(
@@ -187,6 +182,11 @@ class Bus:
         else:
             self._finalizer.close_now()
 
+    @property
+    def _session(self) -> Session:
+        self._require_open()
+        return self._zenoh
+
     def _require_open(self) -> None:
         require_unforked()
         if not self._finalizer.alive:
@@ -202,7 +202,6 @@ class Bus:
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
-        self._require_open()
         session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
         receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
@@ -248,10 +247,7 @@ def connect_with(
     return Bus(session, routers=settings.routers, prefix=settings.prefix, tls=tls)
 
 
-def _close(receivers: Iterable[Receiver], closes: Iterable[Callable[[], object]]) -> None:
-    """Close the receivers, then the rest, the last first; if one fails, the others are closed as well."""
-    with ExitStack() as closing:
-        for close in closes:
-            closing.callback(close)
+def _close_all(receivers: Iterable[Receiver]) -> None:
+    with ExitStack() as closing:  # if one fails, the others are closed as well
         for receiver in list(receivers):
             closing.callback(receiver.close)

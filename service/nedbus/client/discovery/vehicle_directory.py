@@ -20,18 +20,17 @@ _POLL: Final = 0.002  # s between two looks for an answer
 class VehicleDirectory:
     """The addresses that are published, from the first query on."""
 
-    def __init__(self, session: Session, *, prefix: str) -> None:
-        self._session = session
+    def __init__(self, *, prefix: str) -> None:
         self._prefix = prefix
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by the key of the token
         self._tokens: AliveTokens | None = None
 
-    def vehicles(self, *, timeout: float) -> dict[str, list[Address]]:
+    def vehicles(self, session: Session, *, timeout: float) -> dict[str, list[Address]]:
         """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(self._session, alive_key_expr(prefix=self._prefix))
+                self._tokens = AliveTokens(session, alive_key_expr(prefix=self._prefix))
                 self._tokens.ask()
             self._take(self._tokens, timeout)
             while self._tokens.is_asking:
