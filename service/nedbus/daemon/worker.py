@@ -198,15 +198,17 @@ class Worker:
             failures += 1
 
     def _run_replay(self, source: ReplaySource) -> None:
-        run = source.open()
-        first = self._run is None
-        if self._run is None or self._run.summary != run.summary:
+        run, last = source.open(), self._run
+        if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             for warning in run.warnings:
                 _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
         self._run, self._done = run, 0
-        if source.wait and first:
-            self._wait_for_reader(run)
+        if source.wait and last is None:
+            self._state = "waiting"
+            _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
+            while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
+                pass
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=source.speed is None)
         self._set_state("running")
@@ -230,15 +232,10 @@ class Worker:
 
     def _listen(self, source: LiveSource) -> None:
         """Publish what a live source delivers; it yields None several times a second while nothing arrives."""
-        # Each is a generator.
-        with closing(
-            cast("Generator[SourceMessage | Rejection | Absence | None]", source.listen(self._router))
-        ) as items:
-            next_poll = float("-inf")
-            for number, item in enumerate(items):
-                self._turn = self._clock.now()
-                if not number:
-                    self._set_state("waiting")
+        with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # each is a generator
+            next_poll = 0.0
+            for item in items:
+                now = self._turn = self._clock.now()
                 if self._clock.stopped:
                     return
                 if isinstance(item, Rejection):
@@ -248,20 +245,13 @@ class Worker:
                 elif item is not None:
                     self._output.publish_live(item)
                     self._set_state("running")
-                now = self._clock.now()
                 if now >= next_poll:
                     next_poll = now + _STALE_POLL
                     if not self._output.expire_stale():
                         self._set_state("waiting")
 
-    def _wait_for_reader(self, run: ReplayRun) -> None:
-        self._state = "waiting"
-        _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
-        while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
-            pass
-
     def _set_state(self, state: State) -> None:
-        if state == "waiting" and self._state in {"starting", "retrying"}:
+        if isinstance(self.source, LiveSource) and self._state in {"starting", "retrying"}:
             _log.info("%s: listening", self._name, extra=about("listening", source=self._name))
         self._state, self._error = state, None
 
@@ -269,7 +259,8 @@ class Worker:
         if not self._clock.stopped:
             self._state, self._error = state, reason
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
-            _log.info("%s: %s", self._name, text, extra=about(state, source=self._name, reason=reason))
+            event = "failed" if state == "failed" else "done"
+            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, reason: str) -> None:
         """Note the reason, and release all addresses: another source may need them meanwhile."""
