@@ -7,8 +7,15 @@ from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
-from .discovery.service_status import ServiceStatus, SourceStatus, StreamStatus
-from .discovery.services import RejectionReport, Rejections, find_accounts, find_services
+from .discovery import (
+    RejectionReport,
+    Rejections,
+    ServiceStatus,
+    SourceStatus,
+    StreamStatus,
+    find_accounts,
+    find_services,
+)
 from .health.stream_health import Health, Histogram, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
 from .housekeeping import Housekeeping

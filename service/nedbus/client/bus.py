@@ -18,9 +18,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
-from .discovery.service_status import ServiceStatus
-from .discovery.services import Rejections, find_accounts, find_schemas, find_services
-from .discovery.vehicle_directory import VehicleDirectory
+from .discovery import Rejections, ServiceStatus, VehicleDirectory, find_accounts, find_schemas, find_services
 from .housekeeping import Housekeeping
 from .protocol import LIVE
 from .publishing.publisher import Publisher

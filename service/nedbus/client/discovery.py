@@ -1,26 +1,39 @@
-"""Answers and reports of peers: status, accounts, layouts, rejected messages. Nothing of it is trusted."""
+"""Discovery of peers: vehicles, services and their status, layouts, rejected messages. No peer is trusted."""
 
 from __future__ import annotations
 
 import json
 import logging
+import threading
 import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from operator import attrgetter
 from typing import Annotated, Final
 
 import zenoh
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
+from pydantic_core import PydanticUseDefault
 
 from nedbus.client.closing import Finalizer
+from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas
 from nedbus.events import QUESTION, AccountReport, from_json
 from nedbus.log_event import about
-from nedbus.transport import RawSample, Session, query, while_open
-from nedbus_msgs import ANY, Address, AddressError, address_of_rejected_key, rejected_key_expr, schema_key, status_key
-
-from .service_status import ServiceStatus, parse_status
+from nedbus.transport import AliveTokens, RawSample, Session, query, while_open
+from nedbus_msgs import (
+    ANY,
+    Address,
+    AddressError,
+    address_of_alive_key,
+    address_of_rejected_key,
+    alive_key_expr,
+    rejected_key_expr,
+    schema_key,
+    status_key,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -33,6 +46,132 @@ _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed answers, about: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # that wait; beyond, the oldest are dropped
 _SCHEMA_TIMEOUT: Final = 2.0  # s: a publisher that is busy is not in time for less
+_POLL: Final = 0.002  # s between two polls for tokens
+
+
+class VehicleDirectory:
+    """The addresses that are published, from the first query on."""
+
+    def __init__(self, *, prefix: str) -> None:
+        self._prefix = prefix
+        self._lock = threading.Lock()
+        self._addresses: dict[str, Address] = {}  # by the key of the token
+        self._tokens: AliveTokens | None = None
+
+    def vehicles(self, session: Session, *, timeout: float) -> dict[str, list[Address]]:
+        """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
+        with self._lock:
+            if self._tokens is None:
+                self._tokens = AliveTokens(session, alive_key_expr(prefix=self._prefix))
+                self._tokens.ask()
+            self._take(self._tokens, timeout)
+            while self._tokens.is_asking:
+                time.sleep(_POLL)
+                self._take(self._tokens, timeout)
+            self._take(self._tokens, timeout)  # what the subscriber was told before the last answer
+            addresses = sorted(self._addresses.values())
+        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
+
+    def _take(self, tokens: AliveTokens, timeout: float) -> None:
+        for key, alive in tokens.take(timeout=timeout):
+            if not alive:
+                self._addresses.pop(key, None)
+                continue
+            try:
+                self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
+            except AddressError:
+                _log.debug("%r: a liveliness token that is not one of nedbus", key[:200])
+
+
+@dataclass(frozen=True, slots=True)
+class StreamStatus:
+    """The health of one stream that is published."""
+
+    address: str
+    health: Health
+
+
+class _FromPeer:
+    """Fields of an answer from the network: an invalid value becomes the default, and invalid rows are left out."""
+
+    __slots__ = ()
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _replace_invalid(cls, value: object, validate: ValidatorFunctionWrapHandler) -> object:
+        with suppress(ValidationError):
+            return validate(value)
+        rows: list[object] = []
+        for row in value if isinstance(value, list) else ():
+            with suppress(ValidationError):
+                rows.extend(validate([row]))
+        if not rows:
+            raise PydanticUseDefault
+        return tuple(rows)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceStatus(_FromPeer):
+    """The status of one source.
+
+    `state`: starting, waiting, running, retrying, done or failed; empty if the service does not say.
+    `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
+    `lost`: messages that were lost before they reached a live source, as far as it can count; `reboots` of vehicles.
+    `stale`: addresses that a live source published, until nothing arrived for 3 s.
+    `not_carried`: messages that vehicles publish and this source has no definition of; `silent`: addresses that they
+    announce, and of which nothing arrives while others do.
+    `rejections`: the number of messages that each rule rejected.
+    `retries`: restarts after a failure; `error`: the reason of the last failure.
+    `streams`: the health of each stream that is published, of up to 100 of them.
+    """
+
+    source: str = ""
+    state: str = ""
+    addresses: tuple[str, ...] = ()
+    stale: tuple[str, ...] = ()
+    published: int = 0
+    rejected: int = 0
+    rejections: dict[str, int] = field(default_factory=dict)
+    lost: int = 0
+    reboots: int = 0
+    done: int = 0
+    total: int | None = None
+    retries: int = 0
+    summary: str = ""
+    warnings: tuple[str, ...] = ()
+    error: str | None = None
+    streams: tuple[StreamStatus, ...] = ()
+    not_carried: tuple[str, ...] = ()
+    silent: tuple[str, ...] = ()
+
+    @property
+    def ended(self) -> bool:
+        """True once it will publish no more."""
+        return self.state in {"done", "failed"}
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceStatus(_FromPeer):
+    """The status of a service, from `bus.services()`.
+
+    `service` is its id; `host` the name of its host, or of its container; `role` "router" or "client".
+    Times are seconds since the epoch by its clock.
+    `refused`: vehicles that its router's access rules keep from all readers.
+    Of a peer's answer, which may be of any version, what is absent or invalid has its default.
+    """
+
+    service: str = ""
+    host: str = ""
+    version: str = ""
+    started: float = 0.0
+    now: float | None = None
+    role: str = ""
+    endpoints: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
+    sources: tuple[SourceStatus, ...] = ()
+
+
+_STATUS: Final = TypeAdapter(ServiceStatus)
 
 
 @dataclass(slots=True)
@@ -53,8 +192,11 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
     """Return the status of every nedbus service; answers that would fill the memory are left out."""
     answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
-    found = [(key, parse_status(content)) for key, content in _parse(answers)]
-    return [replace(status, service=key.split("/")[-2]) for key, status in found if status is not None]
+    return [
+        replace(_STATUS.validate_python(content), service=key.split("/")[-2])
+        for key, content in _parse(answers)
+        if isinstance(content, dict)
+    ]
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
