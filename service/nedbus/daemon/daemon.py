@@ -24,8 +24,7 @@ from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_ro
 from nedbus_msgs import codec_of, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
-from .worker import SourceMeasures, Worker
-from .workers import Workers
+from .worker import SourceMeasures, Worker, apply_plan, stop_workers
 from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
@@ -49,7 +48,7 @@ class Daemon:
         self.started = time.time()
         self._stop = threading.Event()
         self._changed = threading.Event()
-        self._workers = Workers()
+        self._workers: Sequence[Worker] = ()
         self._planning = threading.Lock()  # `run` starts what is planned, `reload` changes it
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
@@ -86,7 +85,7 @@ class Daemon:
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
         """The status of each source now."""
-        return tuple(worker.status for worker in self._workers.workers)
+        return tuple(worker.status for worker in self._workers)
 
     @property
     def refused(self) -> Mapping[str, bool]:
@@ -96,12 +95,12 @@ class Daemon:
     @property
     def measures(self) -> list[SourceMeasures]:
         """Measurements of each source, for metrics."""
-        return [worker.measures for worker in self._workers.workers]
+        return [worker.measures for worker in self._workers]
 
     @property
     def busy(self) -> float:
         """For how long the loop of a source has not gone round, of the slowest one [s]: for a watchdog."""
-        return max((worker.busy for worker in self._workers.workers), default=0.0)
+        return max((worker.busy for worker in self._workers), default=0.0)
 
     @property
     def sessions(self) -> int:
@@ -167,9 +166,11 @@ class Daemon:
             self._settings, self._plan = settings, plan
             if self._registry is None:
                 return "nothing runs yet"
-            started, stopped, kept = self._workers.apply(plan, partial(self._make_worker, self._registry))
+            before, make_worker = self._workers, partial(self._make_worker, self._registry)
+            self._workers = apply_plan(plan, before, make_worker)
         self._changed.set()
-        return f"{started} started, {stopped} stopped, {kept} unchanged"
+        kept = len(set(before).intersection(self._workers))
+        return f"{len(plan) - kept} started, {len(before) - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
         """Publish until done or stopped; return whether no source failed for good.
@@ -186,13 +187,13 @@ class Daemon:
             queries.answer_json(status_key(self.id, prefix=settings.prefix), self._answer)
             with self._planning:
                 self._registry = registry
-                self._workers.apply(self._plan, partial(self._make_worker, registry))
+                self._workers = apply_plan(self._plan, self._workers, partial(self._make_worker, registry))
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
             self._wait(registry, None if is_client else Uplinks(session, settings.connect, tls=settings.tls))
         finally:
             self._stop.set()
-            self._workers.end(_GRACE)
+            stop_workers(self._workers, _GRACE)
             queries.close()
             housekeeping.close()
             session.close()
@@ -249,7 +250,7 @@ class Daemon:
         watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
-                finite = [worker for worker in self._workers.workers if is_finite(worker.source)]
+                finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
                     # A reader that missed the very last message learns it from a heartbeat.
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from nedbus.errors import ConfigError
@@ -18,14 +18,10 @@ _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 class Planned:
     """A source as it is configured, `index` among others: after a reload one with this text and vehicle goes on."""
 
-    index: int
+    index: int = field(compare=False)
     text: str
     vehicle: str
-    source: Source
-
-    def is_same(self, other: Planned) -> bool:
-        """Return whether two plans ask for the same."""
-        return (self.text, self.vehicle) == (other.text, other.vehicle)
+    source: Source = field(compare=False)
 
 
 def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:

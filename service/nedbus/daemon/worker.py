@@ -1,11 +1,11 @@
-"""A worker runs one source: replays messages when they are due, or listens to a vehicle, and retries after failures."""
+"""Workers run the sources of a service: each replays messages when they are due, or listens to vehicles."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
@@ -27,6 +27,7 @@ _MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must 
 _MAX_DELAY: Final = 1.0  # s: a replay that is later than this goes on from where it is, and does not hurry
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
 _READER_POLL: Final = 0.05  # s between two checks for a reader
+_RETIRE_TIMEOUT: Final = 5.0  # s that a source which is gone from the configuration has to end
 _MAX_STREAMS: Final = 100  # in a status: it must fit a message
 
 _Item = SourceMessage | Rejection | Absence | None
@@ -151,7 +152,7 @@ class Worker:
         finally:
             self._on_end()
 
-    def stop(self, *, release: bool = False) -> None:
+    def stop(self, *, release: bool) -> None:
         """Stop the source; with `release` its thread then closes its publishers, which may wait for slow readers."""
         self._release = release
         self._clock.stop()
@@ -273,3 +274,33 @@ class Worker:
 
 def _describe(error: BaseException) -> str:
     return f"an unexpected {type(error).__name__}: {error}"
+
+
+def apply_plan(
+    plan: Iterable[Planned], workers: Sequence[Worker], make_worker: Callable[[Planned], Worker]
+) -> list[Worker]:
+    """Start new sources, stop removed ones, and return the workers of the plan in its order."""
+    left, ordered = list(workers), []
+    for planned in plan:
+        same = next((worker for worker in left if worker.planned == planned), None)
+        if same is not None:
+            left.remove(same)
+        ordered.append(same or make_worker(planned))
+    stop_workers(left, _RETIRE_TIMEOUT, release=True)
+    for worker in left:
+        if worker.thread.is_alive():  # giving an address back may take as long as its slowest reader
+            text = "%s: does not end, perhaps because of a slow reader; it goes on until then"
+            _log.warning(text, worker.text, extra=about("reload"))
+    for worker in ordered:  # new sources may need the addresses of those that are gone
+        if worker not in workers:
+            worker.thread.start()
+    return ordered
+
+
+def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:
+    """Stop these workers and wait up to `grace` seconds; `release` as in `Worker.stop`."""
+    for worker in workers:
+        worker.stop(release=release)
+    deadline = time.monotonic() + grace
+    for worker in workers:
+        worker.thread.join(max(0.0, deadline - time.monotonic()))
