@@ -17,7 +17,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, Selection, vehicle_name
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
 from .publishing.publisher import Publisher
-from .sample import Mode, Sample
+from .sample import Mode
 from .subscription import AsyncSubscription
 
 _P = ParamSpec("_P")
@@ -87,14 +87,7 @@ class AsyncBus:
         name = selection.key_expr(prefix=bus.prefix)
         return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue, name=name)
 
-    @last_async
-    async def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
-    ) -> list[Sample[Any]]:
-        """Return the last sample of each key as `Bus.latest` does."""
-        bus = self._blocking
-        return await asyncio.to_thread(bus.latest, topic, vehicle=vehicle, instance=instance, timeout=timeout)
-
+    latest = last_async(_awaited(Bus.latest))
     vehicles = _awaited(Bus.vehicles)
     services = _awaited(Bus.services)
     accounts = _awaited(Bus.accounts)
