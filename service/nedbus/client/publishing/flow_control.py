@@ -58,7 +58,6 @@ class ReaderTable:
     def __init__(self) -> None:
         self._there: set[str] = set()
         self.away: dict[str, float] = {}  # until when each is waited for
-        self._suspects: set[str] = set()  # readers that answered the last request, when an unknown one froze
 
     def note(self, answers: Mapping[str, bool], *, froze: bool, now: float) -> None:
         """Note all answers to one request: whether a reader is closed, by its id; `now` in seconds.
@@ -68,11 +67,8 @@ class ReaderTable:
         if answers.keys() - self._there - self.away.keys():
             self.away.pop(_UNKNOWN, None)
         gone, until = self._there - answers.keys(), now + (FROZEN_TIMEOUT if froze else RETURN_TIMEOUT)
-        if gone & self._suspects:  # it had answered, but not said that this was all
-            until = self.away.pop(_UNKNOWN, until)
-        self._suspects = set()
         if froze and not gone:
-            gone, self._suspects = {_UNKNOWN}, set(answers)
+            gone = {_UNKNOWN}
         self._there = {reader for reader, is_closed in answers.items() if not is_closed}
         self.away = {reader: end for reader, end in self.away.items() if end > now and reader not in answers}
         self.away |= dict.fromkeys(gone, until)
@@ -185,7 +181,7 @@ class FlowControl:
             self._readers.wait_for_link(now)
         self._request, self._ask_at = None, now
         if self._readers.away:
-            self._ask_at += 0.0 if froze else _AWAY_PAUSE  # at once, before the frozen reader can be back
+            self._ask_at += _AWAY_PAUSE
         else:
             self._acknowledged[request.read] = request.number
 
