@@ -76,9 +76,9 @@ class Bus:
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
         Either way `counts` has what was lost, dropped or invalid, and no other reader has to wait.
-        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for links that carry no
-        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is left
-        out here. What is left out is neither lost nor dropped.
+        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for slow links.
+        The publisher sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest not above; below 1 this reader thins them
+        further. Messages left out are neither lost nor dropped.
 
         Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
@@ -98,7 +98,7 @@ class Bus:
     ) -> list[Sample[Any]]:
         """Return the last sample of each key, sorted by address; `latency` is then its age.
 
-        It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
+        It waits for the answers of all publishers, at most `timeout` seconds; invalid messages are left out and logged.
         The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
@@ -128,7 +128,7 @@ class Bus:
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
-        """Return what each nedbus service remembers of the last seconds: events, and the states of its vehicles."""
+        """Return the account of each nedbus service: events of the last `within` seconds, states of vehicles."""
         return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
@@ -154,7 +154,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # the router that answers knows what was declared before
+        self._publishers.is_alive(address)  # a router that answers knows all earlier declarations
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

@@ -45,7 +45,7 @@ _MAX_ACCOUNT_BYTES: Final = 2**20  # of an answer about a thousand vehicles
 _MAX_REPORT_BYTES: Final = 2**16
 _MAX_MEMORY: Final = 2**28  # bytes of all parsed answers, about: JSON takes up to 32 times its length
 _MAX_REPORTS: Final = 1000  # that wait; beyond, the oldest are dropped
-_SCHEMA_TIMEOUT: Final = 2.0  # s: a publisher that is busy is not in time for less
+_SCHEMA_TIMEOUT: Final = 2.0  # s: time for a busy publisher to answer
 _POLL: Final = 0.002  # s between two polls for tokens
 
 
@@ -157,7 +157,7 @@ class ServiceStatus(_FromPeer):
     `service` is its id; `host` the name of its host, or of its container; `role` "router" or "client".
     Times are seconds since the epoch by its clock.
     `refused`: vehicles that its router's access rules keep from all readers.
-    Of a peer's answer, which may be of any version, what is absent or invalid has its default.
+    The answer of a peer may be of any version: absent and invalid fields have their defaults.
     """
 
     service: str = ""
@@ -200,7 +200,7 @@ def find_services(session: Session, *, prefix: str, timeout: float) -> list[Serv
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
-    """Return what services remember of the last seconds; what cannot be parsed, or is too large, is left out."""
+    """Return the accounts of services of the last `within` seconds; invalid or too large answers are left out."""
     answers = query(session, f"{status_key(ANY, prefix=prefix)}?{QUESTION}={within:g}", timeout=timeout)
     found = (from_json(content) for _, content in _parse(answers, limit=_MAX_ACCOUNT_BYTES))
     return [report for report in found if report is not None]

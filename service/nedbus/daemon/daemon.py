@@ -30,7 +30,7 @@ from .write_permission import WritePermission, watch_permission
 _log = logging.getLogger(__name__)
 
 _GRACE: Final = 1.0  # s that a source has to end
-_LOOK: Final = 1.0  # s between two looks at what is silent, and at the link
+_POLL: Final = 1.0  # s between two polls of silent streams and of the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
 
 
@@ -49,7 +49,7 @@ class Daemon:
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: Sequence[Worker] = ()
-        self._planning = threading.Lock()  # `run` starts what is planned, `reload` changes it
+        self._planning = threading.Lock()  # held while workers are started or stopped
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
@@ -89,7 +89,7 @@ class Daemon:
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """Answer of the router for each published vehicle where it is known: true if access rules refuse it."""
+        """The router's verdict on each published vehicle, where it is known: true if access rules refuse it."""
         return {} if self._permission is None else self._permission.refused
 
     @property
@@ -99,7 +99,7 @@ class Daemon:
 
     @property
     def busy(self) -> float:
-        """For how long the loop of a source has not gone round, of the slowest one [s]: for a watchdog."""
+        """Age of the longest turn of a source's loop [s]: for a watchdog."""
         return max((worker.busy for worker in self._workers), default=0.0)
 
     @property
@@ -108,7 +108,7 @@ class Daemon:
         return 0 if self._session is None else len(self._session.info.transports())
 
     def look(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
-        """Return the account of what happened, as it is now; `measures` of this moment, where they are known."""
+        """Update the account of events, and return it; `measures`: those of this moment, if they are known."""
         measured: dict[str, str] = {}
         for source in self.measures if measures is None else measures:
             measured |= source.states
@@ -120,7 +120,7 @@ class Daemon:
         return self.account
 
     def report(self, *, within: float = 0.0) -> AccountReport:
-        """Return what this service remembers of the last seconds, and the state of each vehicle now."""
+        """Return the events of the last `within` seconds, and the state of each vehicle now."""
         return report_of(self.look(), self.id, socket.gethostname(), time.time(), within=within)
 
     def _answer(self, parameter: Callable[[str], str | None]) -> dict[str, object]:
@@ -148,12 +148,12 @@ class Daemon:
         ]
 
     def stop(self) -> None:
-        """Ask it to end; callable from anywhere, a signal handler included."""
+        """Stop `run`; callable from any thread, and from signal handlers."""
         self._stop.set()
         self._changed.set()
 
     def reload(self, settings: Settings) -> str:
-        """Start sources that are new, stop those that are gone, leave all others alone; return what was done.
+        """Start new sources, stop removed ones, leave all others alone; return a summary for the log.
 
         Raises ConfigError, and changes nothing, for a source that is invalid, or another setting than source and
         vehicle that differs.
@@ -219,7 +219,7 @@ class Daemon:
         return plan
 
     def _open(self) -> Session | None:
-        """Open the session; a client waits for its router for as long as it takes, None if it is stopped meanwhile."""
+        """Open the session; a client waits for its router, and returns None if it is stopped meanwhile."""
         settings, endpoints = self._settings, ", ".join(self.endpoints)
         if self.role == "router":
             session = open_router(
@@ -246,7 +246,7 @@ class Daemon:
         return None
 
     def _wait(self, registry: PublisherRegistry, uplinks: Uplinks | None) -> None:
-        """Wait for `stop`, or for the end of all finite sources and for their readers to have all of it."""
+        """Wait for `stop`, or until all finite sources have ended and their readers have all messages."""
         watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
@@ -256,7 +256,7 @@ class Daemon:
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
-            self._changed.wait(UPLINK_POLL if watches else _LOOK)
+            self._changed.wait(UPLINK_POLL if watches else _POLL)
             self._changed.clear()
             self.look()
             if uplinks is not None:

@@ -1,4 +1,4 @@
-"""Plan of a service: the sources of its settings, opened, or all mistakes in them."""
+"""Plan of a service: the sources of its settings, opened, or the mistakes in them."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class Clock:
 
     @property
     def stopped(self) -> bool:
-        """True once the worker is to end."""
+        """True once the worker has to end."""
         return self._event.is_set()
 
 
@@ -88,7 +88,7 @@ class Worker:
         self.planned, self.source = planned, planned.source
         self.text = planned.text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
-        self._name = self.text.rstrip(":")  # as the log calls it
+        self._name = self.text.rstrip(":")  # in the log
         self._registry = registry
         self._router = router
         self._clock = clock or Clock()
@@ -99,12 +99,12 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._turn: float | None = None  # since when the loop is at one message; None while it may take any time
+        self._turn: float | None = None  # begin of the current turn; None while a turn may take any time
         self._release = False
 
     @property
     def busy(self) -> float:
-        """For how long its loop has not gone round [s]; 0 while it opens a source, or waits for what is due."""
+        """Age of the current turn of its loop [s]; 0 while it opens a source, or waits for a due message."""
         since = self._turn
         return 0.0 if since is None else self._clock.now() - since
 
@@ -146,7 +146,7 @@ class Worker:
         """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""
         try:
             self._run_until_done()
-        except BaseException as exc:  # noqa: BLE001 - a thread that ends must not look as if it ran
+        except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
             _log.exception("%s: an unexpected error ended it", self._name, extra=about("failed", source=self._name))
             self._state, self._error = "failed", _describe(exc)
         finally:
@@ -225,7 +225,9 @@ class Worker:
                     self._clock.wait(early)
             if self._clock.stopped:
                 return
-            self._turn = None if source.speed is None else self._clock.now()  # else it waits for its readers
+            self._turn = (
+                None if source.speed is None else self._clock.now()
+            )  # a lossless publisher waits for its readers
             self._output.publish(message)
             self._turn = None
             self._done += 1

@@ -1,7 +1,7 @@
-"""Write permission at the router: access rules drop what they do not allow, and tell its sender nothing.
+"""Write permission at the router: access rules drop messages without telling the sender.
 
-Only a service that shows a certificate is checked, as access rules go by it: with a second session for a moment, a few
-seconds after a link is up or a vehicle appears, and then seldom. Rules change when a router starts again.
+Only services with a certificate are checked, as access rules go by it: with a second session for a moment, soon after a
+link is up or a vehicle appears, and then rarely. Rules change when a router restarts.
 """
 
 from __future__ import annotations
@@ -22,10 +22,16 @@ from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, w
 _log = logging.getLogger(__name__)
 
 _FIRST: Final = (1.0, 5.0)  # s, drawn: the vehicles of a fleet come back together when their router does
-_CONFIRM: Final = 1.0  # s until a refusal is looked at again
-_BELIEVED: Final = 3  # refusals one after the other: a router that is slow, or starts again, is none
-_PAUSES: Final = (30.0, 60.0, 120.0, 300.0, 600.0)  # s until what is refused, or cannot be told, is looked at again
-_POLL: Final = 1.0  # s between two looks at the link
+_CONFIRM: Final = 1.0  # s until a denial is checked again
+_BELIEVED: Final = 3  # denials in a row that are a refusal: a slow or restarting router is none
+_PAUSES: Final = (
+    30.0,
+    60.0,
+    120.0,
+    300.0,
+    600.0,
+)  # s until a refused or unknown vehicle is checked again; the last also for allowed ones
+_POLL: Final = 1.0  # s between two polls of the link
 _OPEN: Final = 5.0  # s for a session
 _ARRIVED: Final = 3.0  # s for a message that is allowed
 _GRACE: Final = 5.0  # s to end
@@ -33,7 +39,7 @@ _MAX_NAMED: Final = 20  # vehicles in a line of the log
 
 
 def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
-    """Start to check what the router lets through, if that may depend on a certificate of ours."""
+    """Start the checks, if the service has a certificate that access rules may go by."""
     endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
     if settings.tls is None or settings.tls.certificate is None or not endpoints:
         return None
@@ -47,7 +53,7 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
 
 
 class WritePermission:
-    """Follow which of the vehicles that `vehicles` returns the router refuses, in a thread of its own.
+    """Check in a thread of its own whether the router refuses any of the vehicles that `vehicles` returns.
 
     `session` publishes them, as a client of one of the endpoints or as a router that joins them.
     """
@@ -67,12 +73,12 @@ class WritePermission:
 
     @property
     def refused(self) -> dict[str, bool]:
-        """Answer of the router for each vehicle where it is known: true if access rules refuse it."""
+        """The router's verdict on each vehicle, where it is known: true if access rules refuse it."""
         known = self._denials.copy().items()
         return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
 
     def start(self) -> None:
-        """Check from now on: when the link is another one, when a vehicle is new, and now and then."""
+        """Check when the link changes, when a vehicle is new, and rarely in between."""
         self._thread.start()
 
     def close(self) -> None:
@@ -95,12 +101,12 @@ class WritePermission:
                 due = now + self.check()
 
     def check(self) -> float:
-        """Look once, and return after how many seconds to look again."""
+        """Check once, and return the seconds until the next check."""
         vehicles = self._vehicles()
         try:
             verdicts = self._probe(vehicles)
         except NedbusError as exc:  # the link or the session has gone, or a file is being replaced
-            _log.debug("whether the router takes what is published cannot be told: %s", exc)
+            _log.debug("the write permission is unknown: %s", exc)
             verdicts = {}
         before = self.refused
         self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
@@ -121,7 +127,7 @@ class WritePermission:
         return pause
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
-        """Return what is known of each vehicle; nothing without a router to which both sessions have a link."""
+        """Return the verdict on each vehicle; none without a router to which both sessions have a link."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
@@ -132,7 +138,7 @@ class WritePermission:
                 if not (there := _routers_of(reader)) or not there <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=_ARRIVED)
-                # What did not arrive counts only where no link was broken meanwhile.
+                # A probe that did not arrive counts only if no link was broken meanwhile.
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
@@ -140,7 +146,7 @@ class WritePermission:
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
-                "the router refuses %s: nothing of it reaches anybody; do its access rules name it, with the"
+                "the router refuses %s: its messages reach no reader; do its access rules name it, with the"
                 " certificate %s? ('nedbus pki rules', docs/security.md); still trying",
                 _name(new),
                 self._tls.certificate,

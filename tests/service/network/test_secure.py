@@ -354,7 +354,7 @@ def test_refused_service_says_so_until_the_rules_are_mended(
     options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
     service = start_hasty(start, SOON, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
-    wait_for(lambda: "the router refuses vehicle 2: nothing of it reaches anybody" in service.err, what="the refusal")
+    wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
     assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
     assert json.loads(pages.ask("/status")[1])["refused"] == ["2"]

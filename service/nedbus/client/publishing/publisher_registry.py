@@ -28,8 +28,8 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-_TOKENS_TIMEOUT: Final = 2.0  # s for a router that is slow to say which publishers it knows; it takes milliseconds
-_FLUSH_LOOK: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
+_TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to list its publishers; it takes milliseconds
+_FLUSH_POLL: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 
 
 class PublisherRegistry:
@@ -70,7 +70,7 @@ class PublisherRegistry:
         """
         definition = definition or BY_TOPIC.get(address.topic)
         if definition is None:
-            expected = f"one of {', '.join(BY_TOPIC)}: nothing here says what its message is"
+            expected = f"one of {', '.join(BY_TOPIC)}: its message is not known here"
             raise AddressError("topic", address.topic, expected)
         with self._lock:
             if address in self._publishers:
@@ -98,7 +98,7 @@ class PublisherRegistry:
         return address in self._publishers
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
-        """Publish why a message of this address was rejected; what JSON cannot hold is written as text."""
+        """Report the rejection of a message of this address; values that JSON cannot hold become text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
@@ -116,11 +116,11 @@ class PublisherRegistry:
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
 
     def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
-        """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
+        """Wait until readers have all messages of these publishers, or `stop` is set; for 10 minutes at most."""
         end = time.monotonic() + FLUSH_TIMEOUT
         for publisher in publishers:
             address, logged = publisher.address, False
-            while not publisher.flush(_FLUSH_LOOK):
+            while not publisher.flush(_FLUSH_POLL):
                 if (stop and stop.is_set()) or time.monotonic() > end:
                     _log.warning("%s: a reader does not have all of it", address, extra=about("slow-reader", address))
                     return
