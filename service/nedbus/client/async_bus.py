@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial, wraps
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, Selection, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection, vehicle_name
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
@@ -24,12 +25,16 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-def _awaited(method: Callable[Concatenate[Any, _P], _T]) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _T]]:
-    """Return a method of the blocking twin for asyncio: it waits in a thread."""
+def _awaited(
+    method: Callable[Concatenate[Any, _P], _T], *, waits: Callable[[Any], bool] = lambda _: True
+) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _T]]:
+    """Return a method of the blocking twin for asyncio; it runs in a thread if it may wait."""
 
     @wraps(method)
     async def call(twin: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return await asyncio.to_thread(method, twin._blocking, *args, **kwargs)
+        if waits(twin):
+            return await asyncio.to_thread(method, twin._blocking, *args, **kwargs)
+        return method(twin._blocking, *args, **kwargs)
 
     return call
 
@@ -156,20 +161,8 @@ class AsyncPublisher:
         """Messages published so far."""
         return self._blocking.published
 
-    async def publish(self, message: Message | Mapping[str, object]) -> None:
-        """Validate a message, or the fields of one by name, and publish it, as `Publisher.publish` does."""
-        if self.lossless:
-            await asyncio.to_thread(self._blocking.publish, message)
-        else:
-            self._blocking.publish(message)
-
-    async def publish_row(self, values: Sequence[object] | Message) -> None:
-        """Validate the values of all fields in PX4's order, and publish them, as `Publisher.publish_row` does."""
-        if self.lossless:
-            await asyncio.to_thread(self._blocking.publish_row, values)
-        else:
-            self._blocking.publish_row(values)
-
+    publish = _awaited(Publisher.publish, waits=attrgetter("lossless"))
+    publish_row = _awaited(Publisher.publish_row, waits=attrgetter("lossless"))
     publish_many = _awaited(Publisher.publish_many)
     flush = _awaited(Publisher.flush)
     close = _awaited(Publisher.close)
