@@ -24,13 +24,8 @@ _log = logging.getLogger(__name__)
 _FIRST: Final = (1.0, 5.0)  # s, drawn: the vehicles of a fleet come back together when their router does
 _CONFIRM: Final = 1.0  # s until a denial is checked again
 _BELIEVED: Final = 3  # denials in a row that are a refusal: a slow or restarting router is none
-_PAUSES: Final = (
-    30.0,
-    60.0,
-    120.0,
-    300.0,
-    600.0,
-)  # s until a refused or unknown vehicle is checked again; the last also for allowed ones
+_UNSURE_PAUSE: Final = 60.0  # s until the next check while a vehicle is refused or unknown
+_PAUSE: Final = 600.0  # s until the next check when all are allowed
 _POLL: Final = 1.0  # s between two polls of the link
 _OPEN: Final = 5.0  # s for a session
 _ARRIVED: Final = 3.0  # s for a message that is allowed
@@ -68,7 +63,6 @@ class WritePermission:
         self._vehicles = vehicles
         self._stop = threading.Event()
         self._denials: dict[str, int] = {}  # in a row, of each vehicle of which anything is known
-        self._tries = 0
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
 
     @property
@@ -93,7 +87,7 @@ class WritePermission:
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
                 self._denials = {vehicle: _BELIEVED * refused for vehicle, refused in self.refused.items()}
-                self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
+                due = now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
             elif vehicles - known[1]:
                 due = min(due, now + _FIRST[0])
             known = routers, vehicles
@@ -122,9 +116,7 @@ class WritePermission:
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
             return _CONFIRM
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
-        pause = _PAUSES[-1 if is_well else min(self._tries, len(_PAUSES) - 1)]
-        self._tries += 1
-        return pause
+        return _PAUSE if is_well else _UNSURE_PAUSE
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
         """Return the verdict on each vehicle; none without a router to which both sessions have a link."""
