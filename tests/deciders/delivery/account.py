@@ -100,6 +100,10 @@ class QueueAccount(PendingQueue):
         with self._capacity:
             self.on_retransmission(request.handle, found, ended=True, now=self._now)
 
+    @property
+    def held(self) -> int:
+        return self._reader.account.held
+
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:
             found = self.pop_batch()

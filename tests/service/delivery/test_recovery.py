@@ -16,7 +16,7 @@ import zenoh
 import nedbus
 from nedbus import Counts
 from nedbus.client.housekeeping import Housekeeping
-from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
+from nedbus.client.receiving import Receiver, retransmission, stateful_reader, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
@@ -278,7 +278,7 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
 
 def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(pending_queue, "_MAX_HELD_OF_KEY", 50)
+    monkeypatch.setattr(stateful_reader, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
@@ -290,7 +290,10 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
-    wait_for(lambda: (lossy.queue.waiting, lossy.queue.held) == (10, 9), what="what comes before the hole and after it")
+    wait_for(
+        lambda: (lossy.queue.waiting, lossy.queue._reader.account.held) == (10, 9),
+        what="what comes before the hole and after it",
+    )
     asked_before = list(lossy.asked)
     assert lossy.receive(20) == list(range(20))
     assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])

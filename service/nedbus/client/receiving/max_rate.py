@@ -94,6 +94,7 @@ class MaxRateReceiver(Receiver):
         self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
         super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, downsampled=True)
+        self._undeclares.append(self._tokens.undeclare)
 
     def _keep_house(self, now: float) -> float:
         pause = super()._keep_house(now)
@@ -121,11 +122,6 @@ class MaxRateReceiver(Receiver):
         if missing := [key for key in due if key not in self._rate_queue.downsampled]:
             text = "%d streams that are not downsampled (by publisher, or access rules) do not arrive, such as %s"
             _log.warning(text, len(missing), missing[0], extra=about("unsupported"))
-
-    def _undeclare(self) -> None:
-        with suppress(zenoh.ZError):  # closed already with the session
-            self._tokens.undeclare()
-        super()._undeclare()
 
 
 def _sent(arrival: Arrival) -> float:

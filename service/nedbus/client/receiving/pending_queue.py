@@ -35,8 +35,6 @@ CAPACITY: Final = 65_536
 MAX_ACK_REQUESTS: Final = 1000
 """Acknowledgement requests that wait for an answer; an honest publisher has one for each key at a time."""
 
-_MAX_HELD: Final = 2 * CAPACITY  # messages behind gaps, some 90 MB,
-_MAX_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key, so that one key does not push out others
 _MAX_BATCH: Final = 4096  # messages of a batch
 _MAX_FRESH: Final = 1024  # samples that are queued with Zenoh's buffer; further ones are going to wait
 
@@ -74,10 +72,6 @@ class PendingQueue:
             raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         self.newest_only = mode == "latest"
         self.ended = False
-        self.idle = False
-        """Set by the receiver, while it waits and nothing is left to receive."""
-        self.drains = 0
-        """Number of times that all that had arrived was put."""
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
         """Called, in any thread, when there may be something to read: an event loop wakes its reader with it."""
@@ -106,11 +100,6 @@ class PendingQueue:
         return len(self._every) or len(self._newest)
 
     @property
-    def held(self) -> int:
-        """Messages that are held back behind a gap."""
-        return self._reader.account.held
-
-    @property
     def requesting(self) -> list[WriterProxy]:
         """Publishers of which something is missing."""
         with self._lock:
@@ -127,11 +116,10 @@ class PendingQueue:
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
-            missing = len(self._reader.requesting)
+            requesting = len(self._reader.requesting)
             self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
-            missing = len(self._reader.requesting) - missing
-            self.drains += not overflowed
-        if missing > 0 and self.on_gap is not None:
+            has_gap = len(self._reader.requesting) > requesting
+        if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does
             self._tokens.put(None)
@@ -150,40 +138,33 @@ class PendingQueue:
     def on_heartbeat(self, key: str, publisher: str, number: int, *, begins: bool) -> None:
         """Note that a publisher has sent a message that should have arrived by now; see StatefulReader."""
         with self._lock:
-            if len(self._reader.requesting) < MAX_KEYS:
-                self._reader.on_heartbeat(key, publisher, number, begins=begins)
+            self._reader.on_heartbeat(key, publisher, number, begins=begins)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
         """Return the numbers to ask a publisher for now; None if nothing is due."""
         with self._lock:
             return writer.next_request(now)
 
-    def on_retransmission(self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float) -> str:
-        """Queue what was recovered, and what waited for it; return a key of which there is something to read by that.
-
-        It takes the place of nothing that is queued: where there is no room for all, the oldest of it are dropped.
-        """
+    def on_retransmission(
+        self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
+    ) -> bool:
+        """Queue what was recovered, and what waited for it; return whether there is any."""
         arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
         with self._lock:
-            return self._recover(self._reader.on_retransmission(writer, arrivals, ended=ended, now=now))
-
-    def bound(self) -> str:
-        """Give up gaps for which too many messages are held back; return as `on_retransmission`."""
-        if self.held <= _MAX_HELD_OF_KEY:
-            return ""
-        with self._lock:
-            return self._recover(self._reader.give_up(_MAX_HELD, _MAX_HELD_OF_KEY))
+            delivered = self._reader.on_retransmission(writer, arrivals, ended=ended, now=now)
+            self._queue(delivered)
+        return bool(delivered)
 
     def give_up(self) -> None:
         """Give up all that is missing: it is lost."""
         with self._lock:
-            self._recover(self._reader.give_up(-1, -1))
+            self._queue(self._reader.give_up(-1))
 
-    def add(self, request: AckRequest) -> None:
+    def add(self, request: AckRequest, *, drained: bool) -> None:
         """Answer a publisher's request as soon as it can be answered."""
         with self._lock:
             self._ack_requests.append(request)
-        self.acknowledge(drained=self.idle)
+        self.acknowledge(drained=drained)
 
     def acknowledge(self, *, drained: bool) -> None:
         """Answer the requests that can be answered now.
@@ -295,27 +276,10 @@ class PendingQueue:
         every = self._every
         every.extend(map(self._decoder.keep, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
-            self._drop(every.popleft())
-
-    def _recover(self, arrivals: list[Arrival]) -> str:
-        beyond = min(len(arrivals), max(0, len(self._every) + len(arrivals) - CAPACITY))
-        self._arrived += beyond
-        for arrival in arrivals[:beyond]:
-            self._drop(arrival)
-        self._queue(arrivals[beyond:])
-        return arrivals[-1][0].heard if arrivals else ""
-
-    def _drop(self, arrival: Arrival) -> None:
-        stream, _, _, lost = arrival
-        self._dropped += 1
-        stream.unreported += lost
-        self._warn_once()
-
-    def _warn_once(self) -> None:
-        if not self._warned and not self.newest_only:
-            self._warned = True
-            extra = about("dropped")
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
+            stream, _, _, lost = every.popleft()
+            stream.unreported += lost
+            self._dropped += 1
+            self._warn_once()
 
     def _supersede(self, arrival: Arrival) -> None:
         stream, payload, raw, lost = arrival
@@ -327,3 +291,9 @@ class PendingQueue:
             self._dropped += 1
             return
         self._newest[stream.key] = arrival
+
+    def _warn_once(self) -> None:
+        if not self._warned and not self.newest_only:
+            self._warned = True
+            extra = about("dropped")
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)

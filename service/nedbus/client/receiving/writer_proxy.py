@@ -79,8 +79,8 @@ class WriterProxy:
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
-    def on_sample(self, number: int, arrival: Arrival, *, asks: bool, overflowed: bool = False) -> list[Arrival]:
-        """Take a message; with `asks` those that come after a gap are held back until it is filled.
+    def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> list[Arrival]:
+        """Take a message; with `recovers` those that come after a gap are held back until it is filled.
 
         `overflowed`: it comes from a ring that was full: what is absent was dropped there.
         """
@@ -91,7 +91,7 @@ class WriterProxy:
                 return []
             delivered = self.give_up()
             self.expected = number
-        elif step and (self.request is not None or asks) and self.expected + step < _LAST_NUMBER:
+        elif step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER:
             self._hold(number, arrival)
             self._extend_request(number + 1)
             return []
