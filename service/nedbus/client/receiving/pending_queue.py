@@ -173,9 +173,8 @@ class PendingQueue:
         """
         with self._lock:
             ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
-            if ready:
-                waiting = (request for request in self._ack_requests if request not in ready)
-                self._ack_requests = deque(waiting, MAX_ACK_REQUESTS)
+            for request in ready:
+                self._ack_requests.remove(request)
         for request in ready:
             request.reply()
 
@@ -194,14 +193,11 @@ class PendingQueue:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while not (self.waiting or self.ended):
+        if not (self.waiting or self.ended):
             try:
-                self._tokens.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
+                self._tokens.get(timeout=timeout)
             except queue.Empty:
                 return False
-            if timeout is None:
-                break
         if self.ended or self.waiting > 1:
             self.wake()  # another thread that waits: of all that is put at once only one is woken
         return True
