@@ -202,7 +202,7 @@ class PendingQueue:
             self.wake()  # another thread that waits: of all that is put at once only one is woken
         return True
 
-    def pop(self, *, rows: bool) -> Sample[Any] | None:
+    def pop(self, *, rows: bool = False) -> Sample[Any] | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take

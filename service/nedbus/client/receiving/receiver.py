@@ -127,7 +127,9 @@ class Receiver:
         if self._retransmission is not None:
             self._retransmission.close()
         self._queue.give_up()
-        self._undeclare()
+        for undeclare in self._undeclares:
+            with suppress(zenoh.ZError):  # closed already with the session
+                undeclare()
         if self._pump is not None:  # one that is inside Zenoh when the interpreter ends aborts the process
             self._pump.join(_JOIN_TIMEOUT)
         if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # nor may a reader be
@@ -143,11 +145,6 @@ class Receiver:
         self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
         self._retransmission = Retransmission(self._session, self._name, self._queue, begins=not self._downsampled)
         self._queue.on_gap = housekeeping.wake
-
-    def _undeclare(self) -> None:
-        for undeclare in self._undeclares:
-            with suppress(zenoh.ZError):  # closed already with the session
-                undeclare()
 
     def _run(self) -> None:
         try:

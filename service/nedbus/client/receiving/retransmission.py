@@ -103,8 +103,6 @@ class Retransmission:
         numbers = self._queue.next_request(writer, now)
         if numbers is None:
             return
-        try:
+        with suppress(NedbusError):  # the session is closed
             key = writer.stream.heard
             self._open[writer] = request_samples(self._session, key, writer.name, numbers, timeout=_REQUEST_TIMEOUT)
-        except NedbusError:  # the session is closed
-            self._queue.on_retransmission(writer, {}, ended=True, now=now)
