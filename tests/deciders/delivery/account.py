@@ -102,7 +102,7 @@ class QueueAccount(PendingQueue):
 
     @property
     def held(self) -> int:
-        return self._reader.account.held
+        return self._account.held
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:

@@ -291,7 +291,7 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
     wait_for(
-        lambda: (lossy.queue.waiting, lossy.queue._reader.account.held) == (10, 9),
+        lambda: (lossy.queue.waiting, lossy.queue._account.held) == (10, 9),
         what="what comes before the hole and after it",
     )
     asked_before = list(lossy.asked)

@@ -83,6 +83,7 @@ class PendingQueue:
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
+        self._account = self._reader.account
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
         self._arrived = self._dropped = self._received = 0
 
@@ -90,7 +91,7 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far."""
         with self._lock:
-            account = self._reader.account
+            account = self._account
             dropped = self._dropped + account.dropped
             return Counts(self._received, account.lost, dropped, self._decoder.invalid, account.discarded)
 
@@ -103,7 +104,7 @@ class PendingQueue:
     def requesting(self) -> list[WriterProxy]:
         """Publishers of which something is missing."""
         with self._lock:
-            return list(self._reader.requesting)
+            return list(self._account.requesting)
 
     def count_invalid(self, count: int) -> None:
         """Count samples that could not be queued."""
@@ -116,9 +117,9 @@ class PendingQueue:
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
-            requesting = len(self._reader.requesting)
+            requesting = len(self._account.requesting)
             self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
-            has_gap = len(self._reader.requesting) > requesting
+            has_gap = len(self._account.requesting) > requesting
         if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does
@@ -151,7 +152,7 @@ class PendingQueue:
         """Queue what was recovered, and what waited for it; return whether there is any."""
         arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
         with self._lock:
-            delivered = self._reader.on_retransmission(writer, arrivals, ended=ended, now=now)
+            delivered = writer.on_retransmission(arrivals, ended=ended, now=now)
             self._queue(delivered)
         return bool(delivered)
 

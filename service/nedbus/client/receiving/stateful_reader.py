@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
 from operator import itemgetter
 from typing import Final
@@ -24,7 +24,7 @@ _PAYLOAD: Final = itemgetter(1)
 
 
 class StatefulReader:
-    """Follow what arrives, publisher by publisher: `requesting` are those of which something is missing.
+    """Follow what arrives, publisher by publisher.
 
     With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
     Not thread-safe.
@@ -32,7 +32,6 @@ class StatefulReader:
 
     def __init__(self, decoder: Decoder, *, recovers: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self.account = Account()
-        self.requesting: dict[WriterProxy, None] = {}
         self.recovers = recovers
         self._decoder = decoder
         self._clock = clock
@@ -46,7 +45,7 @@ class StatefulReader:
     def on_link(self) -> None:
         """Note that a link broke or came back."""
         self._unsettled_until = self._clock() + _UNSETTLED
-        for writer in self.requesting:
+        for writer in self.account.requesting:
             writer.silent = False  # it could not answer, perhaps
 
     def on_samples(self, arrivals: list[Arrival], *, overflowed: bool) -> list[Arrival]:
@@ -72,7 +71,6 @@ class StatefulReader:
                 delivered.append(arrival)
             else:
                 delivered += writer.on_sample(number, arrival, recovers=recovers, overflowed=overflowed)
-                self._track(writer)
         if self.account.held > MAX_HELD:
             delivered += self.give_up(MAX_HELD)
         return delivered
@@ -85,28 +83,17 @@ class StatefulReader:
         with suppress(AddressError):
             stream = self._decoder.stream(key)
             writer = stream.writers.get(name)
-            if writer is None and (self.unsettled or begins) and len(self.requesting) < MAX_KEYS:
+            if writer is None and (self.unsettled or begins) and len(self.account.requesting) < MAX_KEYS:
                 writer = self._add_writer(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
             if writer is not None:
                 writer.on_heartbeat(number)
-                self._track(writer)
-
-    def on_retransmission(
-        self, writer: WriterProxy, found: Mapping[int, Arrival], *, ended: bool, now: float
-    ) -> list[Arrival]:
-        """Return what can be delivered after an answer to a publisher's retransmission request."""
-        delivered = writer.on_retransmission(found, ended=ended, now=now)
-        self.requesting.pop(writer, None)  # others come first
-        self._track(writer)
-        return delivered
 
     def give_up(self, max_held: int) -> list[Arrival]:
         """Give up gaps, those with most messages behind them first, until `max_held` are held back; -1 for all gaps."""
         delivered: list[Arrival] = []
-        for writer in sorted(self.requesting, key=lambda writer: -len(writer.held)):
+        for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
             if self.account.held > max_held:
                 delivered += writer.give_up()
-                self._track(writer)
         return delivered
 
     def has(self, key: str, name: str, number: int) -> bool | None:
@@ -154,9 +141,3 @@ class StatefulReader:
             del stream.writers[first.name]
         writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, uncertain=uncertain)
         return writer
-
-    def _track(self, writer: WriterProxy) -> None:
-        if writer.request is None:
-            self.requesting.pop(writer, None)
-        else:
-            self.requesting[writer] = None

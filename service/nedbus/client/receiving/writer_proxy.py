@@ -27,15 +27,17 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """Counts of the messages of all publishers of a reader that it did not receive.
+    """The messages of all publishers of a reader that it did not receive.
 
     `dropped`: by a ring that overflowed. `held`: that wait for those before them. `discarded`: duplicates, and late.
+    `requesting`: the publishers of which something is missing; the one that was asked last comes last.
     """
 
     lost: int = 0
     dropped: int = 0
     discarded: int = 0
     held: int = 0
+    requesting: dict[WriterProxy, None] = field(default_factory=dict)
 
 
 @dataclass(slots=True, eq=False)
@@ -119,6 +121,7 @@ class WriterProxy:
         if request.until is None:
             request.until = now if self.silent else now + RETRANSMIT_TIMEOUT
         request.tries += 1
+        self.account.requesting[self] = self.account.requesting.pop(self)
         request.asked = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
         return request.asked
 
@@ -178,6 +181,7 @@ class WriterProxy:
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
+            self.account.requesting[self] = None
         self.request.stop = max(self.request.stop, stop)
 
     def _count_missing(self, number: int, *, overflowed: bool = False) -> None:
@@ -216,4 +220,5 @@ class WriterProxy:
             request.until, request.tries = None, 0
         if self.expected >= request.stop:
             self.request = None
+            del self.account.requesting[self]
         return delivered
