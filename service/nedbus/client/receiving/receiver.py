@@ -148,7 +148,7 @@ class Receiver:
 
     def _run(self) -> None:
         try:
-            while not self._closed:
+            while not self._queue.ended:
                 if self._busy:
                     time.sleep(_BUSY_PAUSE)
                 with self._receiving:
