@@ -88,9 +88,9 @@ class QueueAccount(PendingQueue):
     def requests(self) -> list[Request]:
         with self._patience:
             self._now += 1.0
-            for writer in self.requesting:
+            for writer in list(self.account.requesting):
                 self.next_request(writer, self._now)
-        asked = [(writer, writer.request.asked) for writer in self.requesting if writer.request is not None]
+        asked = [(writer, writer.request.asked) for writer in self.account.requesting if writer.request is not None]
         return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
@@ -102,7 +102,7 @@ class QueueAccount(PendingQueue):
 
     @property
     def held(self) -> int:
-        return self._account.held
+        return self.account.held
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:

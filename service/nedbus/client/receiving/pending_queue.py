@@ -83,7 +83,7 @@ class PendingQueue:
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
-        self._account = self._reader.account
+        self.account = self._reader.account
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
         self._arrived = self._dropped = self._received = 0
 
@@ -91,20 +91,13 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far."""
         with self._lock:
-            account = self._account
-            dropped = self._dropped + account.dropped
+            account, dropped = self.account, self._dropped + self.account.dropped
             return Counts(self._received, account.lost, dropped, self._decoder.invalid, account.discarded)
 
     @property
     def waiting(self) -> int:
         """Messages that wait to be read."""
         return len(self._every) or len(self._newest)
-
-    @property
-    def requesting(self) -> list[WriterProxy]:
-        """Publishers of which something is missing."""
-        with self._lock:
-            return list(self._account.requesting)
 
     def count_invalid(self, count: int) -> None:
         """Count samples that could not be queued."""
@@ -117,9 +110,9 @@ class PendingQueue:
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
-            requesting = len(self._account.requesting)
+            requesting = len(self.account.requesting)
             self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
-            has_gap = len(self._account.requesting) > requesting
+            has_gap = len(self.account.requesting) > requesting
         if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does

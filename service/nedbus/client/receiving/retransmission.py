@@ -63,7 +63,7 @@ class Retransmission:
         filled = ""
         for writer, answers in list(self._open.items()):
             filled = self._take(writer, answers, now) or filled
-        requesting = self._queue.requesting
+        requesting = list(self._queue.account.requesting)  # at once: other threads add to them
         if self._queue.waiting <= _MAX_WAITING:
             for writer in requesting:
                 if len(self._open) >= _MAX_OPEN:
