@@ -106,7 +106,7 @@ class PendingQueue:
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue all that has arrived, in its order, wake the reader, and reject what is invalid.
 
-        `overflowed`: it comes from a ring that was full, and perhaps dropped something: nothing is asked for.
+        `overflowed`: it comes from a full ring, which perhaps dropped some: none of these are requested.
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
@@ -130,7 +130,7 @@ class PendingQueue:
             self._reader.on_link()
 
     def on_heartbeat(self, key: str, publisher: str, number: int, *, begins: bool) -> None:
-        """Note that a publisher has sent a message that should have arrived by now; see StatefulReader."""
+        """Note that a publisher has sent a message that should have arrived by now, as StatefulReader does."""
         with self._lock:
             self._reader.on_heartbeat(key, publisher, number, begins=begins)
 
@@ -150,7 +150,7 @@ class PendingQueue:
         return bool(delivered)
 
     def give_up(self) -> None:
-        """Give up all that is missing: it is lost."""
+        """Count all missing messages as lost."""
         with self._lock:
             self._queue(self._reader.give_up(-1))
 

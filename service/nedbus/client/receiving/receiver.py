@@ -160,9 +160,9 @@ class Receiver:
             self._queue.end()  # a reader must not wait for a pump that has ended
 
     def _receive(self, *, if_empty: bool = False) -> None:
-        """Wait for something, and queue all that is there; the queue ends with Zenoh's side.
+        """Wait for a sample, and queue all that have arrived; the queue ends with the subscriber.
 
-        `if_empty`: return at once if something is queued: from here on `_wake` ends the wait.
+        `if_empty`: return at once if there is something in the queue already; later `_wake` ends the wait.
         """
         handler = self._handler
         self._idle = True
@@ -239,7 +239,7 @@ class Receiver:
 
 
 def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
-    """Add all that is there to a batch, up to a full ring, and return it."""
+    """Add all that has arrived to a batch, up to a full ring, and return it."""
     try:
         while len(batch) < RING_CAPACITY and (item := handler.try_recv()) is not None:
             batch.append(item)

@@ -1,9 +1,8 @@
-"""Retransmission requests of a subscription of mode `every`: to each publisher by its exact key, and again.
+"""Retransmission requests of a subscription of mode `every`: to each publisher by its exact key, repeated for 20 s.
 
 Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
 all publishers: the restart of a router with 1,000 of them became a storm in which requests went unanswered. Here at
-most 64 are open, whatever there is to ask, and one without an answer is repeated for 20 s. Meanwhile only what comes
-after it from the same publisher waits.
+most 64 requests are open, and only later messages of the same publisher wait for the answer.
 """
 
 from __future__ import annotations
@@ -29,16 +28,14 @@ _MAX_OPEN_UNCERTAIN: Final = 16  # and of these for what a publisher sent before
 _MAX_OPEN_OF_KEY: Final = 4  # and for one key, whose publishers may leave them unanswered
 _MAX_WAITING: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
 _REQUEST_TIMEOUT: Final = 3.0  # s until a request is given up
-_HEARTBEAT_POLL: Final = 0.1  # s between two polls of heartbeats
+_POLL: Final = 0.1  # s between two polls of heartbeats, and of requests that are due
 _ANSWER_POLL: Final = 0.005  # s between two polls for answers
-_REQUEST_POLL: Final = 0.05  # s between two looks at what is due
-_IDLE_POLL: Final = 1.0  # s
 
 
 class Retransmission:
-    """Send the requests of a queue's publishers, and pass on their answers; a job of Housekeeping's thread.
+    """Send the requests for a queue's publishers, and pass on their answers; a job of Housekeeping's thread.
 
-    Heartbeats tell of the newest messages; one of a publisher that is new here is requested if the stream `begins` so.
+    `begins`: the newest message of an unknown publisher, known from its heartbeat, is requested as well.
     """
 
     def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue, *, begins: bool) -> None:
@@ -56,21 +53,20 @@ class Retransmission:
         `drained`: all that had arrived before this turn is queued.
         """
         if drained and now >= self._next_heartbeat_poll:  # else what the last ones tell of may be in the ring still
-            self._next_heartbeat_poll = now + _HEARTBEAT_POLL
+            self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._queue.on_heartbeat(key, publisher, number, begins=self._begins)
             self._heartbeats = self._take_heartbeats()
         filled = ""
         for writer, answers in list(self._open.items()):
             filled = self._take(writer, answers, now) or filled
-        requesting = list(self._queue.account.requesting)  # at once: other threads add to them
         if self._queue.waiting <= _MAX_WAITING:
-            for writer in requesting:
+            for writer in list(self._queue.account.requesting):  # a copy: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
                 if writer not in self._open and self._has_room(writer):
                     self._ask(writer, now)
-        return filled, _ANSWER_POLL if self._open else _REQUEST_POLL if requesting else _IDLE_POLL
+        return filled, _ANSWER_POLL if self._open else _POLL
 
     def close(self) -> None:
         """Drop all requests: a channel of answers that is not emptied would hold up the session."""

@@ -1,4 +1,4 @@
-"""All remote publishers that a subscription hears, and the one account of their messages. Pure, without I/O."""
+"""All remote publishers of a subscription, and the one account of their messages. Pure, without I/O."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ MAX_HELD: Final = 131_072
 """Messages that are held back behind gaps, some 90 MB; beyond, gaps are given up."""
 
 _MAX_WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
-_MIN_BATCH: Final = 8  # messages of one key for which a look at all of them together pays
+_MIN_BATCH: Final = 8  # messages from which on a check of all together pays
 _UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
 _PAYLOAD: Final = itemgetter(1)
 
 
 class StatefulReader:
-    """Follow what arrives, publisher by publisher.
+    """Put the messages of each publisher in order, and count those that are missing. Not thread-safe.
 
-    With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
-    Not thread-safe.
+    With `recovers`, messages after a gap are held back until it is filled; else the missing ones are lost.
     """
 
     def __init__(self, decoder: Decoder, *, recovers: bool, clock: Callable[[], float] = time.monotonic) -> None:
@@ -39,7 +38,7 @@ class StatefulReader:
 
     @property
     def unsettled(self) -> bool:
-        """True while there may be publishers that sent something, and are not known yet."""
+        """True while unknown publishers may have sent messages."""
         return self._clock() < self._unsettled_until
 
     def on_link(self) -> None:

@@ -44,10 +44,10 @@ class Account:
 class Request:
     """The retransmission request for what is missing of one publisher; times in monotonic seconds.
 
-    `stop`: one more than the newest number that is known to be sent. `asked`: what an open query is for.
+    `stop`: one more than the newest number that is known to be sent. `asked`: the numbers of the open query.
     `until`: when it is given up, unless something is delivered meanwhile. `kept_from`: the lowest number that was
-    answered; a publisher keeps all from there on. `answered`: it has sent the last of what was asked for. `witness`:
-    what it has to send once more, so that the lowest that was answered before, `confirmed`, is the lowest indeed.
+    answered; a publisher keeps all from there on. `answered`: the last of the numbers was answered. `witness`: the
+    number that it has to answer once more, to prove that `confirmed` is the lowest that it keeps.
     """
 
     stop: int
@@ -65,9 +65,9 @@ class Request:
 class WriterProxy:
     """One publisher on one key. Each `on_` method returns what can be delivered now, in order.
 
-    `name`: `zid` and `eid` in one, which are known from its first message on. `expected`: the number that comes next.
-    `uncertain`: below it numbers were perhaps not sent for this reader, until one is delivered. `silent`: it was asked
-    in vain, and is asked only once from then on. Not thread-safe.
+    `name`: `zid` and `eid` in one, which are known from its first message on. `expected`: the next number.
+    `uncertain`: until one is delivered, numbers below this were perhaps sent before this reader subscribed. `silent`:
+    it has not answered a request; it is asked only once from then on. Not thread-safe.
     """
 
     stream: KeyState
