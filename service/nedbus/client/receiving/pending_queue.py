@@ -61,12 +61,7 @@ class PendingQueue:
     """
 
     def __init__(
-        self,
-        mode: Mode,
-        decoder: Decoder,
-        *,
-        name: str = "",
-        clock: Callable[[], float] = time.monotonic,
+        self, mode: Mode, decoder: Decoder, *, name: str = "", clock: Callable[[], float] = time.monotonic
     ) -> None:
         if mode not in get_args(Mode):
             raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
@@ -225,7 +220,7 @@ class PendingQueue:
             with self._lock:
                 taken = self._take_batch()
                 lost = sum(lost for _, _, _, lost in taken)
-                for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
+                for stream in {stream for stream, _, _, _ in taken}:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._ack_requests:
                 self.acknowledge(drained=False)
