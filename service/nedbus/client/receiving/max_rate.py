@@ -93,8 +93,9 @@ class MaxRateReceiver(Receiver):
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
         self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
-        super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, downsampled=True)
+        super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, history=False)
         self._undeclares.append(self._tokens.undeclare)
+        self.pump()  # last messages pass by the ring, for which a reader would wait
 
     def _keep_house(self, now: float) -> float:
         pause = super()._keep_house(now)

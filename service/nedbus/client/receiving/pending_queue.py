@@ -124,10 +124,10 @@ class PendingQueue:
         with self._lock:
             self._reader.on_link()
 
-    def on_heartbeat(self, key: str, publisher: str, number: int, *, begins: bool) -> None:
-        """Note that a publisher has sent a message that should have arrived by now, as StatefulReader does."""
+    def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
+        """Note that a publisher has sent a message that should have arrived by now."""
         with self._lock:
-            self._reader.on_heartbeat(key, publisher, number, begins=begins)
+            self._reader.on_heartbeat(key, publisher, number)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
         """Return the numbers to ask a publisher for now; None if nothing is due."""

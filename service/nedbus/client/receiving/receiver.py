@@ -45,7 +45,7 @@ class Receiver:
     """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
 
     A subscriber of mode `every` requests retransmissions of publishers, and acknowledges their messages on request.
-    One of `downsampled` streams begins with what is published from now on.
+    With `history` it begins with the last message of each publisher.
     """
 
     def __init__(
@@ -55,12 +55,11 @@ class Receiver:
         pending_queue: PendingQueue,
         *,
         housekeeping: Housekeeping,
-        downsampled: bool = False,
+        history: bool = True,
     ) -> None:
         self._session = session
         self._queue = pending_queue
         self._name = key_expr
-        self._downsampled = downsampled
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # its holder empties the ring; a reader may keep it by a Ctrl-C
@@ -69,9 +68,9 @@ class Receiver:
         self._pump: threading.Thread | None = None
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
-        history = None if downsampled else zenoh.ext.HistoryConfig(max_samples=1)
+        last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with while_open():
-            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
@@ -96,7 +95,7 @@ class Receiver:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something in the queue; return False after `timeout` seconds."""
-        if timeout is not None or self._downsampled or self._pump is not None:  # last messages pass by the ring
+        if timeout is not None or self._pump is not None:
             self.pump()
             return self._queue.wait(timeout)
         if self._busy:
@@ -143,7 +142,7 @@ class Receiver:
             links = self._session.info.declare_transport_events_listener(events, history=False)
         self._undeclares += [queryable.undeclare, links.undeclare]
         self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
-        self._retransmission = Retransmission(self._session, self._name, self._queue, begins=not self._downsampled)
+        self._retransmission = Retransmission(self._session, self._name, self._queue)
         self._queue.on_gap = housekeeping.wake
 
     def _run(self) -> None:

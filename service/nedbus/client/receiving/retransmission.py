@@ -33,15 +33,11 @@ _ANSWER_POLL: Final = 0.005  # s between two polls for answers
 
 
 class Retransmission:
-    """Send the requests for a queue's publishers, and pass on their answers; a job of Housekeeping's thread.
+    """Send the requests for a queue's publishers, and pass on their answers; a job of Housekeeping's thread."""
 
-    `begins`: the newest message of an unknown publisher, known from its heartbeat, is requested as well.
-    """
-
-    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue, *, begins: bool) -> None:
+    def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
-        self._begins = begins
         self._open: dict[WriterProxy, RetransmitRequest] = {}
         self._take_heartbeats, self._undeclare = follow_heartbeats(session, key_expr)
         self._heartbeats: Heartbeats = {}  # of the last poll
@@ -55,7 +51,7 @@ class Retransmission:
         if drained and now >= self._next_heartbeat_poll:  # else what the last ones tell of may be in the ring still
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
-                self._queue.on_heartbeat(key, publisher, number, begins=self._begins)
+                self._queue.on_heartbeat(key, publisher, number)
             self._heartbeats = self._take_heartbeats()
         filled = ""
         for writer, answers in list(self._open.items()):

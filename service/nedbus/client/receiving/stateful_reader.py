@@ -74,15 +74,12 @@ class StatefulReader:
             delivered += self.give_up(MAX_HELD)
         return delivered
 
-    def on_heartbeat(self, key: str, name: str, number: int, *, begins: bool) -> None:
-        """Note that a publisher has sent a message that should have arrived by now.
-
-        `begins`: of a publisher that is new here this one is missing.
-        """
+    def on_heartbeat(self, key: str, name: str, number: int) -> None:
+        """Note that a publisher, perhaps an unknown one, has sent a message that should have arrived by now."""
         with suppress(AddressError):
             stream = self._decoder.stream(key)
             writer = stream.writers.get(name)
-            if writer is None and (self.unsettled or begins) and len(self.account.requesting) < MAX_KEYS:
+            if writer is None and len(self.account.requesting) < MAX_KEYS:
                 writer = self._add_writer(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
             if writer is not None:
                 writer.on_heartbeat(number)
