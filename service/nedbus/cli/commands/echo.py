@@ -64,7 +64,7 @@ def echo(
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_fields if full else Lines(selection)
+    form = to_json if json_output else to_fields if full else Lines()
     due: dict[Address, float] = {}
     csv_head: list[str] = []
 

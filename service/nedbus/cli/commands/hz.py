@@ -11,7 +11,7 @@ from typing import Any, Final
 from nedbus.cli.follow import follow
 from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
 from nedbus.cli.output.streams import csv_line, write
-from nedbus.cli.output.table import LiveTable
+from nedbus.cli.output.table import live_table
 from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
 from nedbus_msgs import ANY, DOUBT_FLAGS, Address, Selection
 
@@ -44,14 +44,14 @@ def hz(
     require_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
     written: dict[Address, tuple[int, str]] = {}
-    with bus.subscribe_to(selection, mode="every") as subscription, LiveTable(_HEAD, _OPTIONAL) as table:
+    with bus.subscribe_to(selection, mode="every") as subscription, live_table(_HEAD, _OPTIONAL) as show_table:
         if csv_output:
             write(csv_line(_CSV_HEAD))
 
         def show() -> None:
             streams = sorted(_states(bus, monitor), key=_severity)
             if not (json_output or csv_output):
-                table.show([_to_row(*each) for each in streams])
+                show_table([_to_row(*each) for each in streams])
                 return
             for address, health, state in streams:
                 if written.get(address) != (health.messages, state.name):

@@ -62,7 +62,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         text = describe_stream(health, state) if health and state else "no answer"
         rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
     if rows and not json_output:
-        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows, width=terminal_width()))
+        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
         hint = (
             "a service answers, so see 'nedbus info'; with certificates, may it write, and may this client read?"
@@ -109,7 +109,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [_source_row(source) for source in service.sources]
         if rows:
-            write(to_table(_SOURCE_HEAD, rows, width=width, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
+            write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
             if absent := [each for source in service.sources for each in getattr(source, what)]:
                 write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
@@ -117,7 +117,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         if streams:
-            table = to_table(_STREAM_HEAD, streams, width=width, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
+            table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
     if len(services) > _MAX_ROWS:
         write(f"{len(services) - _MAX_ROWS} services more")

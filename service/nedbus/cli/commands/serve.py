@@ -13,7 +13,7 @@ import typer
 
 from nedbus import __version__
 from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
-from nedbus.cli.output.progress import Display
+from nedbus.cli.output.progress import ProgressLog
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
 from nedbus.daemon import Daemon
@@ -83,10 +83,10 @@ def serve(
         if settings.http is not None:
             closing.enter_context(serve_pages(settings.http, service_pages(daemon)))
         notifier = closing.enter_context(Notifier(daemon))
-        display = closing.enter_context(Display(daemon))
+        progress = ProgressLog(daemon)
 
         def tick() -> None:
-            display.update()
+            progress.update()
             notifier.tick()
 
         def stop() -> None:
