@@ -1,4 +1,4 @@
-"""The log on stderr: text for people, priorities for the journal, JSON for programs (fewer lines than with python-json-logger)."""
+"""The log on stderr: text for people, priorities for the journal, JSON for programs."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(TextFormatter):
-    """Format a record as one JSON object on one line; what is not known has no key."""
+    """Format a record as one JSON object on one line; unknown facts have no key. python-json-logger is longer."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the object."""
