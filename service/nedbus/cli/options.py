@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import logging
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -17,11 +19,10 @@ from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, 
 from nedbus.log_event import about
 from nedbus.settings import load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, MESSAGES, TOPICS, Selection
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
 
 from .output.streams import MAX_TEXT, discard_stdout, logs_for_programs, to_text, write_stderr
 
-P = ParamSpec("P")
 _log = logging.getLogger("nedbus")
 
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
@@ -42,6 +43,10 @@ TopicArgument = Annotated[
     ),
 ]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
+DefaultTopicOption = Annotated[
+    str | None,
+    typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'),
+]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
 InstanceOption = Annotated[
     int | None, typer.Option("--instance", "-i", help="Instance, of topics that have some (default: all)")
@@ -56,93 +61,74 @@ CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="E
 DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="End after this many seconds")]
 
 
-def command(function: Callable[P, None]) -> Callable[P, None]:
-    """Turn errors into one line and an exit code: 1 failure, 2 usage, 130 interrupt."""
+ALL: Final = Selection()
+"""The default of commands that show all topics."""
+
+POSITIONS: Final = Selection(DEFAULT_TOPIC)
+"""The default of commands that show positions."""
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function, whose errors become one line and an exit code.
+
+    The command has the options to make parameters `bus`, an open one, `open_bus`, which opens one, and `selection` of;
+    the default of `selection` has its default topic.
+    """
+    parameters = inspect.signature(function, eval_str=True).parameters
+    makers = {name: maker for name, maker in _MAKERS.items() if name in parameters}
+    taken = {name: _options_of(maker) for name, maker in makers.items()}
+    own = [each for name, each in parameters.items() if name not in makers]
 
     @functools.wraps(function)
-    def run(*args: P.args, **kwargs: P.kwargs) -> None:
-        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as `main` left it while everything was imported
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            function(*args, **kwargs)
-        except (ConfigError, AddressError, LayoutError) as exc:
-            raise _exit_with(exc, 2) from exc
-        except NedbusError as exc:
-            raise _exit_with(exc, 1) from exc
-        except KeyboardInterrupt:
-            raise typer.Exit(130) from None
-        except BrokenPipeError:
-            # The reader of a pipe is gone (`| head`): nothing can be written, at exit either.
-            discard_stdout()
-            raise typer.Exit(0) from None
-        except OSError as exc:
-            where = f"{exc.filename}: " if exc.filename else ""
-            raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
-        except BaseException as exc:
-            if type(exc).__name__ != "PanicException":  # of Zenoh's; it cannot be imported
-                raise
-            hint = "is the clock set, is there memory, are enough open files allowed ('ulimit -n')?"
-            raise _exit_with(NedbusError(f"Zenoh cannot go on ({exc}): {hint}"), 1) from exc
-        finally:
-            if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-                signal.signal(signal.SIGINT, signal.SIG_DFL)  # what is left is the end, which needs no traceback
+    def run(**values: Any) -> None:
+        with _exit_on_errors(), ExitStack() as stack:
+            for name, maker in makers.items():
+                make = functools.partial(maker, **{each.name: values.pop(each.name) for each in taken[name]})
+                if name == "selection":
+                    values[name] = make(default=parameters[name].default.topic)
+                else:
+                    values[name] = make if name == "open_bus" else stack.enter_context(make())
+            function(**values)
 
+    options = sorted([*own, *itertools.chain(*taken.values())], key=lambda each: each.kind)
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
+    run.__annotations__ = {each.name: each.annotation for each in options}
     return run
 
 
-def on_bus(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function that has a parameter `bus`, an open one, or `open_bus`, which opens one.
-
-    The command has the options for connecting in its place.
-    """
-    name = "bus" if "bus" in inspect.signature(function).parameters else "open_bus"
-
-    def run(options: dict[str, Any], own: dict[str, Any]) -> None:
-        if name == "open_bus":
-            function(**own, open_bus=functools.partial(_open_bus, **options))
-            return
-        with _open_bus(**options) as bus:
-            function(**own, bus=bus)
-
-    return command(_replace_parameter(function, name, inspect.signature(_open_bus, eval_str=True), run))
+def _options_of(maker: Callable[..., object]) -> list[inspect.Parameter]:
+    parameters = inspect.signature(maker, eval_str=True).parameters.values()
+    return [each for each in parameters if each.default is not each.empty]
 
 
-def selecting(default: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options that select streams in place of its parameter `selection`; `default`: its topic."""
-    shown = "all" if default == ANY else default
-    option = Annotated[str | None, typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {shown})')]
-
-    def decorate(function: Callable[..., None]) -> Callable[..., None]:
-        def run(options: dict[str, Any], own: dict[str, Any]) -> None:
-            function(**own, selection=_select(**options, default=default))
-
-        *added, _ = inspect.signature(_select, eval_str=True).parameters.values()
-        added = [each.replace(annotation=option) if each.name == "topic_option" else each for each in added]
-        return _replace_parameter(function, "selection", inspect.Signature(added), run)
-
-    return decorate
-
-
-def _replace_parameter(
-    function: Callable[..., None],
-    name: str,
-    added: inspect.Signature,
-    run: Callable[[dict[str, Any], dict[str, Any]], None],
-) -> Callable[..., None]:
-    """Return a function that has other parameters in place of one, as Typer reads them.
-
-    `run` gets the values of those, and the values of the function's own.
-    """
-
-    @functools.wraps(function)
-    def replaced(**options: Any) -> None:
-        run({each: options.pop(each) for each in added.parameters}, options)
-
-    own = [each for each in inspect.signature(function, eval_str=True).parameters.values() if each.name != name]
-    parameters = sorted([*own, *added.parameters.values()], key=lambda each: each.kind)
-    replaced.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # Typer reads both
-    replaced.__annotations__ = {each.name: each.annotation for each in parameters}
-    return replaced
+@contextmanager
+def _exit_on_errors() -> Iterator[None]:
+    """Turn errors into one line and an exit code: 1 failure, 2 usage, 130 interrupt."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as `main` left it while everything was imported
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    except (ConfigError, AddressError, LayoutError) as exc:
+        raise _exit_with(exc, 2) from exc
+    except NedbusError as exc:
+        raise _exit_with(exc, 1) from exc
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    except BrokenPipeError:
+        # The reader of a pipe is gone (`| head`): nothing can be written, at exit either.
+        discard_stdout()
+        raise typer.Exit(0) from None
+    except OSError as exc:
+        where = f"{exc.filename}: " if exc.filename else ""
+        raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
+    except BaseException as exc:
+        if type(exc).__name__ != "PanicException":  # of Zenoh's; it cannot be imported
+            raise
+        hint = "is the clock set, is there memory, are enough open files allowed ('ulimit -n')?"
+        raise _exit_with(NedbusError(f"Zenoh cannot go on ({exc}): {hint}"), 1) from exc
+    finally:
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # what is left is the end, which needs no traceback
 
 
 def _open_bus(
@@ -170,7 +156,7 @@ def _open_bus(
 def _select(
     topic: TopicArgument = None,
     *,
-    topic_option: str | None = None,
+    topic_option: DefaultTopicOption = None,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
     default: str,
@@ -189,6 +175,9 @@ def _select(
     if len(chunks) == 2 and chunks[1].isdecimal():
         instance = int(chunks.pop())
     return Selection("/".join(chunks), vehicle, instance)
+
+
+_MAKERS: Final[Mapping[str, Callable[..., Any]]] = {"selection": _select, "bus": _open_bus, "open_bus": _open_bus}
 
 
 def require_one(flags: Mapping[str, bool]) -> None:

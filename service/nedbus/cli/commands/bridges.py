@@ -15,7 +15,7 @@ import typer
 from nedbus import __version__, bridges
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import InstanceOption, TopicOption, VehicleOption, on_bus, selecting
+from nedbus.cli.options import ALL, InstanceOption, TopicOption, VehicleOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
@@ -33,7 +33,7 @@ _ANSWER_TIMEOUT: Final = 1.0  # s
 HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
 
 
-@on_bus
+@command
 def web(
     open_bus: Callable[[], Bus],
     file: Annotated[
@@ -83,9 +83,8 @@ def web(
         )
 
 
-@on_bus
-@selecting(ANY)
-def export(open_bus: Callable[[], Bus], selection: Selection, *, http: HttpOption = "127.0.0.1:9464") -> None:
+@command
+def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
     """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
     from nedbus.monitoring import Exporter
 
@@ -96,7 +95,7 @@ def export(open_bus: Callable[[], Bus], selection: Selection, *, http: HttpOptio
             run_until_stopped(exporter.run)
 
 
-@on_bus
+@command
 def foxglove(
     open_bus: Callable[[], Bus], *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
 ) -> None:
@@ -107,11 +106,10 @@ def foxglove(
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
 
 
-@on_bus
-@selecting(ANY)
+@command
 def ros2(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
     layout: Annotated[

@@ -11,28 +11,27 @@ import typer
 
 from nedbus.cli.follow import follow
 from nedbus.cli.options import (
+    POSITIONS,
     CountOption,
     CsvOption,
     DurationOption,
     FieldOption,
     JsonOption,
-    on_bus,
+    command,
     parse_fields,
     require_one,
-    selecting,
 )
 from nedbus.cli.output.samples import Lines, to_fields, to_json, to_row
 from nedbus.cli.output.streams import csv_line, write, write_stderr
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
-from nedbus_msgs import DEFAULT_TOPIC, Address, Selection
+from nedbus_msgs import Address, Selection
 
 
-@on_bus
-@selecting(DEFAULT_TOPIC)
+@command
 def echo(
     open_bus: Callable[[], Bus],
-    selection: Selection,
+    selection: Selection = POSITIONS,
     *,
     field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
+from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.client import Bus, Monitor, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
@@ -31,7 +31,7 @@ FileArgument = Annotated[
 ]
 
 
-@on_bus
+@command
 def events(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
@@ -99,7 +99,7 @@ def events(
         write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
 
 
-@on_bus
+@command
 def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,

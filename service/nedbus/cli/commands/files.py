@@ -12,7 +12,7 @@ import typer
 
 from nedbus import recording
 from nedbus.cli.follow import SILENCE_TIMEOUT, write_notice
-from nedbus.cli.options import DurationOption, InstanceOption, VehicleOption, command, on_bus, selecting
+from nedbus.cli.options import ALL, DurationOption, InstanceOption, VehicleOption, command
 from nedbus.cli.output.progress import show_progress
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
@@ -26,11 +26,10 @@ from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
 
 
-@on_bus
-@selecting(ANY)
+@command
 def record(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")],
     duration: DurationOption = None,

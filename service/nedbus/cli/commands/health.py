@@ -10,7 +10,7 @@ from typing import Annotated, Final
 
 import typer
 
-from nedbus.cli.options import JsonOption, on_bus
+from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
 from nedbus.client import Bus, SourceStatus, to_age
 from nedbus.errors import ConfigError, NedbusError
@@ -23,7 +23,7 @@ _DENIED: Final = (
 )
 
 
-@on_bus
+@command
 def health(
     bus: Bus,
     *,

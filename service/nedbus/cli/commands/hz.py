@@ -9,11 +9,11 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
+from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, command, require_one
 from nedbus.cli.output.streams import csv_line, write
 from nedbus.cli.output.table import live_table
 from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
-from nedbus_msgs import ANY, DOUBT_FLAGS, Address, Selection
+from nedbus_msgs import DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
 _OPTIONAL: Final = ("JITTER", "MAX", "LATENCY", "LOST")
@@ -26,11 +26,10 @@ _FORGET_AFTER: Final = 60.0  # s after which a stream that is gone is not shown 
 Stream = tuple[Address, Health, StreamState]
 
 
-@on_bus
-@selecting(ANY)
+@command
 def hz(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,

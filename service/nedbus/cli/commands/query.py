@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.cli.options import FieldOption, JsonOption, VehicleOption, on_bus, parse_fields, selecting
+from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import terminal_width, to_table
@@ -42,7 +42,7 @@ _MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a s
 _MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
 
-@on_bus
+@command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List the vehicles and topics that are published now, how old their last message is, and their state."""
     selection = Selection(ANY, vehicle)
@@ -73,9 +73,10 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
 
 
-@on_bus
-@selecting(DEFAULT_TOPIC)
-def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_output: JsonOption = False) -> None:
+@command
+def get(
+    bus: Bus, selection: Selection = POSITIONS, *, field: FieldOption = None, json_output: JsonOption = False
+) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
     What only a storage kept is shown as such.
@@ -92,7 +93,7 @@ def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_outpu
         raise typer.Exit(1)
 
 
-@on_bus
+@command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
     """Show the services on this network: the state of their sources and streams, and what was rejected."""
     services = bus.services()
@@ -125,7 +126,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write_stderr("no nedbus service answers here")
 
 
-@on_bus
+@command
 def schema(
     open_bus: Callable[[], Bus],
     message: Annotated[
