@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,9 +16,9 @@ from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOpt
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.client import Bus, Monitor, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import SEVERITIES, WINDOW, Account, AccountReport, Event, Story, Times, by_vehicle, tell
+from nedbus.events import SEVERITIES, WINDOW, AccountReport, Event, Story, Times, Vehicle, by_vehicle, tell
 from nedbus.monitoring import Observer
-from nedbus.sources import read_account
+from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 _HEAD: Final = (
@@ -57,10 +57,9 @@ def events(
         raise ConfigError("--severity", f"{severity!r}: expected {' or '.join(SEVERITIES)}")
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
     form = _to_json if json_output else _to_csv if csv_output else to_line
-    times = Times(is_live=True)
 
-    def show(new: Iterable[Event]) -> None:
-        for event in new:
+    def show(found: Iterable[Event], times: Times) -> None:
+        for event in found:
             if event.severity in severities and (ANY in (vehicle, event.vehicle) or event.vehicle == vehicle):
                 write(form(event, times))
 
@@ -68,33 +67,26 @@ def events(
         if csv_output:
             write(csv_line(_HEAD))
         with open_bus() as bus:
+            times = Times(is_live=True)
             if within is not None:
-                show(_merge(bus.accounts(within=within)))
-            _follow(bus, Selection(ANY, vehicle), show, duration)
+                show(_merge(bus.accounts(within=within)), times)
+            _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "is for live vehicles, not for a file")
-    read = read_account(file)
-    times, vehicles = read.times, read.account.vehicles
-    found = [event for event in read.account.take(0)[0] if vehicle in (ANY, event.vehicle)]
-    for warning in read.warnings:
-        write_stderr(f"{file}: {warning}")
+    read, found = _read(file)
     if vehicle != ANY:
-        _choose_vehicle(file, vehicles, vehicle)
-    _write_kept(file, read.account)
+        _choose_vehicle(file, read.account.vehicles, vehicle)
+        found = [event for event in found if event.vehicle == vehicle]
     if csv_output:
         write(csv_line(_HEAD))
     elif not json_output:
-        _write_clock(found, times)
-    show(sorted(found, key=lambda event: event.time))
-    initial = [
-        f"{name}: {condition.text}"
-        for name, each in sorted(vehicles.items())
-        for condition in each.conditions.values()
-        if condition.initial and vehicle in (ANY, name)
-    ]
-    if initial:
-        write_stderr(f"from the first message to the end: {', '.join(dict.fromkeys(initial))}")
+        _write_clock(found, read.times)
+    show(found, read.times)
+    initial = {name: _held_from_start(each) for name, each in sorted(read.account.vehicles.items())}
+    texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
+    if texts:
+        write_stderr(f"from the first message to the end: {'; '.join(texts)}")
     elif not found:
         write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
 
@@ -120,27 +112,24 @@ def why(
     if vehicle is not None:
         check_vehicle(vehicle)
     if file is not None:
-        read = read_account(file)
+        read, found = _read(file)
         name = _choose_vehicle(file, read.account.vehicles, vehicle)
-        _write_kept(file, read.account)
-        followed = read.account.vehicles[name]
-        found = [event for event in read.account.take(0)[0] if event.vehicle == name]
-        conditions = [each for each in followed.conditions.values() if each.severity != "info"]
-        topics, times = list(followed.messages.values()), read.times
+        known = read.account.vehicles[name]
+        found = [event for event in found if event.vehicle == name]
+        conditions = [each for each in known.conditions.values() if each.severity != "info"]
+        topics, times = list(known.messages.values()), read.times
         until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
-        initial = ", ".join(dict.fromkeys(each.text for each in followed.conditions.values() if each.initial))
-        others = f"; from the first message to the end: {initial}" if initial else ""
-        nothing = f"nothing was wrong in {read.end:.0f} s{others}"
+        nothing = f"nothing was wrong in {read.end:.0f} s"
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
             where = " or ".join(bus.routers)
-        known = by_vehicle(reports)
-        if not known:
+        reporting = by_vehicle(reports)
+        if not reporting:
             raise NedbusError(f"no nedbus service at {where} knows a vehicle: 'nedbus serve' remembers what happens")
-        name = _choose_vehicle("the network", known, vehicle)
+        name = _choose_vehicle("the network", reporting, vehicle)
         found = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
-        state = known[name].vehicles[name]
+        state = reporting[name].vehicles[name]
         conditions, topics, times = list(state.held), list(state.topics), Times(is_live=True)
         until, advice, nothing = "until now", _LIVE_ADVICE, "nothing was wrong, as far as services remember"
     moment = None
@@ -149,7 +138,7 @@ def why(
             moment = times.find(at, found[-1]) if found else None
         except ValueError as exc:
             raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
-    stories = tell(sorted(found, key=lambda event: event.time), conditions, topics=topics, at=moment)
+    stories = tell(found, conditions, topics=topics, at=moment)
     if json_output:
         for story in stories:
             write(_story_json(story, times))
@@ -163,25 +152,25 @@ def why(
     write("\n\n".join("\n".join(_describe(name, story, times, advice, until)) for story in stories))
 
 
-def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> list[str]:
-    since = "from the first message on" if story.begin is None else f"from {times.text(story.begin)}"
+def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
+    """Yield the lines of a story."""
+    since = "the first message on" if story.begin is None else times.text(story.begin)
     lasted = until if story.until is None else f"for {to_age(story.until - story.since)}"
-    is_once = story.until == story.since
-    when = f"at {times.text(story.begin)}" if is_once and story.begin is not None else f"{since}, {lasted}"
-    lines = [f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"]
+    when = f"at {since}" if story.begin and story.until == story.since else f"from {since}, {lasted}"
+    yield f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"
     if story.before:
-        lines.append("  before it")
-        lines += [f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before]
+        yield "  before it"
+        yield from (f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before)
     if story.meanwhile:
-        lines += ["  meanwhile"] + [f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile]
+        yield "  meanwhile"
+        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile)
     if story.end is not None:
-        lines += [f"  it ended at {times.text(story.end)}" + (" with" if story.after else "")]
-        lines += [f"    {times.text(each)}  {_shown(each)}" for each in story.after]
+        yield f"  it ended at {times.text(story.end)}" + (" with" if story.after else "")
+        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.after)
     if not story.before and story.begin is not None:
-        lines.append(f"  no evidence in the {WINDOW:.0f} s before")
+        yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
-        lines.append(f"  not in the data: {', '.join(story.lacking)}, which may tell why: {advice}")
-    return lines
+        yield f"  not in the data: {', '.join(story.lacking)}, which may tell why: {advice}"
 
 
 _LIVE_ADVICE: Final = (
@@ -221,10 +210,8 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
-                initial = [held for held in each.conditions.values() if held.initial and held.severity != "info"]
-                if initial:
-                    texts = ", ".join(dict.fromkeys(held.text for held in initial))
-                    write_stderr(f"{name}: {texts}, since before this began")
+                if initial := _held_from_start(each):
+                    write_stderr(f"{name}: {initial}, since before this began")
 
     def handle(sample: Sample[Any]) -> bool:
         monitor.add(sample)
@@ -235,14 +222,24 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
 
 
+def _read(file: Path) -> tuple[FileAccount, list[Event]]:
+    """Return the account of a file and its events in order; write to stderr what it lacks."""
+    read = read_account(file)
+    found, told = read.account.take(0)
+    warnings = [*read.warnings, *([f"of {told} events only the last {len(found)}"] if told > len(found) else [])]
+    for warning in warnings:
+        write_stderr(f"{file}: {warning}")
+    return read, sorted(found, key=lambda event: event.time)
+
+
 def _merge(reports: Iterable[AccountReport]) -> list[Event]:
     return sorted((event for report in reports for event in report.events), key=lambda event: event.time)
 
 
-def _write_kept(file: Path, account: Account) -> None:
-    kept = len(account.events)
-    if account.told > kept:
-        write_stderr(f"{file}: of {account.told} events only the last {kept}")
+def _held_from_start(vehicle: Vehicle) -> str:
+    """Return what was wrong at the first message already, and never ended."""
+    held = [each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"]
+    return ", ".join(dict.fromkeys(held))
 
 
 def _write_clock(found: Sequence[Event], times: Times) -> None:
@@ -278,14 +275,15 @@ def _to_csv(event: Event, times: Times) -> str:
 
 
 def _story_json(story: Story, times: Times) -> str:
-    fields: dict[str, object] = {
+    events = {name: getattr(story, name) for name in ("before", "meanwhile", "after")}
+    fields = {
         "what": story.what,
         "begin": None if story.begin is None else _to_fields(story.begin, times),
         "lasted": None if story.until is None else story.until - story.since,
+        **{name: [_to_fields(event, times) for event in each] for name, each in events.items()},
+        "lacking": story.lacking,
     }
-    for name in ("before", "meanwhile", "after"):
-        fields[name] = [_to_fields(event, times) for event in getattr(story, name)]
-    return json.dumps({**fields, "lacking": story.lacking})
+    return json.dumps(fields)
 
 
 def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) -> str:
