@@ -495,7 +495,7 @@ def test_closed_terminal_ends_no_service(on_terminal: OnTerminal, bus: nedbus.Bu
 @pytest.mark.slow
 @pytest.mark.process
 def test_make_run(tmp_path: Path) -> None:
-    """A second one says that a nedbus runs already, and how to choose; Ctrl-C ends the first without make's error."""
+    """A second one says that the address is in use, and how to choose; Ctrl-C ends the first without make's error."""
     program = tmp_path / "venv" / "bin" / "nedbus"
     program.parent.mkdir(parents=True)
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
@@ -510,7 +510,7 @@ def test_make_run(tmp_path: Path) -> None:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
         second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)
         assert second.returncode == 2
-        assert "(a nedbus runs there already): end it, or choose another address with --http\n" in second.stderr
+        assert "(address already in use): choose another address with --http\n" in second.stderr
         assert 'make run ARGS="' in second.stderr
         os.killpg(first.pid, signal.SIGINT)
         assert first.wait(DEADLINE) in {0, -signal.SIGINT}

@@ -6,9 +6,8 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
-from http.client import HTTPConnection, HTTPException
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,7 +18,7 @@ from nedbus.cli.options import ALL, InstanceOption, TopicOption, VehicleOption, 
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
-from nedbus.errors import ConfigError, ConnectError, ListenError, NedbusError
+from nedbus.errors import ConfigError, ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY, RELEASES, Selection
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("nedbus")
 
-_ANSWER_TIMEOUT: Final = 1.0  # s
 HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
 
 
@@ -150,34 +148,12 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
     """Serve pages on HOST:PORT for as long as this is entered."""
     from nedbus.monitoring import HttpServer
 
-    try:
-        server = HttpServer(where, pages)
-    except ListenError as exc:
-        if not _is_nedbus(where):
-            raise
-        hint = "end it, or choose another address with --http"
-        raise ListenError([f"http://{where}"], "a nedbus runs there already", hint=hint) from exc
-    _log.info(
-        "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
-    )
-    if not is_loopback(split_http(where)[0]):
-        _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
-    try:
+    with closing(HttpServer(where, pages)):
+        text = "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status"
+        _log.info(text, where, extra=about("http"))
+        if not is_loopback(split_http(where)[0]):
+            _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
         yield
-    finally:
-        server.close()
-
-
-def _is_nedbus(where: str) -> bool:
-    """Return whether a command of ours serves pages on HOST:PORT."""
-    connection = HTTPConnection(*split_http(where), timeout=_ANSWER_TIMEOUT)
-    try:
-        connection.request("HEAD", "/")
-        return connection.getresponse().getheader("Server", "").startswith("nedbus")
-    except (OSError, HTTPException):
-        return False
-    finally:
-        connection.close()
 
 
 def _split(option: str, where: str) -> tuple[str, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -14,7 +13,7 @@ import typer
 from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
-from nedbus.cli.output.table import terminal_width, to_table
+from nedbus.cli.output.table import fold, to_table
 from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
@@ -104,7 +103,6 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         return
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
-    width = terminal_width()
     for service in services[:_MAX_ROWS]:
         name, version, role = map(to_text, (service.service, service.version, service.role))
         write(f"\nservice {name}, nedbus {version}, as {role}")
@@ -113,9 +111,9 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
             if absent := [each for source in service.sources for each in getattr(source, what)]:
-                write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
+                write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
         if refused := service.refused:
-            write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
+            write(fold("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         if streams:
             table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
@@ -168,12 +166,6 @@ def _source_row(source: SourceStatus) -> list[str]:
     gone = len(source.stale)
     remark = source.error or (f"{gone} gone" if gone else "-")
     return [*map(to_text, (source.source, source.state, *numbers, remark))]
-
-
-def _fold_list(head: str, text: str, width: int | None) -> str:
-    if width is None:
-        return head + text
-    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

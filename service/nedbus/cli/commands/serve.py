@@ -26,7 +26,7 @@ from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
-from .check import report_mistakes
+from .doctor import report_mistakes
 
 _log = logging.getLogger("nedbus")
 _SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())

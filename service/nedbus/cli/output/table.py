@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final, Literal
@@ -25,6 +26,14 @@ def terminal_width() -> int | None:
     """Return the width of the terminal that stdout is, None if it is none."""
     is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     return shutil.get_terminal_size().columns if is_terminal else None
+
+
+def fold(head: str, text: str) -> str:
+    """Return a line; on a terminal its text is folded, and its further lines are indented like the first."""
+    width = terminal_width()
+    if width is None:
+        return head + text
+    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
 def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) -> list[str]:
