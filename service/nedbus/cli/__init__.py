@@ -3,16 +3,12 @@
 import atexit
 import gc
 import os
-import resource
 import signal
 import sys
-from typing import Final
 
 from nedbus import __version__
 
 __all__ = ["main"]
-
-_FILES: Final = 64  # that a process needs to open at once, and some more
 
 
 def main() -> None:
@@ -23,10 +19,6 @@ def main() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # at once: the imports below take longer
         return
-    allowed, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if allowed != resource.RLIM_INFINITY and allowed < _FILES:  # Zenoh would abort the process
-        sys.stderr.write(f"nedbus: only {allowed} open files are allowed: set 'ulimit -n {_FILES}' or more\n")
-        sys.exit(1)
     atexit.register(_give_up_stderr)
     gc.disable()  # to look for garbage while everything is imported takes a sixth of the time, and finds none
     from .app import app

@@ -25,14 +25,11 @@ from .output.streams import MAX_TEXT, discard_stdout, logs_for_programs, to_text
 
 _log = logging.getLogger("nedbus")
 
+_ROUTER: Final = f"Router to join (default: {DEFAULT_ENDPOINT})"
+_TOPIC: Final = f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
-ConnectOption = Annotated[
-    list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help=f"Router to join (default: {DEFAULT_ENDPOINT})"),
-]
-PrefixOption = Annotated[
-    str | None, typer.Option("--prefix", help=f"First chunks of every key (default: {DEFAULT_PREFIX})")
-]
+ConnectOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)]
+PrefixOption = Annotated[str | None, typer.Option(help=f"First chunks of every key (default: {DEFAULT_PREFIX})")]
 TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="Authority of tls/ routers, PEM")]
 TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="This client's certificate, PEM")]
 TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of that certificate, PEM")]
@@ -42,18 +39,14 @@ TopicArgument = Annotated[
         metavar="TOPIC", help="TOPIC, or what nedbus list prints: VEHICLE/TOPIC/INSTANCE", show_default=False
     ),
 ]
+FileArgument = Annotated[
+    Path | None, typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording, instead of live vehicles")
+]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
-DefaultTopicOption = Annotated[
-    str | None,
-    typer.Option("--topic", "-t", help=f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'),
-]
+DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
-InstanceOption = Annotated[
-    int | None, typer.Option("--instance", "-i", help="Instance, of topics that have some (default: all)")
-]
-FieldOption = Annotated[
-    str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z; nedbus schema")
-]
+InstanceOption = Annotated[int | None, typer.Option("--instance", "-i", help="Of topics that have some (default: all)")]
+FieldOption = Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z")]
 JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
 CsvOption = Annotated[bool, typer.Option("--csv", help="CSV, with a line of names first")]
 WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait for a router that is not there yet")]

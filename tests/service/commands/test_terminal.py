@@ -379,13 +379,11 @@ def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
     assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
 
 
-LIMITS = {
+CLOSING = {
     "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
     "exec 2>&-": "os.close(2); sys.stderr = None",
-    "ulimit -n 12": "resource.setrlimit(resource.RLIMIT_NOFILE, (12, 12))",
 }
 CLOSED = "nedbus: cannot write: standard output is closed\n"
-TOO_FEW = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
 
 
 @pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
@@ -395,18 +393,14 @@ TOO_FEW = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
         *(("exec >&-", command, (1, 0, CLOSED)) for command in ("list", "schema", "get", "--version", "pki ca .")),
         ("exec 2>&-", "list", (0, 2, "")),
         ("exec 2>&-", "get -v 9", (1, 0, "")),
-        *(("ulimit -n 12", command, (1, 0, TOO_FEW)) for command in ("list", "serve -s sim:", "schema")),
     ],
 )
-def test_closed_stream_or_too_few_files_are_one_line(
+def test_closed_stream_is_one_line(
     start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
 ) -> None:
-    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain.
-
-    With few files Zenoh would abort the process with a page of Rust.
-    """
+    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    script = f"import os, resource, sys\n{LIMITS[limit]}\nfrom nedbus.cli import main\nmain()"
+    script = f"import os, sys\n{CLOSING[limit]}\nfrom nedbus.cli import main\nmain()"
     if shell:
         line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
         ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)

@@ -14,7 +14,7 @@ import typer
 from nedbus import __version__, bridges
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import ALL, InstanceOption, TopicOption, VehicleOption, command
+from nedbus.cli.options import ALL, FileArgument, InstanceOption, TopicOption, VehicleOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
@@ -28,16 +28,20 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("nedbus")
 
+MapOption = Annotated[
+    Path | None,
+    typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help="GeoJSON, or a picture with a world file"),
+]
+NamespaceOption = Annotated[
+    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics as /NAMESPACE/fmu/out/...; repeatable")
+]
 HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
 
 
 @command
 def web(
     open_bus: Callable[[], Bus],
-    file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording to look at, instead of live vehicles"),
-    ] = None,
+    file: FileArgument = None,
     *,
     topic_option: TopicOption = ANY,
     vehicle: VehicleOption = ANY,
@@ -47,16 +51,7 @@ def web(
         list[str] | None,
         typer.Option(metavar="HOST:PORT", help="Another name that browsers call this page by; repeatable"),
     ] = None,
-    background: Annotated[
-        Path | None,
-        typer.Option(
-            "--map",
-            exists=True,
-            dir_okay=False,
-            metavar="FILE",
-            help="GeoJSON, or a picture with a world file, under the tracks",
-        ),
-    ] = None,
+    background: MapOption = None,
 ) -> None:
     """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
     host, port = _split("--http", http)
@@ -114,10 +109,7 @@ def ros2(
         str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
     ] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
-    namespace: Annotated[
-        list[str] | None,
-        typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics of a vehicle, as /NAMESPACE/fmu/out/...; repeatable"),
-    ] = None,
+    namespace: NamespaceOption = None,
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
 ) -> None:
     """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""

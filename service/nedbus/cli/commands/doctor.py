@@ -36,9 +36,7 @@ def doctor(
     vehicle: Annotated[
         str | None, typer.Option("--vehicle", "-v", help="Look at this vehicle, and whether this client may write it")
     ] = None,
-    mavlink: Annotated[
-        str | None, typer.Option("--mavlink", metavar="LINK", help="Listen here too, such as udpin:0.0.0.0:14550")
-    ] = None,
+    mavlink: Annotated[str | None, typer.Option(metavar="LINK", help="Listen there too: udpin:0.0.0.0:14550")] = None,
     connect: ConnectOption = None,
     prefix: PrefixOption = None,
     tls_ca: TlsCaOption = None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -27,6 +27,8 @@ from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus.errors import ConfigError
 from nedbus_msgs import Address, Selection
 
+_EVERY: Final = "Every message, in order; a replay at speed=max then waits for this terminal or pipe"
+
 
 @command
 def echo(
@@ -35,23 +37,12 @@ def echo(
     *,
     field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
-    every: Annotated[
-        bool,
-        typer.Option(
-            "--every",
-            help="Print every message, in order; a replay at speed=max then waits for this terminal or pipe",
-        ),
-    ] = False,
+    every: Annotated[bool, typer.Option("--every", help=_EVERY)] = False,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
     max_rate: Annotated[
-        float | None,
-        typer.Option(
-            "--max-rate",
-            metavar="HZ",
-            help="Messages a second of each stream, downsampled by its publisher: for links that carry no more",
-        ),
+        float | None, typer.Option(metavar="HZ", help="Messages a second of each stream, downsampled by its publisher")
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,
     count: CountOption = None,

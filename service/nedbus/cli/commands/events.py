@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, command, require_one
+from nedbus.cli.options import CsvOption, DurationOption, FileArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.client import Bus, Monitor, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
@@ -26,9 +26,6 @@ _HEAD: Final = (
 )  # fmt: skip
 _MAX_TEXT: Final = 400  # characters of what a peer may have written
 _DAY: Final = 86_400.0
-FileArgument = Annotated[
-    Path | None, typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording, instead of live vehicles")
-]
 
 
 @command
@@ -38,11 +35,9 @@ def events(
     *,
     vehicle: VehicleOption = ANY,
     within: Annotated[
-        float | None, typer.Option("--within", metavar="SECONDS", min=0.0, help="First what services remember of these")
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Start with the last SECONDS")
     ] = None,
-    severity: Annotated[
-        str, typer.Option("--severity", metavar="bad|watch|info", help="Only these, and worse ones")
-    ] = "info",
+    severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Only these, and worse ones")] = "info",
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     duration: DurationOption = None,
@@ -96,12 +91,8 @@ def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
     *,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="The vehicle; needed where there are several")
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option("--at", metavar="TIME", help="What was wrong then: 14:05:12 (UTC), or s since boot")
-    ] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed where there are several")] = None,
+    at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC), or seconds since boot")] = None,
     json_output: JsonOption = False,
 ) -> None:
     """Say what was wrong with a vehicle, since when, for how long, and why; live as services remember it, or of a file.

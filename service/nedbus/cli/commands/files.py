@@ -61,10 +61,7 @@ def convert(
     output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording to write", show_default=False)],
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of a log of one vehicle")] = None,
-    topics: Annotated[
-        str | None,
-        typer.Option("--topics", "-t", help='Topics or messages, separated by commas; "*" is all in the log'),
-    ] = None,
+    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Separated by commas; "*" for all')] = None,
 ) -> None:
     """Convert a flight log to a recording, validated, with all topics whose messages nedbus knows."""
     spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))

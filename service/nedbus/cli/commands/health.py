@@ -30,24 +30,13 @@ def health(
     vehicle: Annotated[
         str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, of any publisher, by an answer")
     ] = None,
-    services: Annotated[
-        int | None, typer.Option("--services", metavar="N", min=1, help="Expect N services, on all hosts together")
-    ] = None,
-    max_age: Annotated[
-        float, typer.Option("--max-age", metavar="SECONDS", min=0.0, help="Age of the newest message at most")
-    ] = 3.0,
-    expect: Annotated[
-        str | None, typer.Option("--expect", metavar="1,2,7", help="Vehicles that must be heard, on all hosts together")
-    ] = None,
-    vehicles: Annotated[
-        int | None, typer.Option("--vehicles", metavar="N", min=1, help="Expect N vehicles, on all hosts together")
-    ] = None,
-    valid: Annotated[
-        str | None, typer.Option("--valid", metavar="xy,z", help="What must be valid: xy, z, vxy, vz")
-    ] = None,
+    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="N services answer, on all hosts")] = None,
+    max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Age of the newest message at most")] = 3.0,
+    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="These vehicles are heard, on all hosts")] = None,
+    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="N vehicles are heard, on all hosts")] = None,
+    valid: Annotated[str | None, typer.Option(metavar="xy,z", help="These are valid: xy, z, vxy, vz")] = None,
     within: Annotated[
-        float | None,
-        typer.Option("--within", metavar="SECONDS", min=0.0, help="Nothing bad, or to be watched, happened in these"),
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="No bad or watch event in these")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:

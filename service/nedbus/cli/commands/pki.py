@@ -37,10 +37,7 @@ def cert(
     folder: FolderArgument,
     name: Annotated[str, typer.Argument(metavar="NAME", help="router, vehicle-1, reader, operator, ...")],
     *,
-    host: Annotated[
-        list[str] | None,
-        typer.Option("--host", help="For a router: a name or address that clients connect to; repeatable"),
-    ] = None,
+    host: Annotated[list[str] | None, typer.Option(help="Name or address of a router; repeatable")] = None,
     days: DaysOption = None,
 ) -> None:
     """Make NAME.key and NAME.crt; config/router-secure.json5 defines what each name may do."""
@@ -53,18 +50,12 @@ def enroll(
     folder: FolderArgument,
     vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Its id, the second part of its keys")],
     *,
-    router: Annotated[
-        list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="Router to join; repeatable")
-    ],
+    router: Annotated[list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="To join; repeatable")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder to make (default: vehicle-VEHICLE)")
     ] = None,
-    source: Annotated[
-        list[str] | None, typer.Option("--source", "-s", help="What it publishes (default: to be filled in)")
-    ] = None,
-    target: Annotated[
-        Path | None, typer.Option("--target", help="Folder of these files on the vehicle (default: /etc/nedbus)")
-    ] = None,
+    source: Annotated[list[str] | None, typer.Option("--source", "-s", help="Default: to be filled in")] = None,
+    target: Annotated[Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")] = None,
     days: DaysOption = None,
 ) -> None:
     """Make a bundle for a vehicle: certificate, key, nedbus.toml, compose.yml, and what to copy where."""
@@ -108,9 +99,7 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="These, due or not (default: all that are due)")
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Default: all that are due")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="With new keys, to be copied as well")] = False,
@@ -139,10 +128,7 @@ def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A router's file, such as config/router-secure.json5")],
     vehicles: Annotated[list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Ids of vehicles")] = None,
     *,
-    source: Annotated[
-        Path | None,
-        typer.Option("--from", help="A file with an id a line, - for standard input, or the folder of certificates"),
-    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="A file of ids, - for stdin, or a folder")] = None,
     add: Annotated[bool, typer.Option("--add", help="Keep the vehicles that the file names already")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Remove these, and keep the others")] = False,
     prefix: Annotated[str, typer.Option("--prefix", help="First chunks of every key")] = "nedbus",

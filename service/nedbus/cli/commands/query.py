@@ -127,9 +127,7 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
 @command
 def schema(
     open_bus: Callable[[], Bus],
-    message: Annotated[
-        str, typer.Argument(help="A message, such as VehicleAttitude, or one of its topics")
-    ] = DEFAULT_TOPIC,
+    message: Annotated[str, typer.Argument(help="A message, such as VehicleAttitude, or a topic")] = DEFAULT_TOPIC,
     *,
     layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False,
 ) -> None:

@@ -29,25 +29,19 @@ from .bridges import serve_pages
 from .doctor import report_mistakes
 
 _log = logging.getLogger("nedbus")
-_SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
+_KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
+_SOURCES = f"{_KINDS}, with ?OPTION=VALUE&...; repeatable"
 
-ListenOption = Annotated[
-    list[str] | None,
-    typer.Option("--listen", "-l", metavar="ENDPOINT", help=f"Where the router listens (default: {DEFAULT_ENDPOINT})"),
-]
+_LISTEN = f"Address of the router (default: {DEFAULT_ENDPOINT})"
+ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
+JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join")]
 
 
 @command
 def serve(
     *,
-    source: Annotated[
-        list[str] | None,
-        typer.Option("--source", "-s", metavar="SOURCE", help=f"{_SOURCES}, with ?OPTION=VALUE&...; repeatable"),
-    ] = None,
-    connect: Annotated[
-        list[str] | None,
-        typer.Option("--connect", "-c", metavar="ENDPOINT", help="Join this router instead of being one"),
-    ] = None,
+    source: Annotated[list[str] | None, typer.Option("--source", "-s", metavar="SOURCE", help=_SOURCES)] = None,
+    connect: JoinOption = None,
     listen: ListenOption = None,
     router_config: Annotated[Path | None, typer.Option(help="JSON5 configuration of the embedded router")] = None,
     tls_ca: TlsCaOption = None,
@@ -56,8 +50,7 @@ def serve(
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
     http: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Serve /metrics, /healthz, /readyz, /vehicles and /status there"),
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status there")
     ] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,
@@ -125,9 +118,7 @@ def router(
     ] = None,
     *,
     listen: ListenOption = None,
-    connect: Annotated[
-        list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Another router to join")
-    ] = None,
+    connect: JoinOption = None,
     tls_ca: TlsCaOption = None,
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
