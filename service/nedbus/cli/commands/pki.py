@@ -14,6 +14,7 @@ import typer
 from nedbus import pki as certificates
 from nedbus.cli.options import JsonOption, command, require_one
 from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.output.table import to_table
 from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 
@@ -88,11 +89,11 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     if as_json:
         write(json.dumps(rows, indent=2))
         return
-    width = max(len("NAME"), *(len(row["name"]) for row in rows))
-    write(f"{'NAME':{width}}  {'USE':9}  {'UNTIL':10}  {'DAYS':>5}  STATE")
-    for row in rows:
-        hosts = f" ({', '.join(row['hosts'])})" if row["hosts"] else ""
-        write(f"{row['name']:{width}}  {row['use']:9}  {row['until']:.10}  {row['days_left']:5}  {row['state']}{hosts}")
+    cells = [
+        [row["name"], row["use"], row["until"][:10], str(row["days_left"]), ", ".join([row["state"], *row["hosts"]])]
+        for row in rows
+    ]
+    write(to_table(("NAME", "USE", "UNTIL", "DAYS", "STATE, HOSTS"), cells))
 
 
 @pki.command()

@@ -63,11 +63,8 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = (
-            "a service answers, so see 'nedbus info'; with certificates, may it write, and may this client read?"
-            if bus.services()
-            else "start a source with 'nedbus serve'"
-        )
+        hint = "see 'nedbus info'; with certificates, may it write, and may this client read?"
+        hint = f"a service answers, so {hint}" if bus.services() else "start a source with 'nedbus serve'"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
 
