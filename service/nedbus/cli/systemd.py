@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from typing import Final, Self
 
 from nedbus.daemon import Daemon
-from nedbus.log_event import about
 from nedbus.monitoring import why_not_ready
 
 from .output.streams import MAX_TEXT, to_text
@@ -34,9 +33,6 @@ class NotifySocket:
     def __init__(self, address: str) -> None:
         self.active = address.startswith(("/", "@"))
         self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: an abstract address
-        if address and not self.active:
-            text = "NOTIFY_SOCKET is %s, which is neither a path nor @NAME: systemd is told nothing"
-            _log.warning(text, address, extra=about("setting"))
 
     def send(self, **fields: object) -> bool:
         """Send these fields as one datagram; return whether it was taken."""

@@ -27,15 +27,11 @@ def wait_for_message(endpoint: str) -> None:
 
 
 def test_hint_of_what_listens_on_all_addresses(run_nedbus: Start) -> None:
-    """This host gets a command with loopback, other hosts one with an address of this host, and both work."""
+    """Its commands name the loopback address, and work."""
     port = free_port()
     service = run_nedbus("serve", "--listen", f"tcp/0.0.0.0:{port}", "-s", "sim:")
-    wait_for(lambda: "On another host" in service.err, what="the hint")
-    here, elsewhere = re.findall(r"nedbus list -c (\S+)", service.err)
+    wait_for(lambda: " all fields" in service.err, what="the hint")
+    (here,) = re.findall(r"nedbus list -c (\S+)", service.err)
     assert here == f"tcp/127.0.0.1:{port}"
-    assert not re.search(r"/(0\.0\.0\.0|127\.|localhost)", elsewhere)
-    for endpoint in (here, elsewhere):
-        wait_for_message(endpoint)
+    wait_for_message(here)
     assert " list  published" in what_to_type(["tcp/0.0.0.0:7447"])
-    assert re.search(r"^  nedbus list -c tcp/\S+:7448$", what_to_type(["tcp/[::]:7448"]).splitlines()[-1])
-    assert "On another host" not in what_to_type(["tcp/192.0.2.1:7447"])

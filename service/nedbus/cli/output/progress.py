@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import shutil
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -30,9 +29,6 @@ _HINT: Final = """In a second terminal:
   {nedbus} echo{where}  messages as they arrive, a line each
   {nedbus} hz{where}    rate, jitter, latency, loss
   {nedbus} get{where}   all fields of the last message"""
-_ELSEWHERE: Final = """
-On another host:
-  nedbus list -c {endpoint}"""
 _TLS_HINT: Final = "Readers at {endpoint} need a certificate of their own: docs/security.md"
 _ENCRYPTED: Final = ("tls/", "quic/")
 
@@ -103,18 +99,7 @@ def what_to_type(endpoints: Sequence[str]) -> str:
     if not plain:
         return _TLS_HINT.format(endpoint=endpoints[0])
     here = [dial_endpoint(each) for each in plain]
-    hint = _HINT.format(nedbus=_program(), where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")
-    anywhere = next((each for each, dialled in zip(plain, here, strict=True) if each != dialled), None)
-    return hint if anywhere is None else hint + _ELSEWHERE.format(endpoint=_from_elsewhere(anywhere))
-
-
-def _from_elsewhere(endpoint: str) -> str:
-    """Return the endpoint for other hosts of a listener on all addresses: this host's of the IPv4 default route."""
-    host = socket.gethostname()
-    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("192.0.2.1", 9))  # of UDP: nothing is sent
-        host = str(probe.getsockname()[0])
-    return endpoint.replace("/0.0.0.0:", f"/{host}:").replace("/[::]:", f"/{host}:")
+    return _HINT.format(nedbus=_program(), where="" if DEFAULT_ENDPOINT in here else f" -c {here[0]}")
 
 
 def _program() -> str:
