@@ -43,7 +43,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "retrying": Event("a source failed, and is started again after a pause", limited=False),
     "done": Event("a source has ended", limited=False),
     "failed": Event("a source has ended by a failure", limited=False),
-    "progress": Event("how much a source has published; the newest message of a vehicle", limited=False),
+    "progress": Event("the number of messages that a source has published", limited=False),
     # a stream
     "published": Event("a live stream is published"),
     "back": Event("a stale stream is published again"),

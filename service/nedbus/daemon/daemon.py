@@ -12,14 +12,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Final
 
-from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, Sample, ServiceStatus, SourceStatus
+from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
 from nedbus.events import QUESTION, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
 from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, router_max_sessions
-from nedbus_msgs import codec_of, provenance_of, status_key
+from nedbus_msgs import status_key
 
 from .plan import Planned, is_finite, plan_sources
 from .status import Role, SourceMeasures
@@ -129,21 +129,6 @@ class Daemon:
         except ValueError:
             seconds = 0.0
         return asdict(self.report(within=seconds))
-
-    def newest(self) -> list[Sample]:
-        """Return the last message of each address that was published."""
-        publishers = self._registry.publishers if self._registry else []
-        last = [(publisher, *publisher.last) for publisher in publishers if publisher.last]
-        return [
-            Sample(
-                codec_of(publisher.definition).decode(payload),
-                publisher.address,
-                time.time_ns(),
-                stamp,
-                provenance=provenance_of(publisher.definition, encoding),
-            )
-            for publisher, payload, stamp, encoding in last
-        ]
 
     def stop(self) -> None:
         """Ask it to end; callable from anywhere, a signal handler included."""

@@ -15,14 +15,11 @@ from nedbus.client import SourceStatus
 from nedbus.daemon import Daemon
 from nedbus.log_event import about
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
-from nedbus_msgs import DEFAULT_TOPIC
 
-from .samples import to_line
 from .streams import logs_for_programs, write_stderr
 
 _log = logging.getLogger("nedbus")
 _REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports; then the last one
-_MAX_REPORTED: Final = 3  # messages in a report
 
 _HINT: Final = """In a second terminal:
   {nedbus} list{where}  published vehicles and topics
@@ -59,7 +56,7 @@ class ProgressLog:
             self._report(elapsed)
 
     def _report(self, elapsed: float) -> None:
-        """Log the progress of each source, and the newest messages of some vehicles."""
+        """Log the progress of each source."""
         self._reported += elapsed
         self._reports += 1
         for status in self._daemon.sources:
@@ -68,9 +65,6 @@ class ProgressLog:
             if status.state == "running":
                 name = status.source.rstrip(":")
                 _log.info("%s: %s", name, _numbers(status, count / elapsed), extra=about("progress", source=name))
-        newest = [sample for sample in self._daemon.newest() if sample.topic == DEFAULT_TOPIC]
-        for sample in newest[:_MAX_REPORTED]:
-            _log.info("%s", to_line(sample), extra=about("progress", sample.address))
 
 
 def _numbers(status: SourceStatus, rate: float) -> str:

@@ -25,10 +25,13 @@ _VELOCITY, _HEADING, _EPH = f"{'VX m/s':>6} {'VY m/s':>6} {'VZ m/s':>6}", "HDG d
 _OPTIONAL: Final = (_EPH, _HEADING, _VELOCITY)  # in the order in which a narrow terminal leaves them out
 
 
-def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, address: str = "") -> str:
-    """Return one line with these fields, or with the most important ones; NED, metres, degrees."""
+def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38) -> str:
+    """Return one line with these fields, or with the most important ones; NED, metres, degrees.
+
+    `width`: that of the address.
+    """
     message = sample.message
-    start = f"{address or f'{sample.address!s:<38}'} {message.timestamp / 1e6:12.3f} s"
+    start = f"{sample.address!s:<{width}} {message.timestamp / 1e6:12.3f} s"
     if fields:
         return "  ".join([start, *(f"{name} {_to_value(sample, name)}" for name in fields)]) + _notes(sample)
     if not _is_position(message):
@@ -57,11 +60,10 @@ class Lines:
         if width is None:
             return to_line(sample, fields)
         self._left -= 1
-        address = str(sample.address)
         if not fields and not _is_position(sample.message):  # it has no columns: all that fits into a line
-            line = to_line(sample, address=address.ljust(self._widths.get(_ADDRESS, 0)))
+            line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
-        cells = {_ADDRESS: address, **_cells(sample, fields), _STATE: _to_state(sample)}
+        cells = {_ADDRESS: str(sample.address), **_cells(sample, fields), _STATE: _to_state(sample)}
         self._widths = {name: max(len(name), len(cell), self._widths.get(name, 0)) for name, cell in cells.items()}
         shown = fit_columns(self._widths, _OPTIONAL, width)
         head, line = self._join({name: name for name in shown}), self._join({name: cells[name] for name in shown})
