@@ -63,17 +63,14 @@ def web(
     def tell(url: str) -> None:
         write_stderr(f"open {url} in a browser; Ctrl-C ends it")
         if not is_loopback(host):
-            write_stderr(
-                f"any client that reaches {http} can see all vehicles, without a password; nothing can be changed there"
-            )
+            write_stderr(f"any client that reaches {http} can see all vehicles, without a password, and change nothing")
 
     if file is not None:
         run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
         return
+    serve_live = partial(page.serve_live, version=__version__, tell=tell)
     with open_bus() as bus:
-        run_until_stopped(
-            lambda stop: page.serve_live(bus, selection, where, version=__version__, stop=stop, tell=tell)
-        )
+        run_until_stopped(lambda stop: serve_live(bus, selection, where, stop=stop))
 
 
 @command
