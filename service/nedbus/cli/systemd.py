@@ -14,7 +14,7 @@ from typing import Final, Self
 from nedbus.daemon import Daemon
 from nedbus.monitoring import why_not_ready
 
-from .output.streams import MAX_TEXT, to_text
+from .output.streams import MAX_TEXT, counted, to_text
 
 _log = logging.getLogger("nedbus")
 
@@ -137,9 +137,10 @@ class Notifier:
         since, before = self._counted
         self._counted = now, published
         rate = max(0, published - before) / (now - since)
+        streams = sum(len(source.addresses) for source in sources)
         counts = (
-            f"{_count(len(sources), 'source')}, {_count(sum(len(source.addresses) for source in sources), 'stream')}, "
-            f"{float(f'{rate:.2g}'):g} messages/s, {_count(daemon.sessions, 'session')}"
+            f"{counted(len(sources), 'source')}, {counted(streams, 'stream')}, "
+            f"{float(f'{rate:.2g}'):g} messages/s, {counted(daemon.sessions, 'session')}"
         )
         return to_text("; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])), MAX_TEXT)
 
@@ -150,7 +151,3 @@ def watchdog_interval(environment: Mapping[str, str]) -> float | None:
     if not limit.isdecimal() or int(limit) == 0 or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}:
         return None
     return int(limit) / 2e6
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

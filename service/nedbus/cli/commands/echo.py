@@ -21,10 +21,9 @@ from nedbus.cli.options import (
     parse_fields,
     require_one,
 )
-from nedbus.cli.output.samples import Lines, to_fields, to_json, to_row
-from nedbus.cli.output.streams import csv_line, write, write_stderr
+from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
-from nedbus.errors import ConfigError
 from nedbus_msgs import Address, Selection
 
 _EVERY: Final = "Every message, in order; a replay at speed=max then waits for this terminal or pipe"
@@ -54,9 +53,8 @@ def echo(
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_fields if full else Lines()
+    form = to_json if json_output else to_fields if full else CsvLines() if csv_output else Lines()
     due: dict[Address, float] = {}
-    csv_head: list[str] = []
 
     def print_one(sample: Sample[Any]) -> bool:
         if interval:
@@ -64,17 +62,7 @@ def echo(
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        if not csv_output:
-            write(form(sample, fields))
-            return True
-        head, cells = zip(*to_row(sample, fields), strict=True)
-        if not csv_head:
-            csv_head.extend(head)
-            write(csv_line(head))
-        elif csv_head != list(head):
-            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
-            raise ConfigError("--csv", text)
-        write(csv_line(cells))
+        write(form(sample, fields))
         return True
 
     mode: Mode = "every" if every else "latest"

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from nedbus.cli.options import JsonOption, command
-from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
+from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.client import Bus, Sample, SourceStatus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, Expectation, faults_of
@@ -67,9 +67,8 @@ def health(
         raise NedbusError(faults[-1])
     if not json_output:
         newest = to_age(min(check.ages.values())) if check.ages else "an unknown time"
-        numbers = {"service": len(check.services), "source": len(check.sources), "vehicle": len(check.ages)}
-        counted = ", ".join(f"{number} {noun}{'s' * (number != 1)}" for noun, number in numbers.items())
-        write(f"{counted}, newest message {newest} old")
+        found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
+        write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest} old")
 
 
 def _parse_names(option: str, text: str | None) -> tuple[str, ...]:

@@ -53,10 +53,9 @@ def hz(
                 show_table([_to_row(*each) for each in streams])
                 return
             for address, health, state in streams:
-                if written.get(address) != (health.messages, state.name):
+                before, written[address] = written.get(address), (health.messages, state.name)
+                if before != written[address]:
                     write((_to_csv if csv_output else json.dumps)(_to_fields(address, health, state)))
-            written.clear()
-            written.update({address: (health.messages, state.name) for address, health, state in streams})
 
         follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 

@@ -13,7 +13,7 @@ import typer
 
 from nedbus import pki as certificates
 from nedbus.cli.options import JsonOption, command, require_one
-from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.output.streams import counted, write, write_stderr
 from nedbus.cli.output.table import to_table
 from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
@@ -149,7 +149,7 @@ def rules(
     for line in [*(f"+ {name}" for name in added), *(f"- {name}" for name in removed)]:
         write(line)
     changed = "the router takes it when it starts again" if added or removed else "no change"
-    write_stderr(f"{file} names {len(wanted)} vehicle{'s' * (len(wanted) != 1)}: {changed}")
+    write_stderr(f"{file} names {counted(len(wanted), 'vehicle')}: {changed}")
 
 
 def _read_names(source: Path) -> list[str]:

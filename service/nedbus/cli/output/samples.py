@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from nedbus.client import Sample, to_age
+from nedbus.errors import ConfigError
 from nedbus_msgs import DEFAULT, Message, message_doubts
 
+from .streams import csv_line
 from .table import COLUMN_GAP, fit_columns, terminal_width
 
 _TIMES: Final = ("timestamp", "timestamp_sample")
@@ -152,7 +154,28 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
     return f'{json.dumps(head)[:-1]}, "message": {message}}}'
 
 
-def to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
+class CsvLines:
+    """Format samples as lines of CSV, the first one below a line of names.
+
+    Raises ConfigError for a sample that has other columns than the first one.
+    """
+
+    def __init__(self) -> None:
+        self._head: tuple[str, ...] = ()
+
+    def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
+        """Return the line of a sample."""
+        head, cells = zip(*_to_row(sample, fields), strict=True)
+        if not self._head:
+            self._head = head
+            return f"{csv_line(head)}\n{csv_line(cells)}"
+        if head != self._head:
+            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
+            raise ConfigError("--csv", text)
+        return csv_line(cells)
+
+
+def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
     """Return the names and cells of a row of CSV: the address, when it was sent [ns], PX4's time [us], these fields.
 
     An array has a cell for each element; a field that this message does not have is empty.

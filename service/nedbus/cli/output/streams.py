@@ -41,6 +41,11 @@ def to_text(value: object, limit: int = _MAX_CELL) -> str:
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: 1 source, 2 sources."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def csv_line(cells: Iterable[object]) -> str:
     """Return a line of CSV, with quotes where they are needed; None is an empty cell."""
     line = io.StringIO()
