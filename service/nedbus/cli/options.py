@@ -17,7 +17,7 @@ import typer
 from nedbus.client import Bus, connect_with
 from nedbus.errors import AddressError, ConfigError, ConnectError, LayoutError, NedbusError
 from nedbus.log_event import about
-from nedbus.settings import load_settings
+from nedbus.settings import Settings, load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
 
@@ -64,8 +64,8 @@ POSITIONS: Final = Selection(DEFAULT_TOPIC)
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Make a command of a function, whose errors become one line and an exit code.
 
-    The command has the options to make parameters `bus`, an open one, `open_bus`, which opens one, and `selection` of;
-    the default of `selection` has its default topic.
+    The command has the options to make parameters `bus`, an open one, `open_bus` and `read_settings`, functions, and
+    `selection` of; the default of `selection` has its default topic.
     """
     parameters = inspect.signature(function, eval_str=True).parameters
     makers = {name: maker for name, maker in _MAKERS.items() if name in parameters}
@@ -80,7 +80,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
                 if name == "selection":
                     values[name] = make(default=parameters[name].default.topic)
                 else:
-                    values[name] = make if name == "open_bus" else stack.enter_context(make())
+                    values[name] = stack.enter_context(make()) if name == "bus" else make
             function(**values)
 
     options = sorted([*own, *itertools.chain(*taken.values())], key=lambda each: each.kind)
@@ -90,8 +90,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _options_of(maker: Callable[..., object]) -> list[inspect.Parameter]:
-    parameters = inspect.signature(maker, eval_str=True).parameters.values()
-    return [each for each in parameters if each.default is not each.empty]
+    """Return the parameters that have defaults; `**settings_options` stands for those of `_read_settings`."""
+    parameters = [*inspect.signature(maker, eval_str=True).parameters.values()]
+    own = [each for each in parameters if each.default is not each.empty]
+    return [*_options_of(_read_settings), *own] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else own
 
 
 @contextmanager
@@ -121,10 +123,10 @@ def _exit_on_errors() -> Iterator[None]:
         raise _exit_with(NedbusError(f"Zenoh cannot go on ({exc}): {hint}"), 1) from exc
     finally:
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # what is left is the end, which needs no traceback
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # only the exit is left, which needs no traceback
 
 
-def _open_bus(
+def _read_settings(
     *,
     connect: ConnectOption = None,
     prefix: PrefixOption = None,
@@ -132,11 +134,14 @@ def _open_bus(
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
     config: ConfigOption = None,
-    wait: WaitOption = False,
-) -> Bus:
-    """Connect with these options; with `wait` for as long as it takes."""
+) -> Settings:
     tls = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
-    settings = load_settings(config, connect=connect, prefix=prefix, **tls)
+    return load_settings(config, connect=connect, prefix=prefix, **tls)
+
+
+def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
+    """Connect with the settings; with `wait` for as long as it takes."""
+    settings = _read_settings(**settings_options)
     try:
         return connect_with(settings, timeout=1.0)
     except ConnectError as exc:
@@ -170,7 +175,9 @@ def _select(
     return Selection("/".join(chunks), vehicle, instance)
 
 
-_MAKERS: Final[Mapping[str, Callable[..., Any]]] = {"selection": _select, "bus": _open_bus, "open_bus": _open_bus}
+_MAKERS: Final[Mapping[str, Callable[..., Any]]] = {
+    "selection": _select, "bus": _open_bus, "open_bus": _open_bus, "read_settings": _read_settings,
+}  # fmt: skip
 
 
 def require_one(flags: Mapping[str, bool]) -> None:
@@ -185,7 +192,7 @@ def parse_fields(text: str | None, selection: Selection) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
     known = list(MESSAGES.values()) if selection.topic == ANY else [BY_TOPIC.get(selection.topic)]
     for name in names:
-        first = known[0]  # what has no file here has any fields
+        first = known[0]  # an undeclared message may have any fields
         if first is not None and not any(each and name in each.types for each in known):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names

@@ -41,7 +41,7 @@ class NotifySocket:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             try:
                 sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), self._address)
-            except OSError as exc:  # no reader, or its queue is full: what matters is sent again
+            except OSError as exc:  # no reader, or its queue is full: READY and STATUS are sent again
                 _log.debug("systemd cannot be notified: %s", exc)
                 return False
         return True
@@ -127,7 +127,7 @@ class Notifier:
                 return
 
     def _status(self) -> str:
-        """Return the line of `systemctl status`: published streams, then what does not work."""
+        """Return the line of `systemctl status`: published streams, then faults."""
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)

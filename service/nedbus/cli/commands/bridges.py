@@ -53,7 +53,7 @@ def web(
     ] = None,
     background: MapOption = None,
 ) -> None:
-    """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
+    """Show all vehicles in a browser: a map, their faults, and plots; live, or of a recording."""
     host, port = _split("--http", http)
     for name in origin or ():
         _split("--origin", name)
@@ -75,7 +75,7 @@ def web(
 
 @command
 def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
-    """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
+    """Serve a reader's metrics for Prometheus, until Ctrl-C: for routers without a nedbus service."""
     from nedbus.monitoring import Exporter
 
     _split("--http", http)

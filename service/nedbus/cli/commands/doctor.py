@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -12,37 +12,23 @@ from typing import Annotated
 import typer
 
 from nedbus import __version__
-from nedbus.cli.options import (
-    ConfigOption,
-    ConnectOption,
-    JsonOption,
-    PrefixOption,
-    TlsCaOption,
-    TlsCertificateOption,
-    TlsKeyOption,
-    command,
-)
+from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.doctor import Finding, check_router_file, check_service, examine, worst_state
 from nedbus.errors import ConfigError
-from nedbus.settings import load_settings
+from nedbus.settings import Settings
 from nedbus_msgs import check_vehicle
 
 
 @command
 def doctor(
+    read_settings: Callable[[], Settings],
     *,
     vehicle: Annotated[
         str | None, typer.Option("--vehicle", "-v", help="Look at this vehicle, and whether this client may write it")
     ] = None,
     mavlink: Annotated[str | None, typer.Option(metavar="LINK", help="Listen there too: udpin:0.0.0.0:14550")] = None,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    tls_ca: TlsCaOption = None,
-    tls_certificate: TlsCertificateOption = None,
-    tls_key: TlsKeyOption = None,
-    config: ConfigOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Find out why nothing arrives: router, certificates, permissions, clocks, vehicles, MAVLink; the worst comes last.
@@ -51,9 +37,7 @@ def doctor(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    own_files = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
-    settings = load_settings(config, connect=connect and tuple(connect), prefix=prefix, **own_files)
-    findings = examine(settings, version=__version__, vehicle=vehicle, mavlink=mavlink)
+    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink)
     state = worst_state(findings)
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
@@ -82,7 +66,7 @@ def check(
         typer.Argument(metavar="CONFIG...", help="Settings (.toml) and router files (.json5)", show_default=False),
     ] = None,
     *,
-    offline: Annotated[bool, typer.Option("--offline", help="Judge the text only, and not what this host has")] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Check the text only, not this host")] = False,
 ) -> None:
     """Report all mistakes in settings and router files, with file, line and column; exit with 2 if there is one."""
     mistakes = [] if files else check_service(offline=offline)

@@ -70,7 +70,7 @@ def echo(
         try:
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
-            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
+            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has its lines
                 _write_counts(subscription)
 
 

@@ -1,4 +1,4 @@
-"""The commands that say what happened, and why: events, why."""
+"""Commands for events of vehicles and their causes: events, why."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from nedbus_msgs import ANY, Selection, check_vehicle
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
 )  # fmt: skip
-_MAX_TEXT: Final = 400  # characters of what a peer may have written
+_MAX_TEXT: Final = 400  # characters of a peer's text
 _DAY: Final = 86_400.0
 
 
@@ -42,7 +42,7 @@ def events(
     csv_output: CsvOption = False,
     duration: DurationOption = None,
 ) -> None:
-    """Show what happens to vehicles, each event with what precedes it; live until Ctrl-C, or of a file.
+    """Show events of vehicles, each with its evidence; live until Ctrl-C, or of a file.
 
     Events: validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode, arming, landing, battery, reboot,
     silence, loss, rejected messages, and the link; of each the events of the ten seconds before that may explain it.
@@ -95,10 +95,10 @@ def why(
     at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC), or seconds since boot")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Say what was wrong with a vehicle, since when, for how long, and why; live as services remember it, or of a file.
+    """Explain the faults of a vehicle: begin, duration and causes; live as services remember it, or of a file.
 
-    Evidence is what precedes it within ten seconds, or goes on since before; where the messages that would tell are
-    not there it says which, and how to get them. Exit 0 with or without anything wrong.
+    Evidence is an event of the ten seconds before, or a condition that goes on since before; topics that are needed
+    and missing are named, with a hint. Exit 0 with or without anything wrong.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -174,7 +174,7 @@ _ADVICE: Final = {
 
 
 def to_line(event: Event, times: Times) -> str:
-    """Return an event for a person: time, vehicle, severity, what, and the evidence."""
+    """Return an event as a line: time, vehicle, severity, text and evidence."""
     evidence = ", ".join(_before(each, event.time) for each in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
@@ -214,7 +214,7 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
 
 
 def _read(file: Path) -> tuple[FileAccount, list[Event]]:
-    """Return the account of a file and its events in order; write to stderr what it lacks."""
+    """Return the account of a file and its events in order; write its warnings to stderr."""
     read = read_account(file)
     found, told = read.account.take(0)
     warnings = [*read.warnings, *([f"of {told} events only the last {len(found)}"] if told > len(found) else [])]
@@ -228,7 +228,7 @@ def _merge(reports: Iterable[AccountReport]) -> list[Event]:
 
 
 def _held_from_start(vehicle: Vehicle) -> str:
-    """Return what was wrong at the first message already, and never ended."""
+    """Return the faults that held at the first message already, and never ended."""
     held = [each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"]
     return ", ".join(dict.fromkeys(held))
 

@@ -121,7 +121,7 @@ def plot(
 
 
 def _read_events(path: Path) -> list[Event]:
-    """Return what happened in a file, and the begin of what held from the first message to the end."""
+    """Return the events of a file, and the begin of conditions that held from the first message to the end."""
     account = read_account(path).account
     held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
     return [*dict.fromkeys(each.begin for each in held), *account.take(0)[0]]

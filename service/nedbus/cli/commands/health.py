@@ -93,7 +93,7 @@ class _Check:
         self._answers: list[Sample[Message]] = []
         if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
             self._answers = [sample for sample in bus.latest(ANY) if not sample.stored]
-        # A status has the streams that a service publishes, and not what a router lets through.
+        # A status lists published streams, also those that the router's access rules drop.
         self._is_refused = False
         if vehicle is not None:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]

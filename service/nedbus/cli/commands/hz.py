@@ -61,7 +61,7 @@ def hz(
 
 
 def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
-    """Yield all streams with their states; forget what has been gone for a minute."""
+    """Yield all streams with their states; forget those that have been gone for a minute."""
     alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
     for address, health in monitor.snapshot().items():
         state = stream_state(health, alive=address in alive, connected=bus.connected)

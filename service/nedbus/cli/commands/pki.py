@@ -21,7 +21,7 @@ from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 pki = typer.Typer(help="Make keys and certificates for tls/ endpoints.", no_args_is_help=True)
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
-WithinOption = Annotated[int, typer.Option(min=0, help="What expires within these days is due")]
+WithinOption = Annotated[int, typer.Option(min=0, help="Certificates that expire within these days are due")]
 DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Days until it expires (default: {certificates.DAYS})")]
 
 
@@ -41,7 +41,7 @@ def cert(
     host: Annotated[list[str] | None, typer.Option(help="Name or address of a router; repeatable")] = None,
     days: DaysOption = None,
 ) -> None:
-    """Make NAME.key and NAME.crt; config/router-secure.json5 defines what each name may do."""
+    """Make NAME.key and NAME.crt; config/router-secure.json5 has the permissions of each name."""
     _write_pair(certificates.make_certificate(folder, name, hosts=host or (), days=days))
 
 
@@ -59,7 +59,7 @@ def enroll(
     target: Annotated[Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")] = None,
     days: DaysOption = None,
 ) -> None:
-    """Make a bundle for a vehicle: certificate, key, nedbus.toml, compose.yml, and what to copy where."""
+    """Make a bundle for a vehicle: certificate, key, nedbus.toml, compose.yml, and a README.txt."""
     output = output or Path(certificate_name(vehicle))
     _write_paths(
         certificates.make_bundle(

@@ -75,7 +75,7 @@ def get(
 ) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
-    What only a storage kept is shown as such.
+    Messages that only a storage kept are marked.
     """
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
@@ -91,7 +91,7 @@ def get(
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services on this network: the state of their sources and streams, and what was rejected."""
+    """Show the services on this network: the state of their sources and streams, and rejected messages."""
     services = bus.services()
     vehicles = bus.vehicles()
     if json_output:
@@ -130,7 +130,7 @@ def schema(
 ) -> None:
     """Print the JSON Schema of a message, or the layouts that can be read.
 
-    Of a topic whose message has no file here it is what its publisher says.
+    For a topic of an undeclared message, the publisher is asked.
     """
     try:
         definition: Definition[Any] = definition_of(message)

@@ -44,7 +44,7 @@ class ProgressLog:
         self._counts: dict[str, int] = {}  # messages published of each source at the last report
 
     def update(self) -> None:
-        """Log what is due."""
+        """Log the progress if a report is due."""
         if not self._daemon.ready.is_set():
             return
         if not self._hinted:

@@ -97,7 +97,7 @@ def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
 
 
 def _to_state(sample: Sample[Any]) -> str:
-    """Return what casts doubt on a sample, or "ok"; then its age, if it is old, and the number lost before it."""
+    """Return the doubts about a sample, or "ok"; then its age, if it is old, and the number lost before it."""
     return (message_doubts(sample.message) if _is_position(sample.message) else "ok") + _notes(sample)
 
 
@@ -107,7 +107,7 @@ def _is_position(message: Message) -> bool:
 
 
 def _to_summary(message: Message) -> str:
-    """Return the numbers of a message by name, then the flags that are set; what is not known is left out."""
+    """Return the numbers of a message by name, then the flags that are set; unknown values are left out."""
     numbers, flags = [], []
     for name, kind in message.DEFINITION.types.items():
         value = getattr(message, name)

@@ -35,7 +35,7 @@ def printable(text: str) -> str:
 
 
 def to_text(value: object, limit: int = _MAX_CELL) -> str:
-    """Return what some peer sent as one line of at most `limit` characters, all of them printable."""
+    """Return a peer's text as one line of at most `limit` characters, all of them printable."""
     text = str(value)
     short = text if len(text) <= limit else f"{text[: limit - 3]}..."
     return printable(short.replace("\n", "\\n"))[: 4 * limit]

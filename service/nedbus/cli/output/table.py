@@ -81,7 +81,7 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
 
 @contextmanager
 def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
-    """Yield a function that shows rows, as many as fit; on a terminal in place of the last ones, the log above them."""
+    """Yield a function that shows the rows that fit; on a terminal in place of the last ones, below the log."""
     if terminal_width() is None:
         yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=_MAX_ROWS))
         return
