@@ -92,7 +92,8 @@ class _Check:
         self._known = {name for report in self._reports for name in report.vehicles}
         self._answers: list[Sample[Message]] = []
         if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
-            self._answers = [sample for sample in bus.latest(ANY) if not sample.stored]
+            only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
+            self._answers = [sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored]
         # A status lists published streams, also those that the router's access rules drop.
         self._is_refused = False
         if vehicle is not None:
