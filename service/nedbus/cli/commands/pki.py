@@ -25,14 +25,12 @@ WithinOption = Annotated[int, typer.Option(min=0, help="Certificates that expire
 DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Days until it expires (default: {certificates.DAYS})")]
 
 
-@pki.command()
 @command
 def ca(folder: FolderArgument) -> None:
     """Make the authority that signs everything else: ca.key, to be kept in private, and ca.crt, which all need."""
     _write_pair(certificates.make_authority(folder))
 
 
-@pki.command()
 @command
 def cert(
     folder: FolderArgument,
@@ -45,7 +43,6 @@ def cert(
     _write_pair(certificates.make_certificate(folder, name, hosts=host or (), days=days))
 
 
-@pki.command()
 @command
 def enroll(
     folder: FolderArgument,
@@ -69,7 +66,6 @@ def enroll(
     write_stderr(f"{output} has the vehicle's only key: copy it there, as its README.txt says, and remove it here")
 
 
-@pki.command("list")
 @command
 def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False) -> None:
     """Show all certificates of a folder, and their expiry."""
@@ -96,7 +92,6 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     write(to_table(("NAME", "USE", "UNTIL", "DAYS", "STATE, HOSTS"), cells))
 
 
-@pki.command()
 @command
 def renew(
     folder: FolderArgument,
@@ -118,12 +113,9 @@ def renew(
     if chosen:
         write_stderr("copy these over the old ones; a router reads its certificate when it starts")
     else:
-        first = min(entries, key=lambda entry: entry.certificate.ends)
-        end = f"{first.name}, on {first.certificate.ends:%Y-%m-%d}"
-        write_stderr(f"nothing expires within {within} days; the first is {end}")
+        write_stderr(f"nothing expires within {within} days: 'nedbus pki list' shows all")
 
 
-@pki.command()
 @command
 def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A router's file, such as config/router-secure.json5")],
@@ -176,3 +168,7 @@ def _write_paths(paths: list[Path]) -> None:
 def _write_pair(paths: list[Path]) -> None:
     _write_paths(paths)
     write_stderr(f"{paths[0]} is secret: only its owner can read it; do not copy it elsewhere")
+
+
+for _command in (ca, cert, enroll, list_, renew, rules):
+    pki.command(_command.__name__.rstrip("_"))(_command)
