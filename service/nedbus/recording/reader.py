@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
@@ -54,12 +54,11 @@ class RecordingReader:
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
-        summary = self._file.summary
-        if summary is not None:
-            self._schemas.update(summary.schemas)
-            for channel in summary.channels.values():
-                self._add(channel)
-        totals = summary.statistics.channel_message_counts if summary and summary.statistics else {}
+        totals: dict[int, int] = {}
+        for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # after their schemas
+            self._learn(record)
+            if isinstance(record, Statistics):
+                totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
         try:
             if self._all_known:
@@ -92,14 +91,12 @@ class RecordingReader:
 
     def _messages_of(self, part: bytes, only: Collection[Address] | None) -> Iterator[RecordedMessage]:
         for record in records_of(part):
-            if isinstance(record, Schema):
-                self._schemas.setdefault(record.id, record)
-            elif isinstance(record, Channel):
-                self._add(record)
-            elif isinstance(record, Message):
+            if isinstance(record, Message):
                 stream = self._stream(record)
                 if stream is not None and (only is None or stream.address in only):
                     yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
+            else:
+                self._learn(record)
 
     def __enter__(self) -> Self:
         return self
@@ -124,9 +121,12 @@ class RecordingReader:
             raise SourceError(str(self.path), f"no message can be read: {'; '.join(self.warnings[:3])}")
         return counts
 
-    def _add(self, channel: Channel) -> None:
-        if channel.id not in self._streams:
-            self._streams[channel.id] = self._describe(self._schemas.get(channel.schema_id), channel)
+    def _learn(self, record: McapRecord) -> None:
+        """Keep a schema or a channel, unless there is one of this number already."""
+        if isinstance(record, Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel) and record.id not in self._streams:
+            self._streams[record.id] = self._describe(self._schemas.get(record.schema_id), record)
 
     def _stream(self, message: Message) -> RecordedStream | None:
         if message.channel_id not in self._streams:
