@@ -14,7 +14,7 @@ from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import Library, Pandas, Polars, Streams, missing_of, read_streams, to_dataframe
-from .utc import tell_utc
+from .utc import utc_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -74,7 +74,7 @@ def align(
     "nearest" takes that nearest in time, so that an age can be negative. "linear" interpolates floats between the
     messages before and after: unit quaternions by slerp, angles the shorter way around. Everything else is the last
     value, as floats are where a reset counter changes, and after the last message.
-    With `utc`, a column `utc` is the UTC that `utc_of` tells, NaT where it tells none.
+    With `utc`, a column `utc` is the UTC of `utc_of`, NaT without one.
 
     Raises ConfigError for several boots of a vehicle in one stream: they have no common time; errors of `read`.
     """
@@ -87,12 +87,10 @@ def align(
         _require_arrays(flight, topics or ())
         everything = not topics or ANY in topics
         streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
-        offset = tell_utc(flight)
     elif not isinstance(flight, str | Path):
         raise ConfigError("flight", _EXPECTED)
     else:
-        wants_utc = utc or dataframe == "pandas"
-        streams, offset = read_streams(flight, names if topics else None, vehicle=vehicle, utc=wants_utc)
+        streams = read_streams(flight, names if topics else None, vehicle=vehicle)
     if isinstance(on, str) and on not in streams:
         raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
     streams = {name: streams[name] for name in [*reference, *streams]}
@@ -105,6 +103,7 @@ def align(
     table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
     table["timestamp"] = times
     if utc:
+        offset = utc_of(flight, vehicle=vehicle)
         table["utc"] = (times + offset.offset_us).astype("M8[us]") if offset else np.datetime64("NaT", "us")
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
@@ -119,7 +118,7 @@ def align(
         for field, _ in _fields(messages):
             table[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
-    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe, offset)
+    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
 def _require_arrays(flight: Mapping[str, object], topics: Iterable[str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import BinaryIO, Final
 
@@ -62,15 +62,21 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
     raise AddressError("instance", selection.instance, f"one of {selection.topic} that is in {path}, {has}")
 
 
-def the_one(path: Path, addresses: Sequence[Address], selection: Selection) -> Address:
+def the_one(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
     """Return the only address of a file that is selected; raise AddressError when there is none, or more than one."""
     found = matching(path, addresses, selection)
-    if len(found) == 1:
-        return found[0]
-    parts = ("topic", "vehicle", "instance")
-    lacking = [part for part in parts if len({getattr(address, part) for address in found}) > 1]
-    problem = f"one stream of {path}, where several match: name {' and '.join(lacking)} too, of {_list(found)}"
-    raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+    lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
+    if lacking:
+        problem = f"one stream of {path}, where several match: name {' and '.join(lacking)} too, of {_list(found)}"
+        raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+    return found
+
+
+def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle: str) -> None:
+    """Raise AddressError if these addresses, which were selected by `vehicle`, are of several vehicles."""
+    vehicles = sorted({address.vehicle for address in addresses})
+    if len(vehicles) > 1:
+        raise AddressError("vehicle", vehicle, f"one of those in {where}: {', '.join(vehicles[:_MAX_NAMED])}")
 
 
 def _list(addresses: Sequence[Address]) -> str:

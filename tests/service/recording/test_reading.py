@@ -322,7 +322,7 @@ def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.Lo
 
 
 def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many topics are wanted, and with the messages that tell UTC."""
+    """However many topics are wanted."""
     path = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=20", path)
     passes: list[object] = []
