@@ -164,7 +164,7 @@ class Flight:
                 raise SourceError(str(path), "no message of PX4's topics is in this recording")
         else:
             log = read_ulog(path, topics=topics)
-            self._file, self.definitions = log, {topic.address: topic.definition for topic in log.topics}
+            self._file, self.definitions = log, {each: topic.definition for each, topic in log.topics.items()}
         self.addresses = sorted(self.definitions)
 
     def __enter__(self) -> Self:
@@ -187,7 +187,7 @@ class Flight:
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return the messages of each address, and for each field that some of them lack a mask of those."""
         if isinstance(self._file, UlogTopics):
-            topics = {topic.address: topic for topic in self._file.topics}
+            topics = self._file.topics
             return {address: self._valid(address, *_decode_ulog(topics[address])) for address in addresses}
         read = self._read_mcap(self._file, addresses)
         return {address: self._valid(address, *read[address]) for address in addresses}

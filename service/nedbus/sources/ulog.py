@@ -39,7 +39,7 @@ class UlogSource:
         log = read_ulog(
             self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
         )
-        topics, warnings = log.topics, list(log.warnings)
+        topics, warnings = list(log.topics.values()), list(log.warnings)
         clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
         for topic, clock in zip(topics, clocks, strict=True):
             outliers = int(np.count_nonzero(clock != topic.columns["timestamp"]))
