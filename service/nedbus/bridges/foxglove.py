@@ -10,7 +10,6 @@ Vehicles with different origins share the frame `map`, whose origin is that of t
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from typing import Any, Final
@@ -38,31 +37,32 @@ from .foxglove_messages import MapFrame, has_position, orientation_of, to_locati
 
 _ATTITUDE: Final = "vehicle_attitude"
 _POLL: Final = 1.0  # s between two queries for the addresses that are published
-_HINT: Final = "choose another address with --http"
 
 
 class FoxgloveServer:
-    """Serve what is on a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
+    """Serve the streams of a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
 
     Fields are encoded only for channels with a subscriber; a client that is too slow misses the oldest messages.
 
-    Raises ListenError when the port is in use.
+    Raises ListenError when the address cannot be listened on.
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[Address, foxglove.Channel] = {}
-        self._unseen: dict[Address, tuple[Message, int]] = {}  # the last of what has no rate, until a client subscribes
+        self._unseen: dict[
+            Address, tuple[Message, int]
+        ] = {}  # the last of streams without a rate, until a client subscribes
         self._poses: dict[str, PoseInFrameChannel] = {}
         self._locations: dict[str, LocationFixChannel] = {}
         self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
         self._map = MapFrame()
-        _require_free(host, port)
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
-        except RuntimeError as exc:
-            raise ListenError([f"ws://{host}:{port}"], "it is in use", hint=_HINT) from exc
+        except RuntimeError as exc:  # "...: Address already in use (os error 98)"
+            reason = str(exc).rpartition(": ")[2].partition(" (os error")[0].lower()
+            raise ListenError([f"ws://{host}:{port}"], reason, hint="choose another address with --http") from exc
         self._transforms = FrameTransformsChannel("/tf", context=self._context)
         self.url = f"ws://{host}:{self._server.port}"
 
@@ -148,14 +148,3 @@ class FoxgloveServer:
             self._poses.pop(vehicle).close()
             self._locations.pop(vehicle).close()
             self._map.forget(vehicle)
-
-
-def _require_free(host: str, port: int) -> None:
-    """Raise ListenError unless the port can be listened on: the SDK does not report the reason."""
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as exc:
-        raise ListenError([f"ws://{host}:{port}"], (exc.strerror or str(exc)).lower(), hint=_HINT) from exc
