@@ -1,4 +1,4 @@
-"""Several messages at one time: one table of the values that each stream has at the times of another one."""
+"""Align streams: one table of the values of several streams at the times of one of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-_EXPECTED: Final = "expected a file, or arrays as nedbus.read(file, [...]) returns them"
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # by the unit of an angle
 _MAX_ROWS: Final = 10_000_000  # of a table at a rate: a damaged timestamp must not fill the memory
@@ -83,14 +82,14 @@ def align(
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
-    if isinstance(flight, Mapping):
-        _require_arrays(flight, topics or ())
-        everything = not topics or ANY in topics
-        streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
-    elif not isinstance(flight, str | Path):
-        raise ConfigError("flight", _EXPECTED)
-    else:
+    streams: Streams
+    if not isinstance(flight, Mapping):
         streams = read_streams(flight, names if topics else None, vehicle=vehicle)
+    elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
+        raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}")
+    else:
+        everything = not topics or ANY in topics
+        streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
     if isinstance(on, str) and on not in streams:
         raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
     streams = {name: streams[name] for name in [*reference, *streams]}
@@ -108,7 +107,7 @@ def align(
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
-        padded = np.append(messages, np.zeros(1, messages.dtype))  # with what row -1 is
+        padded = np.append(messages, np.zeros(1, messages.dtype))  # row -1: no message
         for field, kind in _fields(messages):
             padded[field][-1] = np.nan if kind.base.kind == "f" else 0
         values = padded[rows]
@@ -121,21 +120,12 @@ def align(
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
-def _require_arrays(flight: Mapping[str, object], topics: Iterable[str]) -> None:
-    """Raise ConfigError unless these are streams as `read` returns them, AddressError unless they have the topics."""
-    if not flight or not all(isinstance(each, np.ndarray) and each.dtype.names for each in flight.values()):
-        raise ConfigError("flight", _EXPECTED)
-    for name in topics:
-        if name not in (ANY, *flight):
-            raise AddressError("topic", name, f"one of {', '.join(flight)}")
-
-
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
     return [(name, messages.dtype[name]) for name in messages.dtype.names or ()]
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return the message for each time, -1 for none, the next one, and how far between these two the time is."""
+    """Return the message for each time, -1 for none, the next one, and the fraction of the way between these two."""
     if method == "own" or not len(stamps):  # by its place: two messages may have one time
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
