@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -188,43 +188,52 @@ class Flight:
         """Return the messages of each address, and for each field that some of them lack a mask of those."""
         if isinstance(self._file, UlogTopics):
             topics = self._file.topics
-            return {address: self._valid(address, *_decode_ulog(topics[address])) for address in addresses}
-        read = self._read_mcap(self._file, addresses)
-        return {address: self._valid(address, *read[address]) for address in addresses}
-
-    def _valid(
-        self, address: Address, messages: MessageArray, valid: _Mask, absent: Absent
-    ) -> tuple[MessageArray, Absent]:
-        """Leave out invalid messages, and name the fields that are missing."""
-        if not valid.all():
-            count = f"{np.sum(~valid)} of {len(valid)} messages"
-            self._invalid.append(f"{address.stream}: {count} violate the rules and are left out")
-            messages, absent = messages[valid], {name: mask[valid] for name, mask in absent.items()}
-        if absent:
-            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
-            messages = messages.view(np.dtype(types, metadata={"missing": tuple(absent)}))
-        return messages, absent
-
-    def _read_mcap(
-        self, reader: RecordingReader, addresses: Collection[Address]
-    ) -> dict[Address, tuple[MessageArray, _Mask, Absent]]:
-        """Read the file once, for all of these, some thousand messages at a time."""
-        parts = {address: [_decode(self.definitions[address], [])] for address in addresses}
-        recorded = reader.messages(parts.keys())
+            return {address: self._valid(address, _decode_ulog(topics[address])) for address in addresses}
+        parts = {address: [_decode_cdr(self.definitions[address], [])] for address in addresses}
+        recorded = self._file.messages(parts.keys())
         while chunk := list(islice(recorded, _CHUNK)):
             by_address: dict[Address, list[RecordedMessage]] = {}
             for each in chunk:
                 by_address.setdefault(each.stream.address, []).append(each)
             for address, own in by_address.items():
-                parts[address].append(_decode(self.definitions[address], own))
-        return {address: _join(self.definitions[address], own) for address, own in parts.items()}
+                parts[address].append(_decode_cdr(self.definitions[address], own))
+        return {
+            address: self._valid(address, _Decoded(*map(np.concatenate, zip(*own, strict=True))))
+            for address, own in parts.items()
+        }
+
+    def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
+        """Leave out invalid messages, and name the fields that are missing."""
+        messages, valid, absent = decoded
+        if not valid.all():
+            count = f"{np.sum(~valid)} of {len(valid)} messages"
+            self._invalid.append(f"{address.stream}: {count} violate the rules and are left out")
+            messages, absent = messages[valid], absent[valid]
+        masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
+        if masks:
+            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
+            messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
+        return messages, masks
 
 
-def _decode_ulog(topic: UlogTopic) -> tuple[MessageArray, _Mask, Absent]:
-    """Return the messages of a topic of a log, a mask of the valid ones, and masks of the missing fields."""
+class _Decoded(NamedTuple):
+    """Messages of one definition, a mask of the valid ones, and for each field whether a message lacks it."""
+
+    messages: MessageArray
+    valid: _Mask
+    absent: npt.NDArray[np.void]
+
+    @classmethod
+    def empty(cls, definition: Definition[Any], count: int) -> Self:
+        """Return messages of which nothing is provided, and none is valid yet."""
+        absent = np.zeros(count, [(name, bool) for name in definition.types])
+        return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
+
+
+def _decode_ulog(topic: UlogTopic) -> _Decoded:
     definition, columns = topic.definition, topic.columns
-    arrays, plan = arrays_of(definition), definition.plan(topic.columns)
-    messages = arrays.absent(len(columns["timestamp"]))
+    decoded, plan = _Decoded.empty(definition, len(columns["timestamp"])), definition.plan(columns)
+    messages = decoded.messages
     for name, old in plan.names.items():
         messages[name] = columns[old]
     for name, (old, convert) in plan.converted.items():
@@ -232,56 +241,39 @@ def _decode_ulog(topic: UlogTopic) -> tuple[MessageArray, _Mask, Absent]:
     for name, olds in plan.parts.items():
         for index, part in enumerate(olds):
             messages[name][:, index] = np.nan if part is None else columns[part]
-    valid = arrays.valid_mask(messages)
+    decoded.valid[:] = arrays_of(definition).valid_mask(messages)
     for name, column in columns.items():
         if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
             wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
-            valid &= ~wrong.reshape(len(messages), -1).any(axis=1)
-    lacking = (name for name in definition.types if name not in plan.provided)
-    return messages, valid, {name: np.ones(len(messages), bool) for name in lacking}
+            decoded.valid[wrong.reshape(len(messages), -1).any(axis=1)] = False
+    for name in definition.all_fields - plan.provided:
+        decoded.absent[name] = True
+    return decoded
 
 
-def _join(
-    definition: Definition[Any], parts: Sequence[tuple[MessageArray, _Mask, Absent]]
-) -> tuple[MessageArray, _Mask, Absent]:
-    """Return the parts as one, with masks of the fields that some of them lack."""
-    lacking = {name for _, _, absent in parts for name in absent}
-    absent = {
-        name: np.concatenate([part.get(name, np.zeros(len(array), bool)) for array, _, part in parts])
-        for name in definition.types
-        if name in lacking
-    }
-    arrays, valid, _ = zip(*parts, strict=True)
-    return np.concatenate(arrays), np.concatenate(valid), absent
-
-
-def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask, Absent]:
-    """Return messages, which of them are valid, and which lack a field.
-
-    They are decoded all at once, and one by one what that cannot decide.
-    """
+def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> _Decoded:
+    """Decode messages all at once, and those that this cannot decide one by one."""
     arrays = arrays_of(definition)
-    array, valid = arrays.absent(len(chunk)), np.zeros(len(chunk), bool)
+    decoded = _Decoded.empty(definition, len(chunk))
     by_stream: dict[int, list[int]] = {}  # a stream is one object of its reader
     for index, recorded in enumerate(chunk):
         by_stream.setdefault(id(recorded.stream), []).append(index)
-    absent: dict[str, _Mask] = {}
     for rows in by_stream.values():
         stream = chunk[rows[0]].stream
         if stream.layout.types.items() <= definition.types.items():
-            array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], stream.layout)
-        lacking = definition.all_fields - definition.plan(stream.layout.fields).provided | stream.missing
-        for name in lacking:
-            absent.setdefault(name, np.zeros(len(chunk), bool))[rows] = True
-    decoded: dict[int, Message] = {}
-    for index in np.flatnonzero(~valid).tolist():
+            payloads = [chunk[index].payload for index in rows]
+            decoded.messages[rows], decoded.valid[rows] = arrays.decode_cdr(payloads, stream.layout)
+        for name in definition.all_fields - (definition.plan(stream.layout.fields).provided - stream.missing):
+            decoded.absent[name][rows] = True
+    alone: dict[int, Message] = {}
+    for index in np.flatnonzero(~decoded.valid).tolist():
         with suppress(DecodeError, ValidationError):
             fields = decode_with(definition, chunk[index].payload, chunk[index].stream.layout)
-            decoded[index] = upgrade_with(definition, fields)
-    if decoded:
-        array[list(decoded)] = arrays.of(list(decoded.values()))
-        valid[list(decoded)] = True
-    return array, valid, absent
+            alone[index] = upgrade_with(definition, fields)
+    if alone:
+        decoded.messages[list(alone)] = arrays.of(list(alone.values()))
+        decoded.valid[list(alone)] = True
+    return decoded
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
