@@ -25,7 +25,7 @@ class Recorder:
     """
 
     def __init__(self, subscription: Subscription, path: Path) -> None:
-        check_recording(path, flight="flight.mcap")
+        check_recording(path)
         self._subscription = subscription
         self._writer = RecordingWriter(path)
 

@@ -31,17 +31,15 @@ def convert(
     *,
     source: str,
     on_progress: Callable[[int], object],
-    flight: str = "flight.ulg",
 ) -> str:
     """Write messages to a new MCAP file and return a summary; without success there is no file.
 
     A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
-    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far,
-    and `flight` is the file that the hint of an error names.
+    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far.
 
     Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
     """
-    recording.check_recording(path, flight=flight)
+    recording.check_recording(path)
     try:
         with whole_file(path) as part:
             return _write(messages, part, source=source, on_progress=on_progress)

@@ -80,7 +80,6 @@ def convert(
             run.messages,
             output,
             source=spec.kind,
-            flight=str(source),
             on_progress=lambda done: show(f"{output}", done, run.total),
         )
     write_stderr(f"{output}: {report}")
