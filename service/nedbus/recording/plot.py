@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -47,7 +47,7 @@ _GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
 """The number of streams that one plot can show."""
 
-_FLAGS: Final = [flag for flag in FLAGS.values() if flag.kind == "estimate"]
+_FLAGS: Final = [name for name, flag in FLAGS.items() if flag.kind == "estimate"]
 _HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
 _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy", "vz", "heading")}
 
@@ -63,16 +63,6 @@ class _Stream(NamedTuple):
     def resets(self, counter: str) -> Any:
         """Return the times at which a reset counter changed [s]."""
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One row of the lower part: the intervals in which a flag is set, or the times of resets."""
-
-    label: str
-    color: str
-    bars: Sequence[tuple[float, float]]
-    marks: Sequence[float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +105,7 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
         _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
         for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
-    rows = [row for stream in drawn for row in _rows(stream, f" {stream.address}" if len(drawn) > 1 else "")]
+    rows = _rows(drawn)
     marks = _marks(drawn, start / 1e6, events)
     by_row = _by_row(marks)
     heights = [_FRAME + _ROW * len(each) for each in (rows, by_row) if each]
@@ -191,24 +181,28 @@ def _draw_lines(
         axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=stream.color, linewidth=width)
 
 
-def _rows(stream: _Stream, suffix: str) -> Iterator[_Row]:
-    """Yield a row for each flag of a stream, for each kind of reset that occurred, and for resets of heading."""
-    missing = missing_of(stream.messages)
-    for flag in _FLAGS:
-        if flag.name not in missing:
-            shown = _WARNING_COLOR if flag.inverted else stream.color
-            yield _Row(flag.name + suffix, shown, _intervals(stream.seconds, stream.messages[flag.name]), ())
-    for counter, name in _COUNTERS.items():
-        times = stream.resets(counter)
-        if counter not in missing and (name == "heading" or len(times)):
-            yield _Row(f"{name} resets{suffix}", stream.color, (), times)
+def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
+    """Return label, stream and field of each row: flags, kinds of reset that occurred, and resets of heading."""
+    rows: list[tuple[str, _Stream, str]] = []
+    for stream in streams:
+        suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
+        rows += ((name + suffix, stream, name) for name in _FLAGS if name not in missing)
+        for counter, name in _COUNTERS.items():
+            if counter not in missing and (name == "heading" or len(stream.resets(counter))):
+                rows.append((f"{name} resets{suffix}", stream, counter))
+    return rows
 
 
-def _draw_rows(axes: Any, rows: Sequence[_Row]) -> None:
-    for number, row in enumerate(rows):
-        axes.broken_barh(row.bars, (number - 0.35, 0.7), color=row.color)
-        axes.plot(row.marks, np.full(len(row.marks), number), "|", color=row.color, markersize=7)
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize="x-small" if len(rows) > 12 else "small")
+def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
+    for number, (_, stream, field) in enumerate(rows):
+        if field in _COUNTERS:
+            times = stream.resets(field)
+            axes.plot(times, np.full(len(times), number), "|", color=stream.color, markersize=7)
+        else:
+            flag, color = stream.messages[field], _WARNING_COLOR if FLAGS[field].inverted else stream.color
+            is_shown = flag | np.append(False, flag[:-1])  # until the first message where it is not set
+            axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
+    axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
     axes.set(title="set flags, and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
 
@@ -217,7 +211,8 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
     """Return the marks of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
     told = [event for event in events if event.boot is not None]
     marks: list[_Mark] = []
-    for vehicle in sorted({stream.address.vehicle for stream in streams}):
+    vehicles = sorted({stream.address.vehicle for stream in streams})
+    for vehicle in vehicles:
         seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
         first, last = float(seconds.min()), float(seconds.max())
         found: dict[Event, _Mark] = {}  # flags that began together have one mark, until the last one ends
@@ -231,6 +226,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
                 continue
             row = _QUIET.get(event.kind, event.kind.replace("_", " "))
             text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+            row += f" {vehicle}" if len(vehicles) > 1 else ""
             end = max(begin, last if span.until is None else min(span.until + offset, last))
             end = max(end, found[event].end) if event in found else end
             found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
@@ -239,16 +235,11 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
 
 
 def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
-    """Return the marks of each row, by its label: rows with the worst first."""
-    several = len({mark.vehicle for mark in marks}) > 1
+    """Return the marks of each row by its label, rows with the worst first."""
     rows: dict[str, list[_Mark]] = {}
-    for mark in marks:
-        rows.setdefault(f"{mark.row} {mark.vehicle}" if several else mark.row, []).append(mark)
-
-    def rank(label: str) -> int:
-        return min(SEVERITIES.index(mark.severity) for mark in rows[label])
-
-    return {label: rows[label] for label in sorted(rows, key=rank)}
+    for mark in sorted(marks, key=lambda mark: SEVERITIES.index(mark.severity)):
+        rows.setdefault(mark.row, []).append(mark)
+    return {label: sorted(own, key=lambda mark: mark.begin) for label, own in rows.items()}
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
@@ -311,13 +302,7 @@ def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
 
 def _explain_missing(streams: Sequence[_Stream]) -> str:
     """Return the rows that are not drawn, as the flight does not have them."""
-    drawn = [flag.name for flag in _FLAGS] + list(_COUNTERS)
-    missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
+    missing = {
+        each.address: [name for name in (*_FLAGS, *_COUNTERS) if name in missing_of(each.messages)] for each in streams
+    }
     return "\n".join(f"{address} does not have {', '.join(names)}" for address, names in missing.items() if names)
-
-
-def _intervals(seconds: Any, flag: Any) -> list[tuple[float, float]]:
-    """Return start and length of each interval in which a flag is set, up to the first message where it is not."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], flag, [False])).astype(np.int8)))
-    ends = np.minimum(edges[1::2], len(seconds) - 1)
-    return [(float(seconds[a]), float(seconds[b] - seconds[a])) for a, b in zip(edges[::2], ends, strict=True)]
