@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from .reader import RecordedMessage, RecordingReader
+    from .reader import RecordedMessage, RecordedStream, RecordingReader
 
 _log = logging.getLogger(__name__)
 
@@ -255,11 +255,10 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
     """Decode messages all at once, and those that this cannot decide one by one."""
     arrays = arrays_of(definition)
     decoded = _Decoded.empty(definition, len(chunk))
-    by_stream: dict[int, list[int]] = {}  # a stream is one object of its reader
+    by_stream: dict[RecordedStream, list[int]] = {}
     for index, recorded in enumerate(chunk):
-        by_stream.setdefault(id(recorded.stream), []).append(index)
-    for rows in by_stream.values():
-        stream = chunk[rows[0]].stream
+        by_stream.setdefault(recorded.stream, []).append(index)
+    for stream, rows in by_stream.items():
         if stream.layout.types.items() <= definition.types.items():
             payloads = [chunk[index].payload for index in rows]
             decoded.messages[rows], decoded.valid[rows] = arrays.decode_cdr(payloads, stream.layout)
