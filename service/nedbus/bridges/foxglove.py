@@ -51,9 +51,8 @@ class FoxgloveServer:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[Address, foxglove.Channel] = {}
-        self._unseen: dict[
-            Address, tuple[Message, int]
-        ] = {}  # the last of streams without a rate, until a client subscribes
+        # The last messages of streams without a rate, until a client subscribes.
+        self._unseen: dict[Address, tuple[Message, int]] = {}
         self._poses: dict[str, PoseInFrameChannel] = {}
         self._locations: dict[str, LocationFixChannel] = {}
         self._attitudes: dict[str, Any] = {}  # the last message of each vehicle

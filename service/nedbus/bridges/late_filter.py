@@ -31,7 +31,7 @@ class LateFilter:
         self._latest = 0  # ns that the latest of them was late
 
     def admits(self, sample: Sample, *, arrived: int) -> bool:
-        """Return whether a sample is current, as one without a timestamp is.
+        """Return True for a current sample, and for one without a timestamp.
 
         `arrived` is in ns of this host's monotonic clock.
         """

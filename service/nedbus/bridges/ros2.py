@@ -70,7 +70,7 @@ class Ros2Bridge:
 
     `selection`: the addresses to publish, all without it; `layout`: a release of PX4, or a layout.
     `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
-    `observer`: another session at the same router, to see what others see: access control denies silently.
+    `observer`: another session at the same router, to notice access control, which denies silently.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -251,7 +251,7 @@ class Ros2Bridge:
         if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
             self._left_out.add(address)
             known = address.topic in BY_TOPIC
-            reason = f"PX4 {self._layout} has no such message" if known else "nothing says what it is in px4_msgs"
+            reason = f"PX4 {self._layout} has no such message" if known else "its message in px4_msgs is not known"
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
         return False
 

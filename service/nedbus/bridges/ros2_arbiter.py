@@ -33,7 +33,7 @@ class Decision:
 
 
 class Ros2Arbiter:
-    """Follow the addresses of the bus and the nodes of ROS 2, and decide what changes.
+    """Follow the addresses of the bus and the nodes of ROS 2, and decide the changes.
 
     A namespace stands before the topics of every vehicle but "1": that of `namespaces`, else the vehicle's name, or
     `px4_<name>` where ROS 2 requires a leading letter.
@@ -61,7 +61,7 @@ class Ros2Arbiter:
     def update(
         self, addresses: Collection[Address], other_nodes: Mapping[Address, str], *, now: float
     ) -> list[Decision]:
-        """Return what changes, with these addresses on the bus, and the nodes that publish the topics of some of them.
+        """Return the changes, with these addresses on the bus, and the nodes that publish the topics of some of them.
 
         `now` is in seconds, of any monotonic clock.
         """

@@ -67,7 +67,7 @@ def align(
     `on` gives the rows: a stream, whose messages they are, a rate [Hz], or times as PX4's `timestamp` has them [us].
     Columns are `timestamp` [us], and of each stream `<stream>.<field>` and `<stream>.age` [s]: the time since the
     message that the values are from, NaN where there is none yet; then floats are NaN, others 0 or false.
-    With `dataframe` it is a data frame as `read` returns it; what is not there is null.
+    With `dataframe` it is a data frame as `read` returns it; a missing value is null.
 
     `method`: "last" takes the last message that is not later: no value is from the future.
     "nearest" takes that nearest in time, so that an age can be negative. "linear" interpolates floats between the

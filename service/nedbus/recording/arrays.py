@@ -91,7 +91,7 @@ def read(
 
     Its columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
     Fields that a layout or a source lacks are NaN, false or 0, and `nedbus.missing_of` names them.
-    Invalid messages are left out, and so is what is damaged; both are logged.
+    Invalid messages and damaged parts of the file are left out, and logged.
     With `dataframe` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
     missing fields are null; that of pandas names them in `attrs["missing"]`.
     For a list of topics, or of streams such as "sensor_gps/1", it is a dict by stream, of one vehicle; "*" stands for
@@ -217,7 +217,7 @@ class Flight:
 
 
 class _Decoded(NamedTuple):
-    """Messages of one definition, a mask of the valid ones, and for each field whether a message lacks it."""
+    """Messages of one definition, a mask of the valid ones, and for each field a mask of the messages that lack it."""
 
     messages: MessageArray
     valid: _Mask

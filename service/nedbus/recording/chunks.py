@@ -1,4 +1,4 @@
-"""Read the records of an MCAP file chunk by chunk; leave out and report what is damaged.
+"""Read the records of an MCAP file chunk by chunk; leave out and report damaged parts.
 
 The summary, which has a CRC of its own, lists the chunks; without one the records are followed one by one.
 Chunks are unpacked into bounded memory: the readers of the `mcap` package have no limit, and stop at the first damage.
@@ -55,7 +55,7 @@ class ChunkFile:
     """An MCAP file that is open for reading.
 
     `summary`: the schemas, channels, chunk indexes and statistics of the summary; empty without one, or if damaged.
-    `warnings`: the damage found so far; `damaged`: whether it cost messages.
+    `warnings`: the damage found so far; `damaged`: True if it cost messages.
 
     Raises SourceError for a file that is not MCAP or cannot be opened.
     """

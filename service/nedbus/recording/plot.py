@@ -42,7 +42,7 @@ _QUIET: Final = {
 }  # fmt: skip
 """The events of severity info that are shown, each with its row."""
 
-_NEAR: Final = 1.0  # s between an event and the message that tells where it was
+_NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
 """The number of streams that one plot can show."""
@@ -85,7 +85,7 @@ def draw(
     Each stream has at least one message.
     Times are seconds since the first message of all, positions local NED in metres; altitude is -z.
     Fields that `missing_of` names are not drawn, and the plot says so.
-    `events`: those of the streams' vehicles are marked if they are bad or to be watched, or of mode, arming or landing.
+    `events`: of those of the streams' vehicles, bad ones, those to watch, and modes, arming and landing are marked.
 
     Raises ConfigError for another suffix, OutputError when the file cannot be written; then there is none.
     """
@@ -93,7 +93,7 @@ def draw(
         raise ConfigError(str(path), f"expected a picture: a file that ends with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            draw_figure(streams, title=title, events=events).savefig(part)  # a box for what the font lacks
+            draw_figure(streams, title=title, events=events).savefig(part)  # a character that the font lacks is a box
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
@@ -243,7 +243,7 @@ def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark what is bad or to be watched where it began: on the track, and on the time axes of altitude and speed."""
+    """Mark the begin of bad events and of those to watch, on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():

@@ -25,7 +25,7 @@ _MESSAGE_HEADER: Final = 3  # bytes
 _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
 _MIN_READ_COST: Final = 4096  # bytes of the budget that any read costs
-_BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside what its size makes plausible
+_BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside 1000 times its size
 _MAX_FIELDS: Final = 1000  # that are read of a format; a message has fewer
 _MAX_NESTING: Final = 3  # levels of messages within messages; PX4 has one
 _INDEX = re.compile(r"\[(\d+)\]")
@@ -39,7 +39,7 @@ UlogColumns = Mapping[str, npt.NDArray[np.generic]]
 
 @dataclass(frozen=True, slots=True)
 class UlogTopic:
-    """One topic of a log, whose message is described by a file of ours, or by the log itself."""
+    """One topic of a log; its message is a known one, or described by the log."""
 
     address: Address
     definition: Definition[Any]
@@ -50,7 +50,7 @@ class UlogTopic:
 class UlogTopics:
     """Topics of a log.
 
-    `warnings`: the damage, and the parts that are left out; `damaged`: whether damage may have cost messages.
+    `warnings`: the damage, and the parts that are left out; `damaged`: True if damage may have cost messages.
     A log has no checksums: damage inside the values of a message cannot be noticed.
     """
 
@@ -62,7 +62,7 @@ class UlogTopics:
 def read_ulog(
     path: Path, *, topics: Collection[str] | None = TOPICS, vehicle: str | None = None, default_vehicle: str = "1"
 ) -> UlogTopics:
-    """Return these topics of a log, or all for None; topics without a file of ours are described by the log's formats.
+    """Return these topics of a log, or all for None; unknown messages are described by the log's formats.
 
     `vehicle` is the log's MAV_SYS_ID unless it is given, and `default_vehicle` if the log has none.
 

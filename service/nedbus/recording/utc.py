@@ -20,7 +20,7 @@ from .flight_files import matching, require_one_vehicle
 _FIELDS: Final = ("time_utc_usec", "estimated_offset")  # a GNSS receiver's UTC, or the offset to a companion's clock
 _RELATIVE: Final = "timestamp_time_relative"  # us, of a receiver's UTC after its timestamp
 _PLAUSIBLE: Final = (946_684_800_000_000, 4_102_444_800_000_000)  # us: 2000 to 2100; other clocks have no date
-_TOLERANCE: Final = 1_000_000  # us from the median to what still agrees with it
+_TOLERANCE: Final = 1_000_000  # us from the median; messages within agree
 _AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock that was set
 
 
@@ -28,7 +28,7 @@ _AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock t
 class UtcOffset:
     """Unix time minus the vehicle's `timestamp` [us], and its source.
 
-    `source`: the stream that tells it. With timesync_status it is the clock of a companion, as good as that one is.
+    `source`: its stream. With timesync_status it is the clock of a companion, and as good as that clock.
     `offset_us`: the median of its messages. A GNSS fix is some tenths of a second older than its message.
     `count`: the messages that agree to a second; `spread_us`: from the least to the greatest of these.
     """
@@ -51,8 +51,8 @@ def utc_of(
     Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
     `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
 
-    A GNSS receiver tells it if its `time_utc_usec` is not 0, and `timesync_status` the clock of a companion: that is
-    taken for UTC only if it has a date after 2000. Where messages disagree by more than a second there is none.
+    The source is a GNSS receiver whose `time_utc_usec` is not 0, or the clock of a companion in `timesync_status`,
+    which counts as UTC only with a date after 2000. Where messages disagree by more than a second there is none.
 
     Raises AddressError for several vehicles, without the name of one; other errors are those of `read`.
     """

@@ -38,10 +38,10 @@ class RecordingWriter:
 
     There is one channel for each address and provenance, in the current layout of its message, or in that of PX4 which
     has just the fields that its source provides, where no layout of PX4 has all.
-    A chunk, of up to `chunk_size` bytes before compression, is what damage of one bit costs.
+    Damage of one bit costs a chunk, of up to `chunk_size` bytes before compression.
 
-    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written: then what was flushed
-    can still be read.
+    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written; messages that were
+    flushed can still be read.
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
@@ -188,7 +188,7 @@ class _AppendFile:
         """Do nothing: `sync` writes to the disk."""
 
     def sync(self, end: bytes = _END) -> None:
-        """Write what is pending, and an end behind it, to the disk; restore the previous end if that fails."""
+        """Write the pending data and an end behind it to the disk; restore the previous end if that fails."""
         pending = bytes(self._pending)
         self._pending.clear()
         try:
