@@ -95,15 +95,12 @@ def align(
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps.values())
-    types: list[tuple[str, Any]] = [("timestamp", "u8"), *[("utc", "M8[us]")] * utc]
-    for name, (messages, _) in streams.items():
-        types += [(f"{name}.age", "f8"), *((f"{name}.{field}", kind) for field, kind in _fields(messages))]
-    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
-    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
-    table["timestamp"] = times
+    columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
         offset = utc_of(flight, vehicle=vehicle)
-        table["utc"] = (times + offset.offset_us).astype("M8[us]") if offset else np.datetime64("NaT", "us")
+        columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
+        if offset:
+            columns["utc"] = (times + offset.offset_us).astype("M8[us]")
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
@@ -113,10 +110,15 @@ def align(
         values = padded[rows]
         if method == "linear":
             _interpolate(name, values, padded[following], weight)
-        table[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+        columns[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
         for field, _ in _fields(messages):
-            table[f"{name}.{field}"] = values[field]
+            columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
+    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
+    types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
+    for name, column in columns.items():
+        table[name] = column
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
@@ -162,14 +164,11 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
     """Return values between two; of angles the shorter way around, from 0 or minus half a period on, as they are."""
-    with np.errstate(invalid="ignore"):  # infinity minus itself
+    with np.errstate(invalid="ignore"):  # infinity minus itself, and no period
         step = second - first
-        seam = np.abs(step) > period / 2
-        if not seam.any():
-            return first + weight * step
-        found = first + weight * (step - np.sign(step) * period)
+        turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
-        return np.where(seam, start + np.mod(found - start, period), first + weight * step)
+        return np.where(np.abs(step) > period / 2, start + np.mod(turned - start, period), first + weight * step)
 
 
 def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:
