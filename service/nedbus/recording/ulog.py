@@ -120,9 +120,7 @@ def _describe(formats: Mapping[str, Any], topic: str) -> Definition[Any]:
     return _define(name, tuple(islice(_fields(formats, topic), _MAX_FIELDS)))
 
 
-@lru_cache(1024)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
-def _define(name: str, fields: tuple[tuple[str, FieldType], ...]) -> Definition[Any]:
-    return define(name, fields)
+_define = lru_cache(1024)(define)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
 
 
 def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:
