@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
-from foxglove.messages import Quaternion
+from foxglove.messages import Quaternion, Vector3
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
@@ -53,8 +54,7 @@ class FoxgloveServer:
         self._fields: dict[Address, foxglove.Channel] = {}
         # The last messages of streams without a rate, until a client subscribes.
         self._unseen: dict[Address, tuple[Message, int]] = {}
-        self._poses: dict[str, PoseInFrameChannel] = {}
-        self._locations: dict[str, LocationFixChannel] = {}
+        self._vehicles: dict[str, _Vehicle] = {}
         self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
         self._map = MapFrame()
         try:
@@ -118,19 +118,21 @@ class FoxgloveServer:
             self._unseen[address] = message, time_ns  # it may never come again
 
     def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
-        if vehicle not in self._poses:
-            self._poses[vehicle] = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
-            self._locations[vehicle] = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+        shown = self._vehicles.get(vehicle)
+        if shown is None:
+            pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
+            location = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+            shown = self._vehicles[vehicle] = _Vehicle(pose, location)
         if has_position(message):
             x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
             orientation = Quaternion(x=x, y=y, z=z, w=w)
-            self._poses[vehicle].log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
-            local_in_map = self._map.locate(vehicle, message)
-            transforms = to_transforms(vehicle, message, orientation, local_in_map=local_in_map, time_ns=time_ns)
+            shown.pose.log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
+            local = shown.local_in_map = self._map.locate(message) or shown.local_in_map
+            transforms = to_transforms(vehicle, message, orientation, local_in_map=local, time_ns=time_ns)
             self._transforms.log(transforms, log_time=time_ns)
-        location = to_location(vehicle, message, time_ns=time_ns)
-        if location is not None:
-            self._locations[vehicle].log(location, log_time=time_ns)
+        fix = to_location(vehicle, message, time_ns=time_ns)
+        if fix is not None:
+            shown.location.log(fix, log_time=time_ns)
 
     def _close_unpublished(self) -> None:
         """Close the channels of addresses that are no longer published."""
@@ -143,7 +145,16 @@ class FoxgloveServer:
             if address.topic == _ATTITUDE:
                 self._attitudes.pop(address.vehicle, None)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
-        for vehicle in self._poses.keys() - vehicles:
-            self._poses.pop(vehicle).close()
-            self._locations.pop(vehicle).close()
-            self._map.forget(vehicle)
+        for name in self._vehicles.keys() - vehicles:
+            vehicle = self._vehicles.pop(name)
+            vehicle.pose.close()
+            vehicle.location.close()
+
+
+@dataclass(slots=True)
+class _Vehicle:
+    """The channels of a vehicle, and the last known translation of its local frame in the map."""
+
+    pose: PoseInFrameChannel
+    location: LocationFixChannel
+    local_in_map: Vector3 = field(default_factory=lambda: Vector3(x=0.0, y=0.0, z=0.0))

@@ -29,23 +29,18 @@ class MapFrame:
     def __init__(self) -> None:
         self._projection: MapProjection | None = None
         self._altitude = math.nan
-        self._translations: dict[str, Vector3] = {}  # by vehicle
 
-    def locate(self, vehicle: str, message: VehicleLocalPosition) -> Vector3:
-        """Return the translation of a vehicle's local frame in the map, ENU in metres; zero without a global origin."""
-        if message.xy_global:
-            if self._projection is None:
-                self._projection = MapProjection(message.ref_lat, message.ref_lon)
-            if math.isnan(self._altitude) and message.z_global:
-                self._altitude = message.ref_alt
-            north, east = self._projection.project(message.ref_lat, message.ref_lon)
-            up = message.ref_alt - self._altitude
-            self._translations[vehicle] = Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
-        return self._translations.get(vehicle, Vector3(x=0.0, y=0.0, z=0.0))
-
-    def forget(self, vehicle: str) -> None:
-        """Drop the translation of a vehicle that is no longer published."""
-        self._translations.pop(vehicle, None)
+    def locate(self, message: VehicleLocalPosition) -> Vector3 | None:
+        """Return the translation of a vehicle's local frame, ENU in metres; None without a global origin."""
+        if not message.xy_global:
+            return None
+        if self._projection is None:
+            self._projection = MapProjection(message.ref_lat, message.ref_lon)
+        if math.isnan(self._altitude) and message.z_global:
+            self._altitude = message.ref_alt
+        north, east = self._projection.project(message.ref_lat, message.ref_lon)
+        up = message.ref_alt - self._altitude
+        return Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
 
 def has_position(message: VehicleLocalPosition) -> bool:
