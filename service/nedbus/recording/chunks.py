@@ -131,10 +131,11 @@ class ChunkFile:
         """Yield each chunk, and each schema, channel and message outside of chunks, from one record to the next."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
-            head = self._read(offset, _RECORD_HEAD.size)
-            opcode, length = _RECORD_HEAD.unpack(head) if len(head) == _RECORD_HEAD.size else (0, 0)
+            begin = self._read(offset, _RECORD_HEAD.size + 64)
+            opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
             end = offset + _RECORD_HEAD.size + length
-            if opcode == 0 or end > self._size or not self._is_plausible(opcode, offset, length):
+            own_length = _own_length(opcode, begin[_RECORD_HEAD.size :])
+            if opcode == 0 or end > self._size or own_length not in (None, length):
                 self.warn(f"cut or damaged: all from byte {offset} of {self._size} on is left out", lost=True)
                 return
             if opcode in _LENGTHS:
@@ -146,18 +147,15 @@ class ChunkFile:
                 yield opcode, offset, end
             offset = end
 
-    def _is_plausible(self, opcode: int, offset: int, length: int) -> bool:
-        """Return whether a record has the length that its own fields give."""
-        body = self._read(offset + _RECORD_HEAD.size, min(length, 64))
-        if opcode == Opcode.MESSAGE_INDEX:
-            return length >= 6 and struct.unpack_from("<I", body, 2) == (length - 6,)
-        if opcode != Opcode.CHUNK:
-            return _LENGTHS.get(opcode, length) == length
-        if length < _CHUNK_HEAD.size:
-            return False
-        *_, name_length = _CHUNK_HEAD.unpack_from(body)
-        before: int = _CHUNK_HEAD.size + name_length + 8
-        return name_length <= 8 and before + int.from_bytes(body[before - 8 : before], "little") == length
+
+def _own_length(opcode: int, body: bytes) -> int | None:
+    """Return the length of a record by its own first fields, None for a kind without such fields."""
+    if opcode == Opcode.MESSAGE_INDEX:
+        return 6 + int.from_bytes(body[2:6], "little")
+    if opcode == Opcode.CHUNK:
+        before = _CHUNK_HEAD.size + int.from_bytes(body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little")
+        return before + 8 + int.from_bytes(body[before : before + 8], "little")
+    return _LENGTHS.get(opcode)
 
 
 def records_of(part: bytes) -> Iterator[McapRecord]:
