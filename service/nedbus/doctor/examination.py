@@ -12,7 +12,7 @@ from typing import Final
 from nedbus.errors import NedbusError
 from nedbus.extras import needs
 from nedbus.settings import Settings
-from nedbus.sources import check_link
+from nedbus.sources import parse_link
 from nedbus.transport import Tls, open_client, probe_writes
 
 from .check import check_sources
@@ -54,7 +54,7 @@ def examine(
     findings = [*_describe_settings(settings), *(finding for _, finding in tls_findings)]
     checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
     if mavlink is not None:
-        check_link(mavlink)
+        parse_link(mavlink)
         checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink, listen)
     for endpoint in settings.routers[:_MAX_ROUTERS]:
         checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
