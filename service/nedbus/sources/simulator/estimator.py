@@ -10,6 +10,7 @@ Every lap of 120 s has what estimates have in real flights:
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from random import Random
 from typing import Any, Final
 
@@ -47,8 +48,6 @@ class Estimator:
         self._error = [self._random.gauss(0.0, noise) for _ in range(3)]
         self._drift = [0.0, 0.0]
         self._heading_error = 0.0 if aided else self._random.choice((-1, 1)) * self._random.uniform(0.1, 0.3)
-        self._gyro = 0.0
-        self._last_heading: float | None = None
         self._dead_reckoning = 0.0  # s since the last position aiding
         self._counters = dict.fromkeys(("xy", "z", "vxy", "vz", "heading"), 0)
         self._deltas: dict[str, Any] = {"xy": (0.0, 0.0), "z": 0.0, "vxy": (0.0, 0.0), "vz": 0.0, "heading": 0.0}
@@ -61,39 +60,22 @@ class Estimator:
             self._reset_position()
         else:
             self._wander()
-        if not self._aided and _is_at(lap_time, _HEADING_RESET):
-            self._reset("heading", -self._heading_error)
-            self._heading_error = 0.0
-        if not self._aided and _is_at(lap_time, _Z_RESET):
-            delta = self._random.gauss(0.0, 1.0) - self._error[2]
-            self._error[2] += delta
-            self._reset("z", delta)
-        if not self._aided and _is_at(lap_time, _HEADING_DISTURBED):
-            self._heading_error = self._random.gauss(0.0, 0.15)
-        turned = wrap(truth.heading - self._last_heading) if self._last_heading is not None else 0.0
-        self._gyro = wrap(self._gyro + turned + self._random.gauss(0.0, 2e-5))
-        self._last_heading = truth.heading
+        if not self._aided:
+            self._disturb(lap_time)
 
     def fields(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the message of this moment; EKF2's limits are infinite."""
-        x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
-        vx, vy = truth.velocity[0] + self._drift[0], truth.velocity[1] + self._drift[1]
-        vz = truth.velocity[2]
-        xy_valid, spread = self.xy_valid, self._spread
+        position = [value + error for value, error in zip(truth.position, self._error, strict=True)]
+        velocity = [value + drift for value, drift in zip(truth.velocity, (*self._drift, 0.0), strict=True)]
         return {
-            **_timestamps(time),
-            "xy_valid": xy_valid, "z_valid": True, "v_xy_valid": xy_valid, "v_z_valid": True,
-            "x": x, "y": y, "z": z,
+            **_motion(time, position, velocity, truth.acceleration, origin=time >= ORIGIN_SET),
+            **dict.fromkeys(("xy_valid", "v_xy_valid"), self.xy_valid), "z_valid": True, "v_z_valid": True,
             **{f"delta_{name}": delta for name, delta in self._deltas.items()},
             **{f"{name}_reset_counter": count for name, count in self._counters.items()},
-            "vx": vx, "vy": vy, "vz": vz, "z_deriv": vz + self._random.gauss(0.0, 0.02),
-            **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
             "heading": wrap(truth.heading + self._heading_error), "heading_var": 0.001 + self._heading_error**2,
-            "unaided_heading": self._gyro,
+            "unaided_heading": truth.heading,
             "heading_good_for_control": self._counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
-            **_origin(known=time >= ORIGIN_SET),
-            **_terrain(z),
-            "eph": spread, "epv": self._noise * 3,
+            "eph": self._spread, "epv": self._noise * 3,
             "evh": self._noise / 2 + 0.05 * self._dead_reckoning, "evv": self._noise / 2,
             "dead_reckoning": self._dead_reckoning > 0,
             **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
@@ -143,6 +125,18 @@ class Estimator:
             self._drift[axis] += self._random.gauss(0.02, 0.2) * TICK
             self._error[axis] += self._drift[axis] * TICK
 
+    def _disturb(self, lap_time: float) -> None:
+        """Reset heading and height, and give the heading the error that the next reset corrects."""
+        if _is_at(lap_time, _HEADING_RESET):
+            self._reset("heading", -self._heading_error)
+            self._heading_error = 0.0
+        elif _is_at(lap_time, _Z_RESET):
+            delta = self._random.gauss(0.0, 1.0) - self._error[2]
+            self._error[2] += delta
+            self._reset("z", delta)
+        elif _is_at(lap_time, _HEADING_DISTURBED):
+            self._heading_error = self._random.gauss(0.0, 0.15)
+
     def _reset_position(self) -> None:
         """Reset position and velocity to those of GPS, which is back."""
         new = [self._random.gauss(0.0, self._noise) for _ in range(2)]
@@ -158,15 +152,10 @@ def truth_fields(time: float, truth: Truth) -> dict[str, object]:
     """Return the groundtruth message: variances and limits are 0, as simulators send them."""
     return {
         **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
-        **_timestamps(time),
-        "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
+        **_motion(time, truth.position, truth.velocity, truth.acceleration, origin=True),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
-        **dict(zip(("x", "y", "z"), truth.position, strict=True)),
-        **dict(zip(("vx", "vy", "vz"), truth.velocity, strict=True)),
-        **dict(zip(("ax", "ay", "az"), truth.acceleration, strict=True)),
-        "z_deriv": truth.velocity[2], "heading": truth.heading, "unaided_heading": truth.heading,
-        **_origin(known=True),
-        **_terrain(truth.position[2]),
+        "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
+        "heading": truth.heading, "unaided_heading": truth.heading,
     }  # fmt: skip
 
 
@@ -175,19 +164,18 @@ def _timestamps(time: float) -> dict[str, object]:
     return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
 
 
-def _origin(*, known: bool) -> dict[str, object]:
-    latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
-    return {
-        "xy_global": known, "z_global": known, "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if known else 0,
-        "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
-    }  # fmt: skip
-
-
-def _terrain(z: float) -> dict[str, object]:
-    """Return the fields of a distance sensor above flat ground."""
-    distance = max(0.1, -z)
+def _motion(
+    time: float, position: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float], *, origin: bool
+) -> dict[str, object]:
+    """Return the fields that estimate and truth have in common, with a distance sensor above flat ground."""
+    latitude, longitude, altitude = REFERENCE if origin else (math.nan,) * 3
+    names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
     in_range = distance < _SENSOR_RANGE
     return {
+        **_timestamps(time),
+        **dict(zip(names, (*position, *velocity, *acceleration), strict=True)), "z_deriv": velocity[2],
+        "xy_global": origin, "z_global": origin, "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if origin else 0,
+        "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
         "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
         "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
         "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from random import Random
-from typing import Final
+from typing import Final, NamedTuple
 
 from nedbus_msgs import wrap
 
@@ -17,8 +16,7 @@ _STEP: Final = 1e-3  # s, of the derivatives
 Vector = tuple[float, ...]  # north, east, down
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(NamedTuple):
     """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad]."""
 
     position: Vector
@@ -50,11 +48,8 @@ class Trajectory:
         phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
         along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
         cos, sin = math.cos(self._direction), math.sin(self._direction)
-        return (
-            along * cos - across * sin,
-            along * sin + across * cos,
-            -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2),
-        )
+        down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
+        return along * cos - across * sin, along * sin + across * cos, down
 
 
 def _smoothstep(part: float) -> float:

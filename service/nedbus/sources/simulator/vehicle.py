@@ -14,7 +14,6 @@ from .trajectory import CLIMB, Truth
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = BOOT - 1_000_000  # us since boot
-_CELLS: Final = 4
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
 _ENDURANCE: Final = 1200.0  # s after which it flies on with a full battery; a fifth is left then
@@ -39,7 +38,6 @@ class SimulatedVehicle:
         return {
             "timestamp": now, "armed_time": _ARMED, "takeoff_time": BOOT,
             "arming_state": _Status.ARMING_STATE_ARMED,
-            "latest_arming_reason": _Status.ARM_DISARM_REASON_COMMAND_EXTERNAL,
             "nav_state": mode, "nav_state_display": mode, "nav_state_timestamp": self._mode_since,
             "nav_state_user_intention": flown, "failsafe": failsafe,
             "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
@@ -71,13 +69,11 @@ class SimulatedVehicle:
         """Return a battery that a constant current discharges."""
         discharged = _CURRENT * (time % _ENDURANCE) / 3.6
         remaining = 1.0 - discharged / _CAPACITY
-        cell = 3.5 + 0.7 * remaining
         return {
             "timestamp": BOOT + round(time * 1e6), "connected": True, "id": 1, "scale": 1.0,
-            "voltage_v": _CELLS * cell, "current_a": _CURRENT, "current_average_a": _CURRENT,
+            "voltage_v": 14.0 + 2.8 * remaining, "current_a": _CURRENT, "current_average_a": _CURRENT,
             "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
-            "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0,
-            "cell_count": _CELLS, "voltage_cell_v": (cell,) * _CELLS + (0.0,) * (14 - _CELLS),
+            "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0, "cell_count": 4,
         }  # fmt: skip
 
     def gps(self, time: float, truth: Truth) -> dict[str, object]:
