@@ -51,14 +51,13 @@ def write_access_rules(
 ) -> tuple[list[str], list[str]]:
     """Write rules for exactly these vehicles into a router's file, whole or not at all; nothing else in it changes.
 
-    The names are sorted as people do, 2 before 10, and each is written once. Returns those that the file did not name
-    before, and those that it names no more.
+    Returns those that the file did not name before, and those that it names no more, sorted.
 
     Raises AddressError for an invalid vehicle; ConfigError for no vehicle at all, and for a file that cannot be read or
     written or has no marks, which are those of `config/router-secure.json5`.
     """
     check_prefix(prefix)
-    names = sorted(set(vehicles), key=_natural)
+    names = sorted(set(vehicles))
     if not names:  # Zenoh takes no subject without names: the router would not start
         raise ConfigError.in_file(file, "name at least one vehicle")
     blocks = _find_blocks(file)
@@ -74,7 +73,7 @@ def write_access_rules(
             part.chmod(file.stat().st_mode)
     except OSError as exc:
         raise ConfigError.in_file(file, f"cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
-    return [name for name in names if name not in before], sorted(before - set(names), key=_natural)
+    return [name for name in names if name not in before], sorted(before - set(names))
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
@@ -111,8 +110,3 @@ def _sections(vehicles: Sequence[str], prefix: str) -> tuple[list[str], list[str
         subjects.append(f'{{ id: "{name}", cert_common_names: ["{name}"] }},')
         policies.append(f'{{ rules: ["{name}-in"], subjects: ["{name}"] }},')
     return rules, subjects, policies
-
-
-def _natural(vehicle: str) -> list[tuple[int, int, str]]:
-    """Return a sort key that compares numbers inside names by their value."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", vehicle)]

@@ -1,4 +1,4 @@
-"""Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
+"""The authority of a fleet, and the keys and certificates that it signs, lists and renews.
 
 The access control of `config/router-secure.json5` matches the common name of a certificate.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
@@ -23,9 +24,15 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from nedbus.errors import PkiError
 from nedbus.whole_file import whole_file
 
-from .certificate import DAYS, MAX_NAME
+from .certificate import DAYS, MAX_NAME, Certificate
 
 _CA_DAYS: Final = 3650
+_FOREIGN: Final = "signed by another authority"
+_UNFIT: Final = "not of the key beside it"
+_USAGES: Final = (
+    "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
+    "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
+)  # fmt: skip
 
 
 def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
@@ -52,6 +59,53 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
     authority = Authority.read(folder)
     key = new_key()
     return write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
+
+
+@dataclass(frozen=True, slots=True)
+class CertificateEntry:
+    """A certificate of a folder.
+
+    `name`: its common name, for an authority that of its file.
+    `use`: "authority", "router" or "client".
+    `problem`: why it is of no use although it has not ended, "" if it is of use.
+    """
+
+    path: Path
+    name: str
+    use: str
+    certificate: Certificate
+    problem: str
+
+
+def list_certificates(folder: Path) -> list[CertificateEntry]:
+    """Return the certificates of an authority's folder, the authority first, then those that end first.
+
+    Raises PkiError when the folder has no authority, or a certificate cannot be read.
+    """
+    authority = load_certificate(folder / "ca.crt")
+    found = [_describe(path, authority) for path in folder.glob("*.crt")]
+    return sorted(found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name))
+
+
+def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
+    """Replace a certificate by one of the same name and hosts that ends later, and return the files that are new.
+
+    The old one stays valid until it ends, wherever it is in use; so it does with `replace_key`, with its old key.
+    An authority keeps its key, or all that it signed would be void.
+
+    Raises PkiError for one that this folder's authority did not sign, and when a file cannot be read or written.
+    """
+    folder = entry.path.parent
+    authority = Authority.read(folder)
+    if entry.use == "authority":
+        return write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
+    if entry.problem == _FOREIGN:
+        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it where that authority is")
+    # The private key may be on its vehicle only: the old certificate has all that is needed of it.
+    key = new_key() if replace_key else None
+    public_key = key.public_key() if key else load_certificate(entry.path).public_key()
+    signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
+    return write_files(entry.path.with_suffix(""), signed, key, replace=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,17 +215,8 @@ def _builder(
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = dt.datetime.now(dt.UTC)
     until = now + dt.timedelta(days=days)
-    usage = x509.KeyUsage(
-        digital_signature=not is_authority,
-        key_cert_sign=is_authority,
-        crl_sign=is_authority,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
+    allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
+    usage = x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES})
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -194,3 +239,25 @@ def _host(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
+
+
+def _describe(path: Path, authority: x509.Certificate) -> CertificateEntry:
+    problem, certificate = _find_problem(path, authority), Certificate.read(path)
+    if path.name == "ca.crt":
+        return CertificateEntry(path, path.stem, "authority", certificate, problem)
+    return CertificateEntry(
+        path, certificate.subject, "router" if certificate.hosts else "client", certificate, problem
+    )
+
+
+def _find_problem(path: Path, authority: x509.Certificate) -> str:
+    certificate = load_certificate(path)
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        return _FOREIGN
+    try:
+        key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
+    except (OSError, ValueError, TypeError):
+        return ""  # the key is where it is used, or is not ours to read
+    return "" if key.public_key() == certificate.public_key() else _UNFIT
