@@ -318,23 +318,23 @@ class Limits:
 @pytest.mark.parametrize(
     ("limits", "soft", "warns"),
     [
-        (Limits(1024, 500_000), 2100, False),
-        (Limits(1024, resource.RLIM_INFINITY), 2100, False),
+        (Limits(1024, 500_000), 500_000, False),
+        (Limits(1024, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
         (Limits(20_000, 20_000), 20_000, False),
         (Limits(resource.RLIM_INFINITY, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
         (Limits(1024, 1500), 1500, False),
         (Limits(256, 1024), 1024, True),
         (Limits(256, 4096, refused=True), 256, True),
     ],
-    ids=["raised", "no hard limit", "enough", "none", "fewer handshakes", "too low", "refused"],
+    ids=["raised", "no hard limit", "enough", "none", "just enough", "too low", "refused"],
 )
 def test_files_of_a_router(
     limits: Limits, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The soft limit is raised as far as sessions and handshakes need, and what is missing is told."""
+    """The soft limit is raised to the hard one; a warning says that this is too low."""
     monkeypatch.setattr(router, "resource", limits)
     with caplog.at_level(logging.WARNING):
-        allow_sessions(1000, pending=1000)
+        allow_sessions(1000)
     assert limits.now[0] == soft
     assert bool(caplog.records) is warns
     if warns:
