@@ -8,15 +8,15 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
-from nedbus.errors import SourceError
 from nedbus.sources.source import Rejection
 from nedbus.transport import (
     LONGEST_TOKEN,
     PX4_TYPES,
+    AliveTokens,
     Session,
     TopicKey,
     node_token,
@@ -28,7 +28,6 @@ from nedbus.transport import (
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # of the payload of each
 _RING_SIZE: Final = 16_384  # samples that arrive until the thread takes them
-_MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
@@ -36,15 +35,15 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohNode:
-    """Messages of all publishers in order in `pending`, and their liveliness tokens; a context manager.
+    """Messages of all publishers in order in `pending`, and the `tokens` of these publishers; a context manager.
 
-    Zenoh puts them into channels in Rust, which a thread of ours empties: a callback would wait for the interpreter's
-    lock. Tokens of its own make ROS 2 list this source, and a publisher in ROS 2 see a subscriber.
+    Zenoh puts messages into a channel in Rust, which a thread of ours empties: a callback would wait for the
+    interpreter's lock. Tokens of its own make ROS 2 list this source, and a publisher in ROS 2 see a subscriber.
     """
 
-    def __init__(self, name: str, session: Session, *, domain: int | None) -> None:
+    def __init__(self, session: Session, *, domain: int | None) -> None:
         self.pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._name = name
+        self.tokens = AliveTokens(session, px4_publishers_key_expr(domain))
         self._session = session
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
@@ -53,24 +52,11 @@ class Px4ZenohNode:
         self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
         self._reported = Counter[tuple[str, str]]()
         key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_PENDING_TOKENS)
         with while_open():
-            tokens = session.liveliness().declare_subscriber(px4_publishers_key_expr(domain), ring, history=True)
-            messages = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
-        self._subscribers = tokens, messages
-        self._tokens: zenoh.Handler[zenoh.Sample] = tokens.handler
-        self._thread = threading.Thread(target=self._receive, args=[messages.handler], name="nedbus-px4", daemon=True)
+            self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
+        handler = self._subscriber.handler
+        self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
         self._thread.start()
-
-    def tokens(self) -> Iterator[zenoh.Sample]:
-        """Yield the liveliness tokens that changed; raise SourceError if some were dropped."""
-        with while_open():
-            for _ in range(_MAX_PENDING_TOKENS):
-                token = self._tokens.try_recv()
-                if token is None:
-                    return
-                yield token
-        raise SourceError(self._name, "publishers come and go faster than they can be followed")
 
     def dropped(self) -> Iterator[Rejection]:
         """Yield a rejection for the messages of each reason that were dropped since the last call."""
@@ -91,14 +77,18 @@ class Px4ZenohNode:
     def unsubscribe(self, key: TopicKey) -> None:
         """Withdraw the subscription to a topic that has no publisher any more."""
         if key in self._subscriptions:
-            _undeclare(self._subscriptions.pop(key))
+            with suppress(zenoh.ZError):  # its session may be closed already
+                self._subscriptions.pop(key).undeclare()
 
     def __enter__(self) -> Px4ZenohNode:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for declared in (*self._subscriptions.values(), *self._nodes.values(), *self._subscribers):
-            _undeclare(declared)
+        with suppress(zenoh.ZError):  # its session may be closed already
+            for token in (*self._subscriptions.values(), *self._nodes.values()):
+                token.undeclare()
+            self.tokens.undeclare()
+            self._subscriber.undeclare()
         self._thread.join(_JOIN_TIMEOUT)
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
@@ -115,8 +105,3 @@ class Px4ZenohNode:
                     self._dropped[_TOO_LARGE] += 1
                 else:
                     self.pending.put(sample)
-
-
-def _undeclare(declared: Any) -> None:
-    with suppress(zenoh.ZError):  # its session may be closed already
-        declared.undeclare()

@@ -13,9 +13,7 @@ from nedbus.sources.source import Absence
 from nedbus.transport import PublisherToken, TopicKey
 from nedbus_msgs import Address, get_topic
 
-_MAX_KEYS: Final = 5000  # that are followed; a vehicle has some dozens
-_MAX_PUBLISHERS: Final = 64  # of a key
-_MAX_TOKENS: Final = 10_000  # of all keys
+_MAX_PUBLISHERS: Final = 64  # of a key that are followed
 _SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publisher whose token is gone
 _SILENCE: Final = 5.0  # s, or messages at the nominal rate if that is slower, of which none came
 _NODE_TIMEOUT: Final = 3.0  # s for which a node sends after a message of it: a link that is down silences no topic
@@ -59,23 +57,20 @@ class PublisherTable:
 
     def __init__(self) -> None:
         self._keys: dict[TopicKey, _AnnouncedKey] = {}
-        self._count = 0  # of tokens
 
     def add(self, token: PublisherToken, what: Address | str, now: float) -> None:
         """Add a publisher: of an address, or of a message that is not carried, "" if no option asks for it."""
-        if token.key in self._keys or len(self._keys) < _MAX_KEYS:
-            key = self._keys.setdefault(token.key, _AnnouncedKey(what, now))
-            if token.text not in key.tokens and len(key.tokens) < _MAX_PUBLISHERS and self._count < _MAX_TOKENS:
-                key.tokens[token.text] = token
-                self._count += 1
-                key.alike_until = math.inf if key.has_alike() else key.alike_until
+        key = self._keys.setdefault(token.key, _AnnouncedKey(what, now))
+        if token.text not in key.tokens and len(key.tokens) < _MAX_PUBLISHERS:
+            key.tokens[token.text] = token
+            key.alike_until = math.inf if key.has_alike() else key.alike_until
 
     def remove(self, token: PublisherToken, now: float) -> None:
         """Remove a publisher that is gone."""
         key = self._keys.get(token.key)
         if key is None:
             return
-        self._count -= key.tokens.pop(token.text, None) is not None
+        key.tokens.pop(token.text, None)
         if key.alike_until == math.inf and not key.has_alike():
             key.alike_until = now + _SETTLE_TIME
         if not key.tokens and key.alike_until <= now:  # else messages of several publishers may still arrive
@@ -83,8 +78,7 @@ class PublisherTable:
 
     def forget(self, key: TopicKey) -> None:
         """Forget the publishers of a key."""
-        if announced := self._keys.pop(key, None):
-            self._count -= len(announced.tokens)
+        self._keys.pop(key, None)
 
     def hear(self, key: TopicKey, now: float) -> bool:
         """Note the arrival of a message; return whether its key is announced, and not carried."""

@@ -34,6 +34,7 @@ _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
 _REPORT_INTERVAL: Final = 1.0  # s between two looks at what does not arrive
+_TOKENS_TIMEOUT: Final = 3.0  # s that a router has to list the publishers again, where too many changed at once
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 
 
@@ -61,7 +62,7 @@ class Px4ZenohSource:
                 session = self._open_session()
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
-            node = closing.enter_context(Px4ZenohNode(self._name, session, domain=self._options.domain))
+            node = closing.enter_context(Px4ZenohNode(session, domain=self._options.domain))
             decoder = _Decoder(streams, node)
             yield None
             last: Absence | None = None
@@ -71,8 +72,8 @@ class Px4ZenohSource:
                 sample: zenoh.Sample | None = None
                 with suppress(queue.Empty):
                     sample = node.pending.get(timeout=_TICK)
-                for token in node.tokens():  # those that came before the message are here by now
-                    decoder.on_token(token)
+                for token, alive in node.tokens.take(timeout=_TOKENS_TIMEOUT):  # those before the message are here
+                    decoder.on_token(token, alive=alive)
                 yield None if sample is None else decoder.decode(sample)
                 if (now := time.monotonic()) >= next_report:
                     next_report = now + _REPORT_INTERVAL
@@ -129,16 +130,16 @@ class _Decoder:
             _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=stream.definition)
 
-    def on_token(self, sample: zenoh.Sample) -> None:
+    def on_token(self, text: str, *, alive: bool) -> None:
         """Add the publisher of a liveliness token, or remove it."""
         publishers, now = self._streams.publishers, time.monotonic()
         try:
-            token = PublisherToken.parse(str(sample.key_expr))
-            if sample.kind == zenoh.SampleKind.PUT:
+            token = PublisherToken.parse(text)
+            if alive:
                 self._streams.add_publisher(token, now)
         except (AddressError, DecodeError):
             return  # what it publishes is rejected
-        if sample.kind != zenoh.SampleKind.PUT:
+        if not alive:
             publishers.remove(token, now)
             if not publishers.has(token.key):
                 self._node.unsubscribe(token.key)
