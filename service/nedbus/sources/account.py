@@ -58,26 +58,20 @@ def follow(
     """Add the messages of a replay to an account, and yield each with why it is rejected, or with its payload."""
     looked = due = 0.0
     for message in messages:
-        due = message.due
+        due, reason, payload = message.due, message.error, None
         while due - looked >= _CHECK_INTERVAL:
             looked += _CHECK_INTERVAL
             account.look(looked)
-        yield message, *_add(account, message)
+        if reason is None:
+            definition = message.definition or BY_TOPIC[message.address.topic]
+            try:
+                fields = upgrade_fields(definition, message.fields)
+                payload = codec_of(definition).encode_fields(fields)
+                account.add(message.address, fields, due)
+            except InvalidMessageError as exc:
+                reason = exc.reason
+        if reason is not None:
+            account.reject(message.address, reason, due)
+        yield message, reason, payload
     account.look(due)
     account.settle(due + _SETTLE_TIME)
-
-
-def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | None]:
-    reason = message.error
-    if reason is None:
-        definition = message.definition or BY_TOPIC[message.address.topic]
-        try:
-            fields = upgrade_fields(definition, message.fields)
-            payload = codec_of(definition).encode_fields(fields)
-        except InvalidMessageError as exc:
-            reason = exc.reason
-        else:
-            account.add(message.address, fields, message.due)
-            return None, payload
-    account.reject(message.address, reason, message.due)
-    return reason, None

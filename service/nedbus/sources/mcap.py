@@ -21,8 +21,7 @@ class McapSource:
     """An MCAP file, read one chunk at a time."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
-        self._path = path
-        self._default_vehicle = context.vehicle
+        self._path, self._default_vehicle = path, context.vehicle
         self._options, self._vehicle, self._topics = options, options.vehicle, options.chosen_topics
         self.finite, self.loop = not options.loop, options.loop
         self.speed, self.wait = options.speed, options.wait
@@ -40,15 +39,13 @@ class McapSource:
         if self._vehicle is not None and len(vehicles) > 1:
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
         total = sum(counts.values())
+        absent = self._options.absent_from({each.topic for each in addresses}, "this recording")
         return ReplayRun(
             messages=self._messages(),
             addresses=tuple(sorted({self._rename(address) for address in addresses})),
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
-            warnings=(
-                *reader.warnings,
-                *self._options.absent_from({each.topic for each in addresses}, "this recording"),
-            ),
+            warnings=(*reader.warnings, *absent),
             definitions={
                 stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
             },

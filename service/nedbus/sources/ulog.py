@@ -20,15 +20,12 @@ from .source import ReplayRun, SourceContext, SourceMessage
 _MAX_GAP: Final = 60_000_000  # us: a longer gap in a log is a damaged timestamp, not a time to wait for
 _CHUNK: Final = 1000  # rows that are converted to Python values at a time
 
-_BOOLS: Final = {0: False, 1: True}  # valid bytes of a bool; the model rejects any other
-
 
 class UlogSource:
     """A .ulg file; `open` reads its topics into memory."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
-        self._path = Path(path).expanduser()
-        self._options = options
+        self._path, self._options = Path(path).expanduser(), options
         self._default_vehicle = context.vehicle
         self.finite, self.loop = not options.loop, options.loop
         self.speed, self.wait = options.speed, options.wait
@@ -84,13 +81,14 @@ def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[n
     values: list[object] = column.tolist()
     if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
         return [_to_bool(value) for value in values]
-    return [tuple(value) for value in values if isinstance(value, list)] if column.ndim == 2 else values
+    return list(map(tuple, column.tolist())) if column.ndim == 2 else values
 
 
 def _to_bool(value: object) -> object:
+    """Return 0 and 1 as a bool, and any other byte as it is: the model rejects it."""
     if isinstance(value, list):
         return tuple(map(_to_bool, value))
-    return _BOOLS.get(value, value) if isinstance(value, int) else value
+    return bool(value) if value in (0, 1) else value
 
 
 def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
