@@ -20,15 +20,14 @@ from nedbus.transport import (
     Attachment,
     PublisherToken,
     Session,
-    TopicKey,
     check_endpoints,
     open_client,
 )
-from nedbus_msgs import decode_with
+from nedbus_msgs import Address, decode_with
 
 from .definitions import read_definitions
 from .node import Px4ZenohNode
-from .streams import NotAcceptedError, NotCarriedError, StreamRegistry, track_sequence
+from .streams import Form, NotAcceptedError, NotCarriedError, Px4Stream, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +76,7 @@ class Px4ZenohSource:
                 yield None if sample is None else decoder.decode(sample)
                 if (now := time.monotonic()) >= next_report:
                     next_report = now + _REPORT_INTERVAL
-                    if (absence := streams.publishers.report(now)) != last:
+                    if (absence := streams.report(now)) != last:
                         yield (last := absence)
 
     def _open_session(self) -> Session:
@@ -101,50 +100,50 @@ class _Decoder:
             return None
         key, now = str(sample.key_expr), time.monotonic()
         is_bridged = str(sample.encoding) == BRIDGED_ENCODING
-        stream = self._streams.find(key)
+        address: Address | None = None
         try:
-            if self._streams.publishers.hear(stream.key if stream else TopicKey.parse(key), now):
+            stream = self._streams.hear(key, now)
+            if stream.not_carried is not None:
                 return None
-            if stream is None:
-                stream = self._streams.register(key)
-                if stream.unknown:
-                    extra = about("newer-layout", stream.address, source="px4-zenoh")
-                    _log.warning("%s: unknown here, and left out: %s", key, ", ".join(stream.unknown), extra=extra)
+            definition, layout, unknown = stream.form or self._find_form(stream)
+            address = stream.address
             attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
             if is_bridged:
                 self._log_bridged(key)
                 return None
-            self._streams.claim(stream, attachment, now)
-            fields = decode_with(stream.definition, sample.payload.to_bytes(), stream.layout)
-            for name in stream.unknown:
-                del fields[name]
-            lost, restarted = track_sequence(stream, attachment, now)
+            fields = decode_with(definition, sample.payload.to_bytes(), layout)
+            lost, rebooted = self._streams.accept(stream, attachment, now)
         except NotCarriedError as exc:
             return Rejection(key, f"{exc}: not asked for by topics= or msg=") if str(exc) and not is_bridged else None
         except (AddressError, DecodeError, NotAcceptedError) as exc:
-            reason = exc.reason if isinstance(exc, DecodeError) else str(exc)
-            return Rejection(key, reason, stream.address if stream else None)
-        rebooted = restarted and self._streams.is_reboot(stream)
+            return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
+        for name in unknown:
+            del fields[name]
         if rebooted:
-            extra = about("rebooted", stream.address, source="px4-zenoh")
+            extra = about("rebooted", address, source="px4-zenoh")
             _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=stream.definition)
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
+
+    def _find_form(self, stream: Px4Stream) -> Form:
+        form = self._streams.form_of(stream)
+        if form.unknown:
+            extra = about("newer-layout", stream.address, source="px4-zenoh")
+            _log.warning("%s: unknown here, and left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+        return form
 
     def on_token(self, text: str, *, alive: bool) -> None:
         """Add the publisher of a liveliness token, or remove it."""
-        publishers, now = self._streams.publishers, time.monotonic()
+        now = time.monotonic()
         try:
             token = PublisherToken.parse(text)
             if alive:
                 self._streams.add_publisher(token, now)
-        except (AddressError, DecodeError):
+        except (AddressError, DecodeError, NotAcceptedError):
             return  # what it publishes is rejected
-        if not alive:
-            publishers.remove(token, now)
-            if not publishers.has(token.key):
-                self._node.unsubscribe(token.key)
-        elif not token.node.startswith("nedbus_"):
+        if alive and not token.node.startswith("nedbus_"):
             self._node.subscribe(token.key)
+        elif not alive and self._streams.remove_publisher(token, now):
+            self._node.unsubscribe(token.key)
 
     def _log_bridged(self, key: str) -> None:
         if key not in self._bridged:
