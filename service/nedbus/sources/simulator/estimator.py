@@ -1,6 +1,6 @@
-"""The simulated estimator: errors, an outage of GPS and resets, and the messages that it sends.
+"""The simulated estimates and the truth: functions of the time since the start, and the messages of them.
 
-Every lap of 120 s has what estimates have in real flights:
+Every lap of 120 s has the events of real flights:
 
     t = 15 s         the heading is aligned: a heading reset
     t = 60 to 75 s   no GPS: dead reckoning, growing error, xy invalid after 10 s; at its end resets of xy and vxy
@@ -10,9 +10,9 @@ Every lap of 120 s has what estimates have in real flights:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from random import Random
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
 
@@ -30,122 +30,118 @@ _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s after which the position is no longer valid
 _Z_RESET: Final = 90.0  # s into a lap
 _HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap: the error that the next heading reset corrects
+_Z_STEP: Final = 1.0  # m, up and down in turn
+_DRIFT: Final = 0.02  # m/s^2, half the acceleration of the error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
 _SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
 _GRAVITY: Final = 9.80665  # m/s^2
 
 
-class Estimator:
-    """An estimate of the truth with errors that wander, drift without GPS, and are reset.
+class _State(NamedTuple):
+    """The state of an estimate: its errors in SI units, seconds of dead reckoning, counts and deltas of resets."""
 
-    `noise`: standard deviation of its position error [m]; `aided`: it has position aiding in the outage too.
+    position: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    heading: float
+    dead_reckoning: float
+    counters: Mapping[str, int]
+    deltas: Mapping[str, Any]
+
+    @property
+    def xy_valid(self) -> bool:
+        return self.dead_reckoning < _MAX_DEAD_RECKONING
+
+
+class Estimator:
+    """An estimate of the truth with an error that wanders, drifts without GPS, and is reset.
+
+    `noise`: size of its position error [m]; `aided`: it always has position aiding, and no resets.
     """
 
     def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
-        self._noise = noise
-        self._aided = aided
-        self._random = Random(f"{seed}/{name}")
-        self._error = [self._random.gauss(0.0, noise) for _ in range(3)]
-        self._drift = [0.0, 0.0]
-        self._heading_error = 0.0 if aided else self._random.choice((-1, 1)) * self._random.uniform(0.1, 0.3)
-        self._dead_reckoning = 0.0  # s since the last position aiding
-        self._counters = dict.fromkeys(("xy", "z", "vxy", "vz", "heading"), 0)
-        self._deltas: dict[str, Any] = {"xy": (0.0, 0.0), "z": 0.0, "vxy": (0.0, 0.0), "vz": 0.0, "heading": 0.0}
+        random = Random(f"{seed}/{name}")
+        self._noise, self._aided = noise, aided
+        self._phases = [random.uniform(0.0, math.tau) for _ in range(3)]
+        direction = random.uniform(-math.pi, math.pi)
+        self._north, self._east = math.cos(direction), math.sin(direction)  # of the drift
+        self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
-    def step(self, lap_time: float, truth: Truth) -> None:
-        """Advance by one tick."""
-        if not self._aided and OUTAGE[0] <= lap_time < OUTAGE[1]:
-            self._drift_away()
-        elif self._dead_reckoning:
-            self._reset_position()
-        else:
-            self._wander()
-        if not self._aided:
-            self._disturb(lap_time)
+    def xy_valid(self, time: float) -> bool:
+        """Return the validity of its horizontal position and velocity."""
+        return self._at(time).xy_valid
 
     def fields(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the message of this moment; EKF2's limits are infinite."""
-        position = [value + error for value, error in zip(truth.position, self._error, strict=True)]
-        velocity = [value + drift for value, drift in zip(truth.velocity, (*self._drift, 0.0), strict=True)]
+        state = self._at(time)
+        position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
+        velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
         return {
             **_motion(time, position, velocity, truth.acceleration, origin=time >= ORIGIN_SET),
-            **dict.fromkeys(("xy_valid", "v_xy_valid"), self.xy_valid), "z_valid": True, "v_z_valid": True,
-            **{f"delta_{name}": delta for name, delta in self._deltas.items()},
-            **{f"{name}_reset_counter": count for name, count in self._counters.items()},
-            "heading": wrap(truth.heading + self._heading_error), "heading_var": 0.001 + self._heading_error**2,
+            **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
+            **{f"delta_{name}": delta for name, delta in state.deltas.items()},
+            **{f"{name}_reset_counter": count for name, count in state.counters.items()},
+            "heading": wrap(truth.heading + state.heading), "heading_var": 0.001 + state.heading**2,
             "unaided_heading": truth.heading,
-            "heading_good_for_control": self._counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
-            "eph": self._spread, "epv": self._noise * 3,
-            "evh": self._noise / 2 + 0.05 * self._dead_reckoning, "evv": self._noise / 2,
-            "dead_reckoning": self._dead_reckoning > 0,
+            "heading_good_for_control": state.counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
+            **self._deviations(state),
+            "evh": self._noise / 2 + 0.05 * state.dead_reckoning, "evv": self._noise / 2,
             **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
         }  # fmt: skip
 
     def attitude(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the attitude: the tilt is that of a multicopter's thrust, which makes the acceleration; no wind."""
-        ax, ay, az = truth.acceleration
+        state, (ax, ay, az) = self._at(time), truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
         forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
         roll = math.atan2(right, math.hypot(forward, up))
-        q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + self._heading_error)
-        delta = euler_to_quaternion(0.0, 0.0, self._deltas["heading"])
-        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": self._counters["heading"]}
+        q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + state.heading)
+        delta = euler_to_quaternion(0.0, 0.0, state.deltas["heading"])
+        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"]}
 
     def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
         """Return the global position; there is one once the origin is known."""
-        x, y, z = (value + error for value, error in zip(truth.position, self._error, strict=True))
+        state = self._at(time)
+        x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
         (latitude, longitude), altitude = PROJECTION.reproject(x, y), REFERENCE[2]
         return {
             **_timestamps(time),
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
-            "lat_lon_valid": self.xy_valid, "alt_valid": True, "delta_alt": -self._deltas["z"], "delta_terrain": 0.0,
-            "lat_lon_reset_counter": self._counters["xy"], "alt_reset_counter": self._counters["z"],
-            "eph": self._spread, "epv": self._noise * 3,
+            "lat_lon_valid": state.xy_valid, "alt_valid": True, "delta_alt": -state.deltas["z"], "delta_terrain": 0.0,
+            "lat_lon_reset_counter": state.counters["xy"], "alt_reset_counter": state.counters["z"],
+            **self._deviations(state),
             "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
-            "dead_reckoning": self._dead_reckoning > 0,
         }  # fmt: skip
 
-    @property
-    def xy_valid(self) -> bool:
-        """Validity of its horizontal position and velocity."""
-        return self._dead_reckoning < _MAX_DEAD_RECKONING
+    def _at(self, time: float) -> _State:
+        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + TICK / 2, LAP)
+        outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (OUTAGE[1], _Z_RESET, _HEADING_RESET))
+        dead_reckoning = lap_time - OUTAGE[0] if OUTAGE[0] <= lap_time < OUTAGE[1] else 0.0
+        moved, speed = self._drift(dead_reckoning)
+        corrected, slowed = self._drift(OUTAGE[0] - OUTAGE[1] if outages else 0.0)
+        x, y, z = (self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each)) for each in self._phases)
+        return _State(
+            position=(x + moved[0], y + moved[1], z + _Z_STEP * (steps % 2)),
+            velocity=(*speed, 0.0),
+            heading=0.0 if _HEADING_RESET <= lap_time < _HEADING_DISTURBED else self._heading_error,
+            dead_reckoning=dead_reckoning,
+            counters={"xy": outages, "z": steps, "vxy": outages, "vz": 0, "heading": alignments},
+            deltas={
+                "xy": (-corrected[0], -corrected[1]), "vxy": slowed, "vz": 0.0,
+                "z": _Z_STEP * (1 if steps % 2 else -1) if steps else 0.0,
+                "heading": -self._heading_error if alignments else 0.0,
+            },
+        )  # fmt: skip
 
-    @property
-    def _spread(self) -> float:
-        return self._noise * 2 + 0.02 * self._dead_reckoning**2
+    def _drift(self, seconds: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the errors of position and velocity after this time of dead reckoning."""
+        moved, speed = _DRIFT * seconds**2, 2 * _DRIFT * seconds
+        return (moved * self._north, moved * self._east), (speed * self._north, speed * self._east)
 
-    def _wander(self) -> None:
-        keep = math.exp(-TICK / 20.0)
-        kick = self._noise * math.sqrt(1.0 - keep * keep)
-        self._error = [keep * error + self._random.gauss(0.0, kick) for error in self._error]
-
-    def _drift_away(self) -> None:
-        self._dead_reckoning += TICK
-        for axis in (0, 1):
-            self._drift[axis] += self._random.gauss(0.02, 0.2) * TICK
-            self._error[axis] += self._drift[axis] * TICK
-
-    def _disturb(self, lap_time: float) -> None:
-        """Reset heading and height, and give the heading the error that the next reset corrects."""
-        if _is_at(lap_time, _HEADING_RESET):
-            self._reset("heading", -self._heading_error)
-            self._heading_error = 0.0
-        elif _is_at(lap_time, _Z_RESET):
-            delta = self._random.gauss(0.0, 1.0) - self._error[2]
-            self._error[2] += delta
-            self._reset("z", delta)
-        elif _is_at(lap_time, _HEADING_DISTURBED):
-            self._heading_error = self._random.gauss(0.0, 0.15)
-
-    def _reset_position(self) -> None:
-        """Reset position and velocity to those of GPS, which is back."""
-        new = [self._random.gauss(0.0, self._noise) for _ in range(2)]
-        self._reset("xy", (new[0] - self._error[0], new[1] - self._error[1]))
-        self._reset("vxy", (-self._drift[0], -self._drift[1]))
-        self._error[:2], self._drift, self._dead_reckoning = new, [0.0, 0.0], 0.0
-
-    def _reset(self, name: str, delta: float | tuple[float, float]) -> None:
-        self._deltas[name], self._counters[name] = delta, (self._counters[name] + 1) % 256
+    def _deviations(self, state: _State) -> dict[str, object]:
+        return {
+            "eph": self._noise * 2 + _DRIFT * state.dead_reckoning**2, "epv": self._noise * 3,
+            "dead_reckoning": state.dead_reckoning > 0,
+        }  # fmt: skip
 
 
 def truth_fields(time: float, truth: Truth) -> dict[str, object]:
@@ -180,7 +176,3 @@ def _motion(
         "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
         "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
     }  # fmt: skip
-
-
-def _is_at(lap_time: float, moment: float) -> bool:
-    return moment <= lap_time + TICK / 2 < moment + TICK

@@ -1,20 +1,22 @@
-"""Replay a simulated flight with all that its vehicle says: the same seed gives the same messages, to the bit."""
+"""Replay a simulated flight with all topics of its vehicle: the same seed gives the same messages, to the bit."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import count
+from random import Random
 
 from nedbus.errors import SourceError
 from nedbus.sources.options import SimulatorOptions
 from nedbus.sources.source import ReplayRun, SourceContext, SourceMessage
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .estimator import LAP, ORIGIN_SET, TICK, Estimator, truth_fields
-from .trajectory import Trajectory, Truth
-from .vehicle import SimulatedVehicle
+from .estimator import ORIGIN_SET, TICK, Estimator, truth_fields
+from .trajectory import Truth, truth_at
+from .vehicle import battery, gps, home, land_detected, status
 
 Fields = Callable[[float, Truth], dict[str, object]]  # of a message, from the time since the start and the truth
 
@@ -34,9 +36,7 @@ class SimulatorSource:
 
     def open(self) -> ReplayRun:
         """Start a new flight."""
-        estimators = [Estimator(f"ekf {each}", self._seed, noise) for each, noise in enumerate((0.3, 0.5))]
-        estimators.append(Estimator("ins", self._seed, 0.05, aided=True))
-        streams = self._streams(*estimators, end=sys.maxsize if self._ticks is None else self._ticks)
+        streams = self._streams(sys.maxsize if self._ticks is None else self._ticks)
         chosen = {
             address: stream
             for address, stream in streams.items()
@@ -48,18 +48,18 @@ class SimulatorSource:
             raise SourceError("sim", f"a simulated vehicle does not have {asked}, but {known}")
         total = None if self._ticks is None else sum(len(ticks) for ticks, _ in chosen.values())
         return ReplayRun(
-            messages=self._messages(estimators, chosen),
+            messages=self._messages(chosen),
             addresses=tuple(sorted(chosen, key=lambda address: address.topic != DEFAULT_TOPIC)),
             total=total,
             summary=f"vehicle {self._vehicle}, seed {self._seed}, "
             + ("endless" if self._ticks is None else f"{total} messages, {self._ticks * TICK:g} s"),
         )
 
-    def _streams(
-        self, first: Estimator, second: Estimator, ins: Estimator, *, end: int
-    ) -> dict[Address, tuple[range, Fields]]:
+    def _streams(self, end: int) -> dict[Address, tuple[range, Fields]]:
         """Return the ticks and the fields of all streams, in the order of their messages in one tick."""
-        vehicle, origin = SimulatedVehicle(self._seed, first), round(ORIGIN_SET / TICK)
+        first, second = (Estimator(f"ekf {each}", self._seed, noise) for each, noise in enumerate((0.3, 0.5)))
+        ins = Estimator("ins", self._seed, 0.05, aided=True)
+        origin = round(ORIGIN_SET / TICK)
         at = partial(Address, self._vehicle)
         return {
             at("vehicle_local_position_groundtruth"): (range(0, end, 2), truth_fields),
@@ -69,23 +69,19 @@ class SimulatorSource:
             at("vehicle_local_position"): (range(end), first.fields),
             at("vehicle_attitude"): (range(0, end, 2), first.attitude),
             at("vehicle_global_position"): (range(origin, end, 10), first.global_fields),
-            at("sensor_gps", 0): (range(0, end, 10), vehicle.gps),
-            at("vehicle_status"): (range(0, end, 50), vehicle.status),
-            at("vehicle_land_detected"): (range(0, end, 100), vehicle.land_detected),
-            at("battery_status", 0): (range(0, end, 100), vehicle.battery),
-            at("home_position"): (range(0, min(end, origin + 1), origin), vehicle.home),
+            at("sensor_gps", 0): (range(0, end, 10), gps),
+            at("vehicle_status"): (range(0, end, 50), partial(status, first)),
+            at("vehicle_land_detected"): (range(0, end, 100), land_detected),
+            at("battery_status", 0): (range(0, end, 100), battery),
+            at("home_position"): (range(0, min(end, origin + 1), origin), home),
         }
 
-    def _messages(
-        self, estimators: list[Estimator], chosen: Mapping[Address, tuple[range, Fields]]
-    ) -> Iterator[SourceMessage]:
-        trajectory = Trajectory(self._seed)
+    def _messages(self, chosen: Mapping[Address, tuple[range, Fields]]) -> Iterator[SourceMessage]:
+        direction = Random(f"{self._seed}/turn").uniform(-math.pi, math.pi)
         absent = {address: _absent(address.topic) for address in chosen}
         for tick in count() if self._ticks is None else range(self._ticks):
             time = tick * TICK
-            now = trajectory.at(time)
-            for estimator in estimators:
-                estimator.step(time % LAP, now)
+            now = truth_at(time, direction)
             for address, (ticks, fields) in chosen.items():
                 if tick in ticks:
                     yield SourceMessage(time, address, absent[address] | fields(time, now))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from random import Random
 from typing import Final, NamedTuple
 
 from nedbus_msgs import wrap
@@ -25,31 +24,26 @@ class Truth(NamedTuple):
     heading: float
 
 
-class Trajectory:
-    """The path as a function of time; the seed sets its direction."""
+def truth_at(time: float, direction: float) -> Truth:
+    """Return the truth at a time [s] since the start; `direction` [rad] is that of the figures."""
+    positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
+    axes = list(zip(*positions, strict=True))
+    velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
+    acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
+    moving = math.hypot(velocity[0], velocity[1]) > 0.5
+    heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
+    return Truth(positions[1], velocity, acceleration, heading)
 
-    def __init__(self, seed: int) -> None:
-        self._direction = Random(f"{seed}/turn").uniform(-math.pi, math.pi)
 
-    def at(self, time: float) -> Truth:
-        """Return the truth at a time [s] since the start."""
-        positions = [self._position(time + offset) for offset in (-_STEP, 0.0, _STEP)]
-        axes = list(zip(*positions, strict=True))
-        velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
-        acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
-        moving = math.hypot(velocity[0], velocity[1]) > 0.5
-        heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(self._direction + math.pi / 4)
-        return Truth(positions[1], velocity, acceleration, heading)
-
-    def _position(self, time: float) -> Vector:
-        climb = _smoothstep(time / CLIMB)
-        # The phase starts slowly after the climb and then advances evenly, one figure a minute.
-        late = max(0.0, time - 8.0)
-        phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
-        along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
-        cos, sin = math.cos(self._direction), math.sin(self._direction)
-        down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
-        return along * cos - across * sin, along * sin + across * cos, down
+def _position(time: float, direction: float) -> Vector:
+    climb = _smoothstep(time / CLIMB)
+    # The phase starts slowly after the climb and then advances evenly, one figure a minute.
+    late = max(0.0, time - 8.0)
+    phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
+    along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
+    cos, sin = math.cos(direction), math.sin(direction)
+    down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
+    return along * cos - across * sin, along * sin + across * cos, down
 
 
 def _smoothstep(part: float) -> float:
