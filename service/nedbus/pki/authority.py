@@ -67,7 +67,7 @@ class CertificateEntry:
 
     `name`: its common name, for an authority that of its file.
     `use`: "authority", "router" or "client".
-    `problem`: why it is of no use although it has not ended, "" if it is of use.
+    `problem`: the reason that it is of no use before its end, "" if there is none.
     """
 
     path: Path
@@ -159,7 +159,7 @@ def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
 
 
 def write_certificate(path: Path, certificate: x509.Certificate) -> None:
-    """Write a certificate into a new file that everybody can read."""
+    """Write a certificate into a new file that all users can read."""
     _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 

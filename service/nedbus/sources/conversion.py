@@ -19,9 +19,9 @@ from .source import SourceMessage
 
 _log = logging.getLogger(__name__)
 
-_MAX_START: Final = 2**63  # ns: what follows must fit as well
+_MAX_START: Final = 2**63  # ns: later times must fit as well
 _CHUNK: Final = 1024  # messages that are written together
-_CHUNK_BYTES: Final = 2**18  # what damage costs, some seconds of a flight
+_CHUNK_BYTES: Final = 2**18  # lost to damage, some seconds of a flight
 _MAX_LOGGED: Final = 5  # rejected messages that are logged
 
 

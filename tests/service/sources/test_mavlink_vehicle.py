@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources import Rejection, SourceMessage
-from nedbus.sources.mavlink.fields import SAID
+from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, quaternion_to_euler
@@ -99,7 +99,7 @@ def test_only_what_is_needed_is_requested_and_as_the_link_carries(topics: list[s
 def test_each_topic_of_mavlink_has_a_message_that_is_requested() -> None:
     """A topic that a MAVLink vehicle says has a row in STREAMS, with the topic's name as it is."""
     needed = {topic for _, _, topics in STREAMS.values() for topic in topics.split()}
-    assert needed == {topic for topic, _ in SAID.values()} <= TOPICS.keys()
+    assert needed == {topic for topic, _ in CONVERSIONS.values()} <= TOPICS.keys()
 
 
 def test_euler_angles_replace_a_quaternion_that_is_not_sent() -> None:

@@ -64,7 +64,7 @@ class _StreamLink:
         self._file = file
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield what has arrived and its sender; wait up to `timeout` seconds for it."""
+        """Yield the bytes that have arrived and their sender; wait up to `timeout` seconds for them."""
         if _is_ready(self._file, timeout):
             data = self._file.read(_MAX_READ)
             if not data:
@@ -77,7 +77,7 @@ class _StreamLink:
 
 
 Link = _UdpLink | _StreamLink
-"""An open connection to one or several vehicles; what fails raises OSError."""
+"""An open connection to one or several vehicles; its methods raise OSError."""
 
 
 def parse_link(text: str) -> tuple[str, str, int]:

@@ -17,7 +17,7 @@ from nedbus.sources.source import Rejection, SourceContext, SourceMessage
 from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .fields import SAID
+from .fields import CONVERSIONS
 from .link import Link, Peer, open_link, parse_link
 from .vehicle import Vehicle
 
@@ -34,16 +34,16 @@ _AUTOPILOT: Final = 1  # the component; cameras, gimbals and ground stations are
 class MavlinkSource:
     """A link with one or many vehicles.
 
-    What MAVLink does not transmit is not provided: of a position resets, variances of heading and tilt, accelerations,
-    limits; of the state the mode. Nothing is derived that a vehicle did not say.
+    Fields that MAVLink does not transmit are not provided: resets, variances of heading and tilt, accelerations and
+    limits of a position; the mode of the state. Nothing is derived.
     Validity is an approximation from ESTIMATOR_STATUS: LOCAL_POSITION_NED itself is sent whether valid or not.
     """
 
     def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         parse_link(link)
-        known = {topic for topic, _ in SAID.values()}
+        known = {topic for topic, _ in CONVERSIONS.values()}
         if known.isdisjoint(options.chosen_topics or known):
-            reason = f"MAVLink says nothing of these topics, but of {', '.join(sorted(known))}"
+            reason = f"MAVLink has none of these topics, but {', '.join(sorted(known))}"
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
@@ -59,7 +59,7 @@ class MavlinkSource:
 
 
 class _LinkSession:
-    """One open link: parse what arrives, request streams, send heartbeats."""
+    """One open link: parse messages, request streams, send heartbeats."""
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
         self._link = link
@@ -107,11 +107,11 @@ class _LinkSession:
             vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
         self._peers[system] = peer
         vehicle.track_sequence(sequence, now)
-        said = vehicle.handle(message, now)
-        if isinstance(said, SourceMessage) and said.rebooted:
-            address = Address(said.address.vehicle, DEFAULT_TOPIC)
+        converted = vehicle.handle(message, now)
+        if isinstance(converted, SourceMessage) and converted.rebooted:
+            address = Address(converted.address.vehicle, DEFAULT_TOPIC)
             _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
-        return said
+        return converted
 
     def _name_of(self, system: int) -> str:
         configured = self._options.vehicles

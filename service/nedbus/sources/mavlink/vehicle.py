@@ -17,7 +17,7 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
 
-from .fields import SAID, sensors_of
+from .fields import CONVERSIONS, sensors_of
 
 _log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ _SILENCE_TIMEOUT: Final = 3.0  # s after which all state is reset
 _FIRST_ROUNDS: Final = 3  # of all requests: a link loses some
 _REQUEST_INTERVAL: Final = 5.0  # s between two rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, of `hdg`
-_LONG_AGO: Final = 2**48  # us, 9 years: what is more is Unix time, not the time since boot
+_LONG_AGO: Final = 2**48  # us, 9 years: a later time is Unix time, not the time since boot
 _UNKNOWN_HEADING: Final = 65535
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -55,9 +55,9 @@ _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop
 
 
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
-    """Return the rates to request [Hz] for these topics: positions at `rate`, and each other message as often.
+    """Return the rates to request [Hz] for these topics: positions at `rate`, each other message at its own rate.
 
-    That is, up to the rate that it wants; on a link that does not carry it all, up to one that is the same for all.
+    On a link that does not carry all of them, the other messages have a common upper limit.
     """
     wanted = {
         number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
@@ -90,7 +90,7 @@ class Vehicle:
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
-        """Discard what was received, and request everything again: it was silent, or rebooted."""
+        """Discard all state and request everything again: the vehicle was silent, or rebooted."""
         self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and until when
         self._last: dict[Address, int] = {}  # timestamps
         self._sequence: int | None = None
@@ -137,7 +137,7 @@ class Vehicle:
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
         """Return the message of a chosen topic that this one holds, if any; late ones are rejected."""
         kind = message.get_type()
-        topic, fields_of = SAID.get(kind, ("", None))
+        topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
         if (number := message.get_msgId()) in self._rates:
             self._arrivals[number] = now

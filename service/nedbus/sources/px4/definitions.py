@@ -20,9 +20,9 @@ Definitions = Mapping[str, Mapping[str, Definition[Any]]]
 def read_definitions(paths: str) -> Definitions:
     """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
 
-    What cannot be carried is left out of a folder, and named in the log.
+    Messages of a folder that cannot be carried are left out, and named in the log.
 
-    Raises ConfigError, with line and column, for a file that is no message, and for what cannot be read.
+    Raises ConfigError, with line and column, for a file that is not a message, or cannot be read.
     """
     found: dict[str, dict[str, Definition[Any]]] = {}
     left_out: list[str] = []
@@ -50,7 +50,7 @@ def read_definitions(paths: str) -> Definitions:
 
 
 def _with_messages_within(file: Path) -> str:
-    """Return a .msg file with those beside it whose messages are within its own, as ROS 2 puts them together."""
+    """Return a .msg file followed by those beside it that it contains, in the form of ROS 2."""
     text, added = file.read_text(), set[str]()
     while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
         added |= missing

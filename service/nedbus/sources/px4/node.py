@@ -1,4 +1,4 @@
-"""The node as which a source appears in ROS 2: what arrives there, and a subscription to each published topic."""
+"""The node of a source in ROS 2: received messages, and a subscription to each published topic."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ from .streams import Form, NotAcceptedError, NotCarriedError, Px4Stream, StreamR
 _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
-_REPORT_INTERVAL: Final = 1.0  # s between two looks at what does not arrive
+_REPORT_INTERVAL: Final = 1.0  # s between two reports of absent topics
 _TOKENS_TIMEOUT: Final = 3.0  # s that a router has to list the publishers again, where too many changed at once
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 
@@ -55,7 +55,7 @@ class Px4ZenohSource:
         """Receive; raise SourceError when no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
-                # A link between the router and a client of its own would drop what does not fit its queue.
+                # A link between the router and a client of its own would drop messages beyond its queue.
                 session = router
             else:
                 session = self._open_session()
@@ -88,7 +88,7 @@ class Px4ZenohSource:
 
 
 class _Decoder:
-    """Turn samples into messages and rejections, and log what vehicles do."""
+    """Turn samples into messages and rejections, and log reboots and loops."""
 
     def __init__(self, streams: StreamRegistry, node: Px4ZenohNode) -> None:
         self._streams = streams
@@ -139,7 +139,7 @@ class _Decoder:
             if alive:
                 self._streams.add_publisher(token, now)
         except (AddressError, DecodeError, NotAcceptedError):
-            return  # what it publishes is rejected
+            return  # its messages are rejected
         if alive and not token.node.startswith("nedbus_"):
             self._node.subscribe(token.key)
         elif not alive and self._streams.remove_publisher(token, now):

@@ -1,4 +1,4 @@
-"""Decide which messages of rmw_zenoh publishers belong to which address, and what is absent; no I/O, no clock.
+"""Assign the messages of rmw_zenoh publishers to addresses, and find absent topics; no I/O, no clock.
 
 Times are monotonic seconds of the caller's clock.
 """
@@ -43,7 +43,7 @@ class NotAcceptedError(Exception):
 
 
 class NotCarriedError(Exception):
-    """Raised for a key that no option asks for; its text is the message, empty for what `topics=` leaves out."""
+    """Raised for a key that no option asks for; its text is the message, or empty if `topics=` leaves it out."""
 
 
 class Form(NamedTuple):
@@ -179,7 +179,7 @@ class StreamRegistry:
         return lost, restarted and self._is_first_to_reboot(stream)
 
     def report(self, now: float) -> Absence:
-        """Return what is not carried, and what is silent while other topics of its node arrive."""
+        """Return messages that are not carried, and topics that are silent while others of their node arrive."""
         self._streams = {
             key: each for key, each in self._streams.items() if each.tokens or each.form or now < each.alike_until
         }
