@@ -65,6 +65,7 @@ class Px4Stream:
     `heard`, `received`: when the last message arrived, and the last one that was accepted.
     `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
     `reboots`: the number of reboots of its vehicle that it took part in.
+    `is_bridged`: messages of `nedbus ros2` arrived on it.
     """
 
     key: TopicKey
@@ -82,6 +83,7 @@ class Px4Stream:
     restarted: bool = False
     rebooted: float = -math.inf
     reboots: int = 0
+    is_bridged: bool = False
 
     def has_alike(self) -> bool:
         """Return whether publishers of several sessions have the same gid: their messages cannot be told apart."""
