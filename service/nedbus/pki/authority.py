@@ -120,9 +120,7 @@ class Authority:
         """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
         certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
         try:
-            key = serialization.load_pem_private_key(path.read_bytes(), password=None)
-        except OSError as exc:
-            raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: may this user read it?") from exc
+            key = serialization.load_pem_private_key(_read(path), password=None)
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
@@ -135,16 +133,15 @@ class Authority:
         """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
         # A router is a client of other routers too.
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
-        builder = _builder(name, key, self.key, DAYS if days is None else days, issuer=self.certificate)
-        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        extensions: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(purposes)]
         if hosts:
-            builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
-        return builder.sign(self.key, hashes.SHA256())
+            extensions.append(x509.SubjectAlternativeName(list(map(_host, hosts))))
+        return _sign(name, key, self.key, DAYS if days is None else days, extensions, issuer=self.certificate)
 
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
     """Return the certificate of a CA for its key; certificates that the key signed before stay valid."""
-    return _builder("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days).sign(key, hashes.SHA256())
+    return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days, [])
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -189,12 +186,17 @@ def write_files(
 def load_certificate(path: Path) -> x509.Certificate:
     """Read the certificate in a PEM file; raise PkiError when it is missing or damaged."""
     try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
+        return x509.load_pem_x509_certificate(_read(path))
+    except ValueError as exc:
+        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
     except OSError as exc:
         hint = "make the CA first, 'nedbus pki ca'" if path.name == "ca.crt" else "may this user read it?"
         raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
-    except ValueError as exc:
-        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
 
 
 def _write_new(path: Path, content: bytes, mode: int) -> None:
@@ -202,22 +204,23 @@ def _write_new(path: Path, content: bytes, mode: int) -> None:
         file.write(content)
 
 
-def _builder(
+def _sign(
     name: str,
     key: CertificatePublicKeyTypes,
     signer: ec.EllipticCurvePrivateKey,
     days: int,
+    extensions: Sequence[x509.ExtensionType],
     *,
     issuer: x509.Certificate | None = None,
-) -> x509.CertificateBuilder:
-    """Begin the certificate of a key; without an issuer it is that of an authority, signed by itself."""
+) -> x509.Certificate:
+    """Return the certificate of a key; without an issuer it is that of an authority, signed by itself."""
     is_authority = issuer is None
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = dt.datetime.now(dt.UTC)
     until = now + dt.timedelta(days=days)
     allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
     usage = x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES})
-    return (
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(subject if issuer is None else issuer.subject)
@@ -232,6 +235,9 @@ def _builder(
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
         .add_extension(usage, critical=True)
     )
+    for extension in extensions:
+        builder = builder.add_extension(extension, critical=False)
+    return builder.sign(signer, hashes.SHA256())
 
 
 def _host(host: str) -> x509.GeneralName:
@@ -245,9 +251,8 @@ def _describe(path: Path, authority: x509.Certificate) -> CertificateEntry:
     problem, certificate = _find_problem(path, authority), Certificate.read(path)
     if path.name == "ca.crt":
         return CertificateEntry(path, path.stem, "authority", certificate, problem)
-    return CertificateEntry(
-        path, certificate.subject, "router" if certificate.hosts else "client", certificate, problem
-    )
+    use = "router" if certificate.hosts else "client"
+    return CertificateEntry(path, certificate.subject, use, certificate, problem)
 
 
 def _find_problem(path: Path, authority: x509.Certificate) -> str:

@@ -158,10 +158,13 @@ def rules(
     if unknown := sorted(given - set(before)) if remove else []:
         raise ConfigError(str(file), f"it does not name vehicle {unknown[0]!r}")
     wanted = {*before, *given} if add else set(before) - given if remove else given
-    added, removed = certificates.write_access_rules(file, wanted, prefix=prefix)
-    for line in [*(f"+ {name}" for name in added), *(f"- {name}" for name in removed)]:
+    certificates.write_access_rules(file, wanted, prefix=prefix)
+    changes = [f"+ {name}" for name in sorted(wanted - {*before})] + [
+        f"- {name}" for name in sorted({*before} - wanted)
+    ]
+    for line in changes:
         write(line)
-    changed = "the router takes it when it starts again" if added or removed else "no change"
+    changed = "the router takes it when it starts again" if changes else "no change"
     write_stderr(f"{file} names {len(wanted)} vehicle{'s' * (len(wanted) != 1)}: {changed}")
 
 
