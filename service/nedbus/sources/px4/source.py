@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-from nedbus.errors import ConnectError, SourceError
+from nedbus.errors import ConfigError, ConnectError, SourceError
+from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Absence, Rejection, SourceContext, SourceMessage
 from nedbus.transport import Session, check_endpoints, open_client
+from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
 
-from .definitions import read_definitions
 from .node import Px4ZenohNode
-from .streams import StreamRegistry
+from .streams import Definitions, StreamRegistry
+
+_log = logging.getLogger(__name__)
 
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 
@@ -28,7 +33,7 @@ class Px4ZenohSource:
         self._is_own = not endpoint or endpoint in context.routers
         self._tls = context.tls
         self._options = options
-        self._given = read_definitions(options.msg)
+        self._given = _read_definitions(options.msg)
         self._vehicle = options.vehicle or context.vehicle
         self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
 
@@ -51,3 +56,45 @@ class Px4ZenohSource:
         except ConnectError as exc:
             reason = "no Zenoh router answers there: start one, or name another as px4-zenoh:tcp/HOST:7447"
             raise SourceError(self._name, reason) from exc
+
+
+def _read_definitions(paths: str) -> Definitions:
+    """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
+
+    Messages of a folder that cannot be carried are left out, and named in the log.
+
+    Raises ConfigError, with line and column, for a file that is not a message, or cannot be read.
+    """
+    found: dict[str, dict[str, Definition[Any]]] = {}
+    left_out: list[str] = []
+    for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
+        files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
+        if not files and path.is_dir():
+            reason = "no .msg file is in this folder, nor in those within it: name PX4's folder msg"
+            raise ConfigError(str(path), reason, key="msg")
+        for file in files or [path]:
+            try:
+                text = _with_messages_within(file)
+                definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
+            except (OSError, UnicodeDecodeError) as exc:
+                raise ConfigError(str(file), getattr(exc, "strerror", None) or "no UTF-8 text", key="msg") from None
+            except ValueError as exc:  # MsgError, and its like
+                if file == path:
+                    raise ConfigError(str(file), str(exc), key="msg") from None
+                left_out.append(f"{file.stem} ({exc})")
+                continue
+            found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
+    if left_out:
+        extra = about("damaged", source="px4-zenoh")
+        _log.info("px4-zenoh: not carried, of %s: %.2000s", paths, ", ".join(left_out), extra=extra)
+    return found
+
+
+def _with_messages_within(file: Path) -> str:
+    """Return a .msg file followed by those beside it that it contains, in the form of ROS 2."""
+    text, added = file.read_text(), set[str]()
+    while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
+        added |= missing
+        for base in sorted(missing):
+            text += f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{file.with_name(f'{base}.msg').read_text()}"
+    return text

@@ -26,8 +26,6 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-from .definitions import Definitions
-
 _MAX_STREAMS: Final = 10_000  # keys; a vehicle has some dozens
 _MAX_PUBLISHERS: Final = 64  # of a key that are followed
 _MAX_LOSS: Final = 1_000_000  # messages that can be lost at once; a larger step is not a gap
@@ -36,6 +34,10 @@ _SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publish
 _SILENCE: Final = 5.0  # s, or messages at the nominal rate if that is slower, of which none came
 _MAX_NAMES: Final = 100  # in a report
 _HINT: Final = "give each a namespace or a domain of its own"
+
+
+Definitions = Mapping[str, Mapping[str, Definition[Any]]]
+"""PX4's own definitions that a user gives, by the DDS type of the message, and the hash of its ROS 2 type."""
 
 
 class NotAcceptedError(Exception):

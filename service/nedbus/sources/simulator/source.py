@@ -14,8 +14,7 @@ from nedbus.sources.options import SimulatorOptions
 from nedbus.sources.source import ReplayRun, SourceContext, SourceMessage
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .estimator import ORIGIN_SET, TICK, Estimator, truth_fields
-from .trajectory import Truth, truth_at
+from .flight import ORIGIN_SET, TICK, Estimator, Truth, truth_at, truth_fields
 from .vehicle import battery, gps, home, land_detected, status
 
 Fields = Callable[[float, Truth], dict[str, object]]  # of a message, from the time since the start and the truth

@@ -7,8 +7,7 @@ from typing import Final
 
 from nedbus_msgs import MESSAGES
 
-from .estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
-from .trajectory import CLIMB, Truth
+from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator, Truth
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
