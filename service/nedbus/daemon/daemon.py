@@ -18,7 +18,7 @@ from nedbus.events import QUESTION, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
-from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, router_max_sessions
+from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, read_router_config
 from nedbus_msgs import codec_of, provenance_of, status_key
 
 from .plan import Planned, is_finite, plan_sources
@@ -248,7 +248,7 @@ class Daemon:
                 config_file=settings.router_config,
                 tls=settings.tls if settings.connect else None,
             )
-            self.max_sessions = router_max_sessions(settings.router_config)
+            self.max_sessions = read_router_config(settings.router_config).max_sessions
             return session
         logged = False
         while not self._stop.is_set():

@@ -111,27 +111,23 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
     return _endpoints(_read_config(config_file), "listen") or (DEFAULT_ENDPOINT,)
 
 
-def router_max_sessions(config_file: Path | None = None) -> int:
-    """Return the number of sessions that a router accepts: that of the file, else Zenoh's default.
-
-    Raises ConfigError for a malformed file.
-    """
-    config = zenoh.Config() if config_file is None else _read_config(config_file)
-    return int(_get(config, "transport/unicast/max_sessions"))
-
-
 class RouterConfig(NamedTuple):
-    """The endpoints in a router's configuration file, and the PEM files of its TLS section by name."""
+    """The configuration of a router: endpoints, the PEM files of its TLS section by name, and its limit of sessions."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     tls_files: Mapping[str, Path]
+    max_sessions: int
 
 
-def read_router_config(path: Path) -> RouterConfig:
-    """Read a file for zenohd or for a router of ours; raise ConfigError, with line and column, for a mistake."""
-    config = _parse_config(path)
-    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config))
+def read_router_config(path: Path | None = None) -> RouterConfig:
+    """Read a file for zenohd or for a router of ours, by default Zenoh's defaults.
+
+    Raises ConfigError, with line and column, for a mistake.
+    """
+    config = zenoh.Config() if path is None else _parse_config(path)
+    sessions = int(_get(config, "transport/unicast/max_sessions"))
+    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config), sessions)
 
 
 def _get(config: zenoh.Config, key: str) -> Any:

@@ -24,7 +24,7 @@ from nedbus.doctor.prober import check_endpoint
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
-from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, router, router_max_sessions
+from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
 from nedbus.transport.router import allow_sessions
 from nedbus.transport.router_state import read_state
 from tests.peers.certificates import CONFIG
@@ -114,7 +114,7 @@ def test_shipped_files_say_it_twice_alike(name: str) -> None:
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
     blocks = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
     assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(blocks)
-    assert router_max_sessions() == limit == 1000
+    assert read_router_config().max_sessions == limit == 1000
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_limit_of_a_broken_file_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "router.json5"
     file.write_text("{ mode: ")
     with pytest.raises(ConfigError):
-        router_max_sessions(file)
+        read_router_config(file)
 
 
 @pytest.mark.parametrize(
