@@ -100,7 +100,7 @@ class FakeReplay:
     def open(self) -> ReplayRun:
         if self.failures:
             raise self.failures.pop(0)
-        addresses = tuple(dict.fromkeys(each.address for each in self.messages))
+        addresses = {each.address: each.definition for each in self.messages}
         return ReplayRun(self.run() if self.run else iter(self.messages), addresses, len(self.messages), "a flight")
 
 

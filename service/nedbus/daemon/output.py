@@ -96,8 +96,8 @@ class SourceOutput:
         for address in run.addresses:
             if address not in own and self._registry.is_published(address):
                 raise AddressInUseError(address)
-        for address in run.addresses:
-            self.claim(address, run.definitions.get(address.topic), lossless=lossless)
+        for address, definition in run.addresses.items():
+            self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
         """Make sure that an address has a publisher; raise AddressInUseError if another source of ours has it."""

@@ -8,7 +8,7 @@ from typing import Final
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.recording import RecordedMessage, RecordedStream, RecordingReader
-from nedbus_msgs import BY_TOPIC, Address, decode_with
+from nedbus_msgs import Address, decode_with
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -31,7 +31,8 @@ class McapSource:
         with self._reader() as reader:
             reader.check()
         counts = {stream: count for stream, count in reader.counts.items() if self._delivers(stream)}
-        addresses = sorted({stream.address for stream in counts})
+        definitions = {stream.address: stream.definition for stream in counts}
+        addresses = sorted(definitions)
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
             found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "none of PX4's topics"
@@ -42,13 +43,10 @@ class McapSource:
         absent = self._options.absent_from({each.topic for each in addresses}, "this recording")
         return ReplayRun(
             messages=self._messages(),
-            addresses=tuple(sorted({self._rename(address) for address in addresses})),
+            addresses={self._rename(address): definitions[address] for address in addresses},
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
             warnings=(*reader.warnings, *absent),
-            definitions={
-                stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
-            },
             damage=f"{self._path}: damage cost messages: {'; '.join(reader.warnings)}" if reader.damaged else None,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from nedbus.transport import Session, Tls
@@ -62,20 +62,18 @@ class ReplayRun:
     """One run of a replay.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: every address that occurs in the messages.
+    `addresses`: every address that occurs in the messages, with the definition of these, None for that of its topic.
     `total`: the number of messages, None if they never end.
     `summary`: a description for the log; `warnings`: damage, and parts that are left out.
-    `definitions`: those of the messages on topics that have no file.
     `damage`: the cost of damage, if messages were lost; at its end the run has failed then.
     """
 
     messages: Iterator[SourceMessage]
-    addresses: tuple[Address, ...]
+    addresses: Mapping[Address, Definition[Any] | None]
     total: int | None
     summary: str
     warnings: tuple[str, ...] = ()
     damage: str | None = None
-    definitions: Mapping[str, Definition[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

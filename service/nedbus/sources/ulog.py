@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.recording import UlogTopic, read_ulog
-from nedbus_msgs import ALL, BY_TOPIC, DEFAULT, Definition
+from nedbus_msgs import ALL, DEFAULT, Definition
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -54,15 +54,12 @@ class UlogSource:
         layout = f", layout {layouts}" if layouts else ""
         return ReplayRun(
             messages=heapq.merge(*map(_messages, topics, dues), key=lambda message: message.due),
-            addresses=tuple(topic.address for topic in topics),
+            addresses={topic.address: topic.definition for topic in topics},
             total=total,
             summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
-            definitions={
-                topic.address.topic: topic.definition for topic in topics if topic.address.topic not in BY_TOPIC
-            },
         )
 
 

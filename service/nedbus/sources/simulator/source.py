@@ -48,7 +48,7 @@ class SimulatorSource:
         total = None if self._ticks is None else sum(len(ticks) for ticks, _ in chosen.values())
         return ReplayRun(
             messages=self._messages(chosen),
-            addresses=tuple(sorted(chosen, key=lambda address: address.topic != DEFAULT_TOPIC)),
+            addresses=dict.fromkeys(sorted(chosen, key=lambda address: address.topic != DEFAULT_TOPIC)),
             total=total,
             summary=f"vehicle {self._vehicle}, seed {self._seed}, "
             + ("endless" if self._ticks is None else f"{total} messages, {self._ticks * TICK:g} s"),
