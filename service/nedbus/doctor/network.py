@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.events import merge_vehicles, to_age
+from nedbus.events import merge_vehicles, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, brief, list_names
@@ -109,7 +109,7 @@ def _check_states(seen: Observation) -> Iterator[Finding]:
             continue
         state: State = "wrong" if told.severity == "bad" else "warning"
         advice = f"'nedbus why --vehicle {name}' says what preceded it"
-        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{told.since_text(now)}", advice)
+        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}", advice)
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:

@@ -48,15 +48,13 @@ class Account:
     ) -> None:
         """Add a message: a model, a row, or fields by name; `missing` fields were not provided."""
         with self._lock:
-            vehicle = self._vehicle(address.vehicle)
-            if vehicle is not None:
+            if vehicle := self._vehicle(address.vehicle):
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Note a message that was rejected."""
         with self._lock:
-            vehicle = self._vehicle(address.vehicle)
-            if vehicle is not None:
+            if vehicle := self._vehicle(address.vehicle):
                 vehicle.reject(address.stream, reason, time)
 
     def look(
@@ -106,10 +104,9 @@ class Account:
             return list(self.events)[len(self.events) - new :], self.told
 
     def _vehicle(self, name: str) -> Vehicle | None:
-        known = self.vehicles.get(name)
-        if known is None and len(self.vehicles) < _MAX_VEHICLES:
-            known = self.vehicles[name] = Vehicle(name, self._keep, self._common)
-        return known
+        if name not in self.vehicles and len(self.vehicles) < _MAX_VEHICLES:
+            self.vehicles[name] = Vehicle(name, self._keep, self._common)
+        return self.vehicles.get(name)
 
     def _keep(self, event: Event) -> None:
         self.events.append(event)

@@ -20,7 +20,6 @@ _UNKNOWN_SATELLITES: Final = 255
 class Finding:
     """The meaning of a change of one message; the vehicle makes an event of it.
 
-    `flags`: those that begin or end; a condition holds for each.
     `on_ground`: its severity while the vehicle is disarmed, where that is another.
     `first`: the text of an end where the condition has held since the first message.
     `initial`: it held at the first message: a condition, and no event.
@@ -32,7 +31,6 @@ class Finding:
     text: str
     names: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
-    flags: tuple[str, ...] = ("",)
     on_ground: Severity | None = None
     first: str = ""
     initial: bool = False
@@ -198,8 +196,8 @@ def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fi
             is_info = change == "end" or rule.minor.issuperset(flags)
             text = (rule.begin if change == "begin" else rule.end).format(", ".join(rule.flags[name] for name in flags))
             yield Finding(
-                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), flags=tuple(flags),
-                on_ground=rule.on_ground, first=rule.first, initial=initial,
+                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), on_ground=rule.on_ground,
+                first=rule.first, initial=initial,
             )  # fmt: skip
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
+
+from pydantic import Field
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
@@ -15,6 +17,9 @@ WINDOW: Final = 10.0
 
 ALL: Final = "*"
 """The vehicle of events of the link, and of the reader itself, which concern all."""
+
+Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
+"""A time by the account's clock; the bounds are those of what a peer may tell."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,13 +39,23 @@ class Event:
     change: Literal["begin", "end", "once"]
     severity: Literal["bad", "watch", "info"]
     text: str
-    time: float
+    time: Seconds
     boot: float | None = None
     topic: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
     names: tuple[str, ...] = ()
     lasted: float | None = None
     evidence: tuple[Event, ...] = ()
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """The same for this event of a vehicle, whoever tells it."""
+        return self.kind, self.time, self.names
+
+    @property
+    def is_notable(self) -> bool:
+        """True for a begin that is bad or to be watched, and for a change of mode: both belong to a story."""
+        return self.change != "end" and (self.severity != "info" or self.kind == "mode")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +69,7 @@ class Condition:
     kind: str
     severity: Literal["bad", "watch", "info"]
     text: str
-    since: float
+    since: Seconds
     begin: Event
     initial: bool = False
     on_ground: Literal["bad", "watch", "info"] | None = None
@@ -149,12 +164,3 @@ def explain(event: Event, before: Iterable[Event], conditions: Iterable[Conditio
         if condition.kind in kinds and condition.severity != "info" and event.change != "end" and is_before:
             latest.setdefault(condition.kind, condition.begin)
     return sorted(latest.values(), key=lambda each: each.time)
-
-
-def to_age(seconds: float) -> str:
-    """Return a duration in a suitable unit, as text."""
-    if seconds < 1:
-        return f"{max(0.0, seconds) * 1e3:.0f} ms"
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"

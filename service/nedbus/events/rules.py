@@ -126,6 +126,14 @@ RULES: Final[Mapping[str, tuple[FlagRule, ...]]] = {
     ),
 }  # fmt: skip
 
+_FLAGGED: Final = frozenset(rule.kind for rules in RULES.values() for rule in rules)
+
+
+def flags_of(kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the flags for each of which a condition holds: the names of its event, or "" where it has no flags."""
+    return names if kind in _FLAGGED else ("",)
+
+
 RECENT: Final = 60.0
 """Seconds for which something that happened once is a reason to watch a vehicle."""
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
-from nedbus.events import AccountReport, Expectation, faults_of
+from nedbus.events import AccountReport, Expectation, faults_of, since_text
 from nedbus.extras import needs
 
 from .http_server import Page
@@ -32,7 +32,8 @@ def vehicles_page(report: AccountReport) -> Page:
     """Return the states of all vehicles; only the faults, with 503, if there are any."""
     faults = faults_of([report], Expectation(well=True))
     lines = [
-        f"{name} {vehicle.text}{vehicle.since_text(report.now)}" for name, vehicle in sorted(report.vehicles.items())
+        f"{name} {vehicle.text}{since_text(vehicle.since, report.now)}"
+        for name, vehicle in sorted(report.vehicles.items())
     ]
     good = "\n".join(map(_one_line, lines)) or "no vehicle is known"
     return Page.verdict(list(map(_one_line, faults)), good)

@@ -238,7 +238,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
         found: dict[Event, _Mark] = {}
         for span in spans_of([event for event in told if event.vehicle == vehicle]):
             event = span.begin
-            if event is None or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
+            if span.initial or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
                 continue
             offset = event.boot - start - event.time
             begin = span.since + offset

@@ -89,7 +89,7 @@ class Chronicle:
         """Return the stories of an event, a time, or all times; told once for all viewers until more happens."""
         if (vehicle, at) not in self._stories:
             known = self.account.vehicles.get(vehicle)
-            topics = list(known.messages.values()) if known is not None else []
+            topics = list(known.topics) if known is not None else []
             events = self._by_vehicle.get(vehicle, [])
             if isinstance(at, Event):
                 story = about(at, events, topics=topics)

@@ -198,7 +198,7 @@ def test_what_peers_say_is_one_line() -> None:
     forgotten = VehicleReport("bad", "no position", 1.0, ("silent",))
     assert vehicles_page(AccountReport("service", "host", 5000.0, vehicles={"7": forgotten})).status == 200
     assert vehicles_page(AccountReport("service", "host", 50.0, vehicles={"7": forgotten})).status == 503
-    assert vehicles_page(AccountReport("service", "host", 50.0)) == Page.text("no vehicle is known")
+    assert vehicles_page(AccountReport("service", "host", 50.0, {})) == Page.text("no vehicle is known")
 
 
 @pytest.mark.parametrize("every", [1, 3])

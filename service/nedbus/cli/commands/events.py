@@ -126,7 +126,7 @@ def why(
         followed = read.account.vehicles[name]
         found = [event for event in read.account.take(0)[0] if event.vehicle == name]
         conditions = [each for each in followed.conditions.values() if each.severity != "info"]
-        topics, times = list(followed.messages.values()), read.times
+        topics, times = list(followed.topics), read.times
         until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
         initial = ", ".join(dict.fromkeys(each.text for each in followed.conditions.values() if each.initial))
         others = f"; from the first message to the end: {initial}" if initial else ""
