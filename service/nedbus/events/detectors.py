@@ -73,7 +73,7 @@ class ChangeDetector:
         self._read_all = FieldReader(("timestamp", *compared, *told))
         self._detect = detect
         self._last: object = None
-        self._state: tuple[Any, ...] | None = None
+        self._state: tuple[Any, ...] = ()
         self._missing = _NONE
         self.stamp = self.earlier = 0
 
@@ -84,19 +84,14 @@ class ChangeDetector:
         last, self._last = self._last, message
         if state == self._state and (missing is self._missing or missing == self._missing):
             return None
-        return self._change(last, message, state, missing)
-
-    def forget(self) -> None:
-        """Begin anew: the vehicle has rebooted."""
-        self._last = self._state = None
-        self.stamp = self.earlier = 0
-
-    def _change(
-        self, last: object, message: object, state: tuple[Any, ...], missing: frozenset[str]
-    ) -> Iterator[Finding]:
         before = {} if last is None else self._by_name(last, self._missing)
         self._state, self._missing = state, missing
         return self._detect(before, self._by_name(message, missing))
+
+    def forget(self) -> None:
+        """Begin anew: the vehicle has rebooted."""
+        self._last, self._state = None, ()
+        self.stamp = self.earlier = 0
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
@@ -140,12 +135,9 @@ class GpsDetector(ChangeDetector):
             text = f"{'only ' * is_few}{satellites} satellites"
             yield from self._detect_level("few_satellites", is_few, is_enough, text, {"satellites": satellites})
         indicator, state = after["jamming_indicator"] or 0, after["jamming_state"] or 0
+        begins, ends = indicator >= rules.JAMMING_BEGIN or state > 1, indicator < rules.JAMMING_END and state <= 1
         text = f"GNSS jamming: indicator {indicator}" + (f", state {state}" if state > 1 else "")
-        is_jammed, is_clear = (
-            state > 1 or indicator >= rules.JAMMING_BEGIN,
-            state <= 1 and indicator < rules.JAMMING_END,
-        )
-        yield from self._detect_level("jamming", is_jammed, is_clear, text, {"indicator": indicator, "state": state})
+        yield from self._detect_level("jamming", begins, ends, text, {"indicator": indicator, "state": state})
         spoofed = after["spoofing_state"] or 0
         text = f"GNSS spoofing: state {spoofed}"
         yield from self._detect_level("spoofing", spoofed > 1, spoofed <= 1, text, {"state": spoofed})

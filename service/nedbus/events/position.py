@@ -36,8 +36,7 @@ class PositionDetector(ChangeDetector):
 
     def __init__(self) -> None:
         super().__init__(_COMPARED, self._detect_position, told=tuple(_TOLD))
-        self._read_motion = FieldReader(("timestamp", "x", "y", "vx", "vy"), math.nan)
-        self._read_state = FieldReader(_COMPARED)
+        self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # by now
@@ -46,12 +45,10 @@ class PositionDetector(ChangeDetector):
         """Add a message; return None while nothing changes."""
         before, motion = self._motion, self._read_motion(message)
         self._motion_before, self._motion = before, motion
-        self.earlier, self.stamp, state = self.stamp, motion[0], self._read_state(message)
-        last, self._last = self._last, message
-        if state != self._state or not (missing is self._missing or missing == self._missing):
-            return self._change(last, message, state, missing)
-        has_moved = abs(motion[1] - before[1]) > _MIN_STEP or abs(motion[2] - before[2]) > _MIN_STEP
-        step = self._unexplained_step() if has_moved and state[0] else None
+        if (found := super().add(message, missing)) is not None:
+            return found
+        has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
+        step = self._unexplained_step() if has_moved and self._state[0] else None
         return None if step is None and self._jump is None else self._follow_jump(step)
 
     def forget(self) -> None:
@@ -80,7 +77,7 @@ class PositionDetector(ChangeDetector):
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
-        (_, x_before, y_before, vx_before, vy_before), (_, x, y, vx, vy) = self._motion_before, self._motion
+        (x_before, y_before, vx_before, vy_before), (x, y, vx, vy) = self._motion_before, self._motion
         north, east = x - x_before - (vx + vx_before) / 2 * seconds, y - y_before - (vy + vy_before) / 2 * seconds
         limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
         return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
