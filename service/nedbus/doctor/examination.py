@@ -17,22 +17,11 @@ from nedbus.transport import Tls, open_client, probe_writes
 
 from .check import check_sources
 from .finding import Finding, limit_findings, sort_findings
-from .network import check_clocks, check_other_keys, check_permissions, check_routers, check_vehicles
+from .network import NETWORK_CHECKS
 from .observation import Observation
 from .prober import check_endpoint, check_tls_files
-from .services import check_services
 
 Check = Callable[[], Iterable[Finding]]
-NETWORK_CHECKS: Final[tuple[Callable[[Observation], Iterable[Finding]], ...]] = (
-    check_routers,
-    check_permissions,
-    check_services,
-    check_vehicles,
-    check_clocks,
-    check_other_keys,
-)
-"""The checks of what is seen behind a router; those before it are called in `examine`."""
-
 _LISTEN: Final = 3.0  # s
 _ENDPOINTS_TIMEOUT: Final = 9.0  # s for all checks before a router is joined, side by side
 _NETWORK_TIMEOUT: Final = 12.0  # s
@@ -64,7 +53,7 @@ def examine(
         for index, each in enumerate(findings):  # one router is joined: no other one is a reason for silence
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
-        seen = Observation(settings.prefix, version, vehicle, has_tls=tls is not None)
+        seen = Observation(settings.prefix, version, vehicle)
         checks = {("network", ""): partial(check_network, seen, answering[0], tls, listen)}
         findings += _run_together(checks, _NETWORK_TIMEOUT)
     return sort_findings(findings)

@@ -72,7 +72,7 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network(Observation("nedbus", "0", None, has_tls=False), endpoint, None, 0.0)
+        findings = check_network(Observation("nedbus", "0", None), endpoint, None, 0.0)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
