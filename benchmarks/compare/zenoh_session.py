@@ -4,9 +4,9 @@ import json
 
 import zenoh
 
-from .case import Case
+from .case import TOPIC, Case
 
-KEY = "bench/1/vehicle_local_position"  # of forms that know one vehicle only
+KEY = f"bench/1/{TOPIC}"  # of forms that know one vehicle only
 
 
 def open_session(endpoint: str) -> zenoh.Session:
@@ -24,7 +24,7 @@ def open_session(endpoint: str) -> zenoh.Session:
 
 def key(vehicle: str) -> str:
     """Return the key of a vehicle, or the key expression of all."""
-    return f"bench/{vehicle}/vehicle_local_position"
+    return f"bench/{vehicle}/{TOPIC}"
 
 
 def declare_publishers(session: zenoh.Session, case: Case) -> list[zenoh.Publisher]:
