@@ -1,4 +1,4 @@
-"""The examination: all checks, in an order in which each has what it needs, with a time limit for each."""
+"""The examination: all checks in order, each with a time limit."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ def examine(
 
 def _describe_settings(settings: Settings) -> Iterator[Finding]:
     """Yield the routers to join and the other settings, with the flag, variable or file that sets each."""
-    set_by = {name: settings.set_by(name) for name in Settings.model_fields if settings.set_by(name)}
-    setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in set_by.items()}
+    setters = {name: setter for name in Settings.model_fields if (setter := settings.set_by(name))}
+    setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in setters.items()}
     setter = next((setters[name] for name in ("connect", "listen", "router_config") if name in setters), "")
     text = f"set by {setter}" if setter else "the default: nothing sets connect"
     advice = "" if setter else "a router on another host is named with --connect, NEDBUS_CONNECT or in nedbus.toml"

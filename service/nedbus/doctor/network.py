@@ -22,7 +22,7 @@ _SYNCHRONISE: Final = "run NTP or PTP on both hosts: 'timedatectl' says whether 
 
 
 def check_routers(seen: Observation) -> Iterator[Finding]:
-    """Yield the number of sessions of each router, and whether it is nearly full."""
+    """Yield the number of sessions of each router; a warning if it is nearly full."""
     if not seen.routers:
         yield Finding("router", "", "ok", "joined; its other sessions are not shown to this client")
     for router in seen.routers:
@@ -36,7 +36,7 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
-    """Yield whether this client may read, by the messages that arrive, and may write a vehicle, by a probe."""
+    """Yield the permission to read, by the messages that arrive, and to write a vehicle, by a probe."""
     reading = _check_reading(seen)
     yield reading
     vehicle = seen.vehicle
@@ -231,4 +231,4 @@ def _prefix_of(key: str) -> str:
 NETWORK_CHECKS: Final = (
     check_routers, check_permissions, check_services, check_vehicles, check_clocks, check_other_keys,
 )  # fmt: skip
-"""The checks of what is seen behind a router; those before it are called in `examine`."""
+"""The checks of the network behind a router; those before it are called in `examine`."""

@@ -89,7 +89,7 @@ class Stream:
 
 @dataclass(slots=True)
 class Observation:
-    """A network as this client sees it, and what the doctor was asked for.
+    """A network as this client sees it, and the question to the doctor.
 
     `version`: of this nedbus; `vehicle`: the one to look at, None for all; `verdict`: whether it may be written.
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
@@ -198,7 +198,7 @@ def _age_of(sample: RawSample) -> float | None:
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Return what these keys are, without those that cannot be parsed."""
+    """Parse keys, without those that cannot be parsed."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

@@ -175,21 +175,21 @@ def make_detector(message: str) -> ChangeDetector | None:
 def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the flags that begin and end; one that was not known, or is not known any more, is no event."""
     for rule in flag_rules:
-        found: dict[tuple[Change, bool], list[str]] = {}
+        found: dict[tuple[bool, Change], list[str]] = {}  # by whether it is an event: initial conditions are none
         for name in rule.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == rule.bad and rule.initial:
-                found.setdefault(("begin", True), []).append(name)
+                found.setdefault((False, "begin"), []).append(name)
             elif now is None and was == rule.bad:
-                found.setdefault(("end", True), []).append(name)
+                found.setdefault((False, "end"), []).append(name)
             elif was is not None and now is not None and was != now:
-                found.setdefault(("begin" if now == rule.bad else "end", False), []).append(name)
-        for (change, initial), flags in sorted(found.items(), key=lambda item: (not item[0][1], item[0][0])):
+                found.setdefault((True, "begin" if now == rule.bad else "end"), []).append(name)
+        for (is_event, change), flags in sorted(found.items()):
             is_info = change == "end" or rule.minor.issuperset(flags)
             text = (rule.begin if change == "begin" else rule.end).format(", ".join(rule.flags[name] for name in flags))
             yield Finding(
                 rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), on_ground=rule.on_ground,
-                first=rule.first, initial=initial,
+                first=rule.first, initial=not is_event,
             )  # fmt: skip
 
 

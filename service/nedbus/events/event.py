@@ -10,7 +10,7 @@ from pydantic import Field
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
-"""The worst first: bad keeps a vehicle from its task, watch may become bad, info is what happens in any flight."""
+"""The worst first: bad keeps a vehicle from its task, watch may become bad, info occurs in any flight."""
 
 WINDOW: Final = 10.0
 """Seconds before an event in which others count as evidence; of conditions that go on, the begin counts at any time."""
@@ -19,7 +19,7 @@ ALL: Final = "*"
 """The vehicle of events of the link, and of the reader itself, which concern all."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
-"""A time by the account's clock; the bounds are those of what a peer may tell."""
+"""A time by the account's clock; the bounds apply to reports of peers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class Event:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """The same for this event of a vehicle, whoever tells it."""
+        """The same for one event of a vehicle in the reports of two services."""
         return self.kind, self.time, self.names
 
     @property
@@ -60,7 +60,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A condition of a vehicle: since when it holds, by the account's clock, and the event that began it.
+    """A condition of a vehicle, its begin by the account's clock, and the event that began it.
 
     `initial`: it held at the first message already: it began at an unknown time before.
     `on_ground`: its severity while the vehicle is disarmed, where that is another.
@@ -77,7 +77,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of a vehicle now: its severity ("info" is well), in words, since when, and all that holds."""
+    """The state of a vehicle now: severity ("info" is well), text, begin, and all conditions."""
 
     severity: Severity
     text: str

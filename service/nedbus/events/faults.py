@@ -36,7 +36,7 @@ class Expectation:
 def faults_of(
     reports: Sequence[AccountReport], expected: Expectation, *, heard: Collection[str] = (), only: str | None = None
 ) -> list[str]:
-    """Return what is wrong, a line each.
+    """Return the faults, a line each.
 
     `heard`: vehicles that are heard, though no service knows of them. `only`: judge the services of this host alone.
     """
@@ -55,7 +55,7 @@ def faults_of(
 
 
 def merge_vehicles(reports: Iterable[AccountReport]) -> dict[str, tuple[float, VehicleReport]]:
-    """Return what is known of each vehicle, and when: by a service that hears it, if one does."""
+    """Return the report on each vehicle and its time, by a service that hears it if there is one."""
     return {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(reports).items()}
 
 

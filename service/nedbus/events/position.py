@@ -18,13 +18,16 @@ _COMPARED: Final = (
     "xy_valid", *(name for rule in _RULES for name in rule.flags if name != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
-# The fields that are told when one of these changes, with PX4's values for those that are not given.
+# The fields that are read when one of these changes, with the values for those that are not given.
 _TOLD: Final[Mapping[str, object]] = {
-    **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom"), math.nan),
-    **dict.fromkeys(("delta_z", "delta_vz", "delta_heading", "delta_dist_bottom"), math.nan),
-    **dict.fromkeys(("ref_lat", "ref_lon", "ref_alt"), math.nan),
+    **dict.fromkeys(
+        (
+            "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom", "delta_z", "delta_vz",
+            "delta_heading", "delta_dist_bottom", "ref_lat", "ref_lon", "ref_alt",
+        ), math.nan,
+    ),
     **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
-}
+}  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m to one side; a smaller step is no jump, whatever the velocity
 _MAX_INTERVAL: Final = 0.5  # s between two messages that a jump is looked for in
 
@@ -73,7 +76,7 @@ class PositionDetector(ChangeDetector):
         yield from detect_flags(_RULES, before, after)
 
     def _unexplained_step(self) -> Step | None:
-        """Return the last step beyond what the velocity explains; None if it explains all of it."""
+        """Return the part of the last step that the velocity does not explain; None if it is small."""
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
@@ -95,7 +98,7 @@ class PositionDetector(ChangeDetector):
 
 
 def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
-    """Return a reset, with its size as far as the message tells it: deltas of what was not reset are old."""
+    """Return a reset, with the size of each quantity whose delta is of this reset."""
     numbers: dict[str, float] = {}
     words = []
     explained = {name for name in quantities if name not in track.discontinued}

@@ -29,11 +29,10 @@ _MAX_BYTES: Final = 2**17  # of the events of an answer, about, and of what hold
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """The state of one vehicle: its severity ("info" is well), in words, since when, the kinds of what holds.
+    """The state of one vehicle: severity ("info" is well), text, begin, and the kinds of its conditions.
 
-    `flags`: those of its position that say "not valid", each with since when. `topics`: those of the messages that it
-    sends. `has_position`: whether it sends a position at all. `held`: what holds, and is not among the events, as it
-    began before them, or held at the first message already.
+    `flags`: the flags of its position that are not valid, each with its begin. `topics`: of the messages that it sends.
+    `has_position`: True if it sends a position. `held`: conditions that hold and have no begin among the events.
     """
 
     severity: Literal["bad", "watch", "info"]
@@ -47,11 +46,11 @@ class VehicleReport:
 
     @property
     def is_silent(self) -> bool:
-        """True while it is not heard, so that nothing else is known of it."""
+        """True while nothing arrives from it."""
         return "silent" in self.kinds or "gone" in self.kinds
 
     def is_forgotten(self, now: float) -> bool:
-        """Return whether it has been silent for so long that it was switched off."""
+        """Return True if it has been silent for FORGOTTEN seconds."""
         return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
 
 
@@ -73,7 +72,7 @@ _REPORT: Final = TypeAdapter(AccountReport)
 
 
 def report_of(account: Account, service: str, host: str, now: float, *, within: float) -> AccountReport:
-    """Return what an account remembers of the last seconds; of many events the last ones of each vehicle."""
+    """Return the last `within` seconds of an account; of many events the last ones of each vehicle."""
     recent = [event for event in account.take(0)[0] if event.time > now - within]
     share = max(_LEAST_EVENTS, _MAX_EVENTS // max(1, len({event.vehicle for event in recent})))
     counts: Counter[str] = Counter()
@@ -114,7 +113,7 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 
 
 def from_json(content: object) -> AccountReport | None:
-    """Return the report in what a peer answered; None for anything else, as an older service answers."""
+    """Parse the answer of a peer; None if it is no report, as that of an older service."""
     try:
         return _REPORT.validate_python(content)
     except ValidationError:

@@ -15,9 +15,9 @@ class FlagRule:
 
     `flags`: by field, with the word for each; flags that change with one message are one event.
     `severity`: of the begin, and `on_ground` while the vehicle is known to be disarmed; an end is always info.
-    `begin`, `end`: what is said, with `{}` for the words. `first`: said when it never held before.
+    `begin`, `end`: the texts, with `{}` for the words. `first`: that of the end of an initial condition.
     `minor`: flags of which the begin is info too.
-    `initial`: what holds at the first message already is a condition too.
+    `initial`: a flag that is set in the first message is a condition too.
     """
 
     kind: str
@@ -135,10 +135,10 @@ def flags_of(kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 RECENT: Final = 60.0
-"""Seconds for which something that happened once is a reason to watch a vehicle."""
+"""Seconds for which a single event is a reason to watch a vehicle."""
 
 MAX_SILENCE: Final = 3.0
-"""Seconds without a position after which a vehicle is silent, where nothing better is known of its stream."""
+"""Seconds without a position after which a vehicle is silent, where the state of its stream is not known."""
 
 MIN_FIX_TYPE: Final = 3
 """The fix_type of SensorGps from which on a position is a fix in three dimensions."""
@@ -162,13 +162,13 @@ SMALL_RESET: Final = 0.5
 """Metres, and metres a second, below which a reset is nothing to watch."""
 
 FLAPPING_CHANGES: Final = 4
-"""Changes of a condition within WINDOW after which further ones are told when they end."""
+"""Changes of a condition within WINDOW after which only the last one is reported."""
 
 PAUSE: Final = 5.0
 """Seconds without another one after which flapping, losses, rejections or an overload of the reader are over."""
 
 MAX_BURST: Final = 20.0
-"""Seconds after which losses are told, though more may follow."""
+"""Seconds after which losses are reported, though more may follow."""
 
 OUTLIVING: Final = ("silent", "gone", "rejected")
 """Conditions that a reboot does not end."""

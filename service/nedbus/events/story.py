@@ -1,4 +1,4 @@
-"""The answer to "why": what was wrong, since when, for how long, what precedes it, and what the data do not have."""
+"""Stories, the answer of `nedbus why`: a fault, its duration, its evidence, and topics that are missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _HEADS: Final = (
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
-"""The topics that tell why an estimate is not valid."""
+"""The topics with evidence about an estimate that is not valid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,19 +28,19 @@ class Span(Condition):
     end: Event | None = None
 
     def holds(self, time: float) -> bool:
-        """Return whether it holds at a time; what happened once does so while it is recent."""
+        """Return True if it holds at a time; a single event holds while it is recent."""
         until = math.inf if self.until is None else self.until + RECENT * (self.until == self.since)
         return self.since <= time < until
 
 
 @dataclass(frozen=True, slots=True)
 class Story:
-    """One thing that was wrong with a vehicle.
+    """One fault of a vehicle.
 
     `what`: in words. `since`, `until`: by the account's clock; `until` is None while it goes on.
     `begin`: the event that began it, None where it held at the first message already; `end`: the one that ended it.
-    `before`: the evidence, oldest first; `meanwhile`: what else happened until its end; `after`: what came with its
-    end. `lacking`: topics that would have evidence, and are not in the data.
+    `before`: the evidence, oldest first; `meanwhile`: other events until its end; `after`: those at its end.
+    `lacking`: topics that would have evidence, and are not in the data.
     """
 
     what: str
@@ -66,9 +66,9 @@ def tell(
     topics: Collection[str] = (),
     at: float | None = None,
 ) -> list[Story]:
-    """Return what was wrong with one vehicle, in order, each with why; nothing if all was well.
+    """Return the stories of one vehicle, in order; none if all was well.
 
-    `events`: all of one vehicle, in order. `conditions`: what holds at their end, whether they tell its begin or not.
+    `events`: all of one vehicle, in order. `conditions`: those that hold at their end.
     `topics`: those of its messages. `at`: only what held then, or, if nothing did, the last thing before.
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
@@ -88,14 +88,14 @@ def tell(
 
 
 def about(event: Event, events: Sequence[Event], *, topics: Collection[str] = ()) -> Story | None:
-    """Return the story of one event: of what it began, or ended, or of what happened once."""
+    """Return the story of one event: of the condition that it began or ended, or of itself."""
     spans = spans_of(events)
     span = next((each for each in spans if event in (each.begin, each.end)), None)
     return None if span is None else _tell_one(_together(span, spans), spans, events, topics)
 
 
 def spans_of(events: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
-    """Return the conditions of one vehicle from begin to end, and what happened once, in the order of their begin.
+    """Return the conditions of one vehicle from begin to end, and its single events, in the order of their begin.
 
     `conditions`: those that hold at the end, or held at the first message, and have no begin among the events.
     """
@@ -130,12 +130,12 @@ def spans_of(events: Iterable[Event], conditions: Iterable[Condition] = ()) -> l
 
 
 def state_at(spans: Iterable[Span], time: float) -> State:
-    """Return the state of a vehicle at a time, by all that was wrong with it before and after."""
+    """Return the state of a vehicle at a time."""
     return state_of(span for span in spans if span.holds(time))
 
 
 def _tell_one(group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str]) -> Story:
-    """Return the story of conditions that began together; the first one speaks for it."""
+    """Return the story of conditions that began together; begin and evidence are those of the first."""
     span = group[0]
     until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
@@ -169,7 +169,7 @@ def _tell_one(group: Sequence[Span], spans: Iterable[Span], events: Sequence[Eve
 
 
 def _without_parts(stories: Sequence[Story]) -> list[Story]:
-    """Return the stories that are not told as part of something bad that began before."""
+    """Return the stories without those that are part of a bad one that began before."""
     kept: list[Story] = []
     for story in stories:
         parts = {event for each in kept if each.is_bad for event in (*each.meanwhile, *each.after)}
@@ -190,7 +190,7 @@ def _span(condition: Condition) -> Span:
 
 
 def _order(step: Event | Condition) -> tuple[float, bool, bool]:
-    """Of one moment a reboot is the first, then what holds since the first message, then all else."""
+    """Return the key of an order: at one time a reboot first, then initial conditions, then all else."""
     if isinstance(step, Condition):
         return step.since, True, False
     return step.time, step.kind != "reboot", True

@@ -18,7 +18,7 @@ _UNIX: Final = 1e9  # s since boot beyond which PX4's time is Unix time, as some
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """The rule by which times are shown: live, or by the offsets of the vehicles of a file.
+    """The format of times: live, or by the offsets of the vehicles of a file.
 
     `is_live`: the account's clock is this host's, in seconds since the epoch.
     `offsets`: Unix time minus time since boot [s], by vehicle, where a message tells it.
@@ -37,7 +37,7 @@ class Times:
         return utc if 0 <= utc < _LATEST else None  # a damaged time is neither
 
     def clock(self, event: Event) -> str:
-        """Return whose time it is: that of this host, of the vehicle as its messages tell UTC, or since its boot."""
+        """Return the clock of a time: "host", "vehicle" for UTC from its messages, or "boot"."""
         return "host" if self.is_live else "boot" if self.utc(event) is None else "vehicle"
 
     def text(self, event: Event) -> str:
@@ -87,5 +87,5 @@ def to_age(seconds: float) -> str:
 
 
 def since_text(since: float | None, now: float) -> str:
-    """Return since when something holds, to be said behind it; "" where that is not known."""
+    """Return the begin of a condition as a suffix for its text; "" where it is not known."""
     return "" if since is None else f", since {to_clock(since)} UTC ({to_age(now - since)})"

@@ -1,4 +1,4 @@
-"""One vehicle: the events of its messages, the conditions that hold now, and what precedes what."""
+"""One vehicle: the events of its messages, their evidence, and the conditions that hold now."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_AHEAD: Final = 1.0  # s that something may be ahead of a look; more is a cl
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # that are followed; no peer can make it remember more
 _MAX_TOPICS: Final = 20  # that an event names
-# Of these topics one speaks for the vehicle, the first that it sends; and the kinds of conditions that it tells.
+# Of each group one topic is used, the first of the list that arrives, for these kinds of conditions.
 _POSITIONS: Final = (DEFAULT_TOPIC, "external_ins_local_position", "estimator_local_position")
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _KINDS: Final = {
@@ -57,7 +57,7 @@ class Vehicle:
         self._main_time = math.inf  # of the last position
         self._rebooted = -math.inf
         self._changes: dict[tuple[str, tuple[str, ...]], deque[Event]] = {}  # of conditions, the last ones
-        self._untold: Counter[tuple[str, tuple[str, ...]]] = Counter()  # those of them that were too fast to be told
+        self._untold: Counter[tuple[str, tuple[str, ...]]] = Counter()  # of them too fast to be reported
         self._lost, self._rejected = _Burst(), _Burst()
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
@@ -90,14 +90,14 @@ class Vehicle:
             self.emit(each, address.topic, time)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
-        """Note that a message was rejected."""
+        """Add a message that was rejected."""
         if not self._rejected.count:
             text = f"{topic} rejected: {reason}"
             self.emit(Finding("rejected", "begin", "watch", text, names=(topic, reason)), topic, time)
         self._rejected.add(time, 1, topic)
 
     def settle(self, time: float) -> None:
-        """Tell losses, rejections and flapping that are over."""
+        """Report losses, rejections and flapping that are over."""
         lost, rejected = self._lost, self._rejected
         if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
             names = tuple(sorted(lost.topics))
@@ -117,7 +117,7 @@ class Vehicle:
                 del self._changes[key]
 
     def look(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Note how its position arrives now: its stream is "stale", "gone" or another; None where that is not known."""
+        """Update from the state of its position's stream: "stale", "gone" or another, None where it is not known."""
         self.settle(time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
@@ -131,7 +131,7 @@ class Vehicle:
         self.emit(Finding(silent, "begin", "bad", text, numbers={"age": age}), stream, time, changed=since)
 
     def state(self, time: float) -> State:
-        """Return its state now: what holds, what flaps, and what happened in the last minute."""
+        """Return its state now: conditions that hold or flap, and single events of the last minute."""
         found = [each for each in self.conditions.values() if each.on_ground != "info" or self.armed is not False]
         kinds = {each.kind for each in found}
         for event in reversed(self.recent):
@@ -144,7 +144,7 @@ class Vehicle:
         return state_of(dict.fromkeys(found))  # a condition of several flags counts once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
-        """Make an event of a finding, and begin or end its conditions; tell it, unless it held initially or flaps.
+        """Make an event of a finding, and begin or end its conditions; report it, unless it is initial or flaps.
 
         `changed`: when its condition began or ended, where that is earlier than `time`.
         """
@@ -173,9 +173,9 @@ class Vehicle:
             self._keep(event)
 
     def _open(self, address: Address) -> ChangeDetector | None:
-        """Return the detector of a stream, None for one that tells nothing about its vehicle."""
+        """Return the detector of a stream, None for one without events."""
         self.topics.add(address.topic)
-        if address.instance and address.topic not in _POSITIONS:  # the other sensors, batteries and EKFs do not speak
+        if address.instance and address.topic not in _POSITIONS:  # other sensors, batteries and EKFs are not used
             return None
         topics = next((each for each in _KINDS if address.topic in each), ())
         if topics:
@@ -191,7 +191,7 @@ class Vehicle:
         return make_detector(BY_TOPIC[address.topic].name) if address.topic in BY_TOPIC else None
 
     def _replace(self, old: Address, new: Address, kinds: frozenset[str]) -> None:
-        """End the conditions of a stream that speaks for the vehicle no more, as a better one does."""
+        """End the conditions of a stream when a better one takes its place."""
         self._detectors[old] = None
         for each in [each for (kind, _), each in self.conditions.items() if kind in kinds]:
             text = f"{each.text}: over, {new.stream} tells from now on"
@@ -199,7 +199,7 @@ class Vehicle:
             self.emit(ended, new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
-        """Forget what was known before a reboot; tell of it once, though late messages from before may follow it."""
+        """Reset the state, and report the reboot once, even if late messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
             detector.forget()
         self.conditions = {key: each for key, each in self.conditions.items() if key[0] in OUTLIVING}
@@ -218,7 +218,7 @@ class Vehicle:
         self._tell(replace(event, evidence=tuple(explain(event, recent, held))))
 
     def _flaps(self, event: Event) -> bool:
-        """Return whether a condition changes too fast to be told; its last change is told when it has settled."""
+        """Return True if a condition changes too fast to be reported; the last change is reported later."""
         if event.change == "once":
             return False
         key = event.kind, event.names
@@ -232,7 +232,7 @@ class Vehicle:
 
 @dataclass(slots=True)
 class _Burst:
-    """Losses or rejections in a row, which are told once."""
+    """Losses or rejections in a row, which are reported once."""
 
     begin: float = 0.0
     end: float = 0.0
