@@ -54,7 +54,12 @@ class VehicleReport:
         return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
 
 
-_Name = Annotated[str, AfterValidator(lambda name: check_vehicle(name) or name)]
+def _checked(vehicle: str) -> str:
+    check_vehicle(vehicle)
+    return vehicle
+
+
+_Name = Annotated[str, AfterValidator(_checked)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -94,7 +94,7 @@ def about(event: Event, events: Sequence[Event], *, topics: Collection[str] = ()
     return None if span is None else _tell_one(_together(span, spans), spans, events, topics)
 
 
-def spans_of(events: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
+def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
     """Return the conditions of one vehicle from begin to end, and its single events, in the order of their begin.
 
     `conditions`: those that hold at the end, or held at the first message, and have no begin among the events.
