@@ -58,6 +58,11 @@ class Story:
         """True if it keeps the vehicle from its task."""
         return self.begin is None or self.begin.severity == "bad"
 
+    @property
+    def topics(self) -> list[str]:
+        """The topics of its evidence."""
+        return sorted({each.topic for each in (*self.before, *self.meanwhile, *self.after) if each.topic})
+
 
 def tell(
     events: Sequence[Event],
