@@ -104,9 +104,10 @@ class Account:
             return list(self.events)[len(self.events) - new :], self.told
 
     def _vehicle(self, name: str) -> Vehicle | None:
-        if name not in self.vehicles and len(self.vehicles) < _MAX_VEHICLES:
-            self.vehicles[name] = Vehicle(name, self._keep, self._common)
-        return self.vehicles.get(name)
+        known = self.vehicles.get(name)
+        if known is None and len(self.vehicles) < _MAX_VEHICLES:
+            known = self.vehicles[name] = Vehicle(name, self._keep, self._common)
+        return known
 
     def _keep(self, event: Event) -> None:
         self.events.append(event)

@@ -78,7 +78,7 @@ class Vehicle:
         self.time, self.boot = time, stamp / 1e6
         if address == self.main:
             self._main_time = time
-            for kind in ("silent", "gone"):
+            for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", "info", f"{address.stream} is back"), address.topic, time)
         if stamp < before - _REBOOT and not 0 < earlier <= stamp + _REBOOT:  # else the one before was damaged
