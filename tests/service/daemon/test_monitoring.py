@@ -409,7 +409,7 @@ def test_vehicle_that_was_switched_off_has_no_age(
         wait_for(lambda: "gone" not in bus.vehicles(), what="the end of its token")
         assert ages() == {"here", "gone"}
         monkeypatch.setattr(metrics, "SWITCHED_OFF", 0.0)
-        assert ages() == {"here"}
+        wait_for(lambda: ages() == {"here"}, what="the next look")
         assert pages.values("nedbus_messages_received_total", vehicle="gone", topic=VLP)
         with other.publisher(VLP, vehicle="gone"):
             wait_for(lambda: ages() == {"here", "gone"}, what="it to come back")

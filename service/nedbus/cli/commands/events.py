@@ -14,7 +14,7 @@ import typer
 from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
-from nedbus.client import Bus, Monitor, Sample, to_age
+from nedbus.client import Bus, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import SEVERITIES, WINDOW, Account, AccountReport, Event, Story, Times, by_vehicle, tell
 from nedbus.monitoring import Observer
@@ -210,12 +210,12 @@ def _before(event: Event, time: float) -> str:
 
 
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
-    observer, monitor, seen = Observer(bus, selection), Monitor(), 0
+    observer, seen = Observer(bus, selection), 0
     known: set[str] = set()
 
     def show_new() -> None:
         nonlocal seen
-        observer.look(monitor.snapshot(), dropped=subscription.counts.dropped, waiting=subscription.waiting)
+        observer.look()
         new, seen = observer.account.take(seen)
         show(new)
         for name, each in list(observer.account.vehicles.items()):
@@ -227,11 +227,10 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
                     write_stderr(f"{name}: {texts}, since before this began")
 
     def handle(sample: Sample[Any]) -> bool:
-        monitor.add(sample)
         observer.add(sample)
         return True
 
-    with bus.subscribe_to(selection, mode="every") as subscription:
+    with observer.subscription as subscription:
         follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
 
 
