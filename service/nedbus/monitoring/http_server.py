@@ -132,7 +132,7 @@ class _Handler(BaseHTTPRequestHandler):
         if path not in pages:
             return Page.text(f"there is {', '.join(pages)}", status=200 if path == "/" else 404)
         host = self.headers.get("Host") or "localhost"  # every browser names it
-        if (is_local or path not in _ANY_NAME) and not _leads_here(host, local=is_local):
+        if (is_local or path not in _ANY_NAME) and not leads_here(host, local=is_local):
             return Page.text(f"{path} is answered under an address or a name of this host only", status=403)
         try:
             return pages[path]()
@@ -145,7 +145,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.connection.shutdown(socket.SHUT_RD)
 
 
-def _leads_here(host: str, *, local: bool) -> bool:
+def leads_here(host: str, *, local: bool) -> bool:
     """Return whether a Host header is a name that no foreign page can point at this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")

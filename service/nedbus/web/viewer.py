@@ -28,6 +28,7 @@ from .stream import is_position
 from .style import DARK, LIGHT, read_asset
 from .time_plots import Plots, Timeline, is_notable, move
 
+_TICK: Final = 100  # ms between two moves of the map
 _TEXT_TICKS: Final = 5  # moves of the map between two updates of text and plots
 _MAX_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the first of them
 _SLOW: Final = 1.0  # s between two pictures from which on the page says so
@@ -93,6 +94,7 @@ class Viewer:
         args = {"said": self._said, "map": self._map.figure, "search": self._search}
         document.js_on_event(DocumentReady, CustomJS(args=args, code=read_asset("actions.js")))
         document.add_root(self._lay_out(sheets))
+        document.add_periodic_callback(self.update, _TICK)
         if player is not None:
             player.on_jump = self._show_now
 
