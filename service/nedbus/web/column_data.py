@@ -31,20 +31,16 @@ def table(*names: str) -> ColumnDataSource:
 
 
 def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Send the cells that are different, or all when the number of rows is."""
+    """Send the columns that are different, or all when the number of rows is."""
     old = source.data
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
         source.data = new
-        return
-    patches = {}
-    for name, values in new.items():
-        cells = enumerate(zip(old[name], values, strict=True))
-        patch = [(index, value) for index, (was, value) in cells if was != value and repr(was) != repr(value)]  # NaN
-        if patch:
-            patches[name] = patch
-    if patches:
-        source.patch(patches)
+    else:  # repr, as NaN is not equal to itself
+        cells = slice(len(rows))
+        changed = {name: [(cells, values)] for name, values in new.items() if repr(values) != repr(old[name])}
+        if changed:
+            source.patch(changed)
 
 
 class Tracks:

@@ -135,10 +135,10 @@ class Plots:
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [
-            {"begin": begin * 1e3, "end": stop * 1e3, "colour": colours[severity]}
-            for severity in ("watch", "bad")
-            for begin, stop in _union([span for span in spans if span.severity == severity], end)
-        ]
+            {"begin": span.since * 1e3, "end": (end if span.until is None else span.until) * 1e3,
+             "colour": colours[span.severity]}
+            for span in spans if span.severity != "info" and span.until != span.since
+        ]  # fmt: skip
         replace(self._spans, held)
 
     def _draw(self, title: str, names: tuple[str, ...]) -> figure:
@@ -161,15 +161,3 @@ def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:
     )
     plot.xaxis.formatter = clock
     return plot
-
-
-def _union(spans: Sequence[Span], end: float) -> list[list[float]]:
-    """Return from when to when any of these held [s]: those that overlap are one."""
-    found: list[list[float]] = []
-    for span in spans:  # in the order of their beginnings
-        stop = end if span.until is None else span.until
-        if found and span.since <= found[-1][1]:
-            found[-1][1] = max(found[-1][1], stop)
-        elif stop > span.since:
-            found.append([span.since, stop])
-    return found
