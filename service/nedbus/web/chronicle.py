@@ -54,19 +54,12 @@ class Chronicle:
 
     def moment(self, seconds: float) -> str:
         """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
-        return self.time_text(seconds)[:-2] if self.has_utc else _elapsed(seconds)
+        return to_clock(seconds + (self.start or 0.0))[:-2] if self.has_utc else _elapsed(seconds)
 
     def clock(self, seconds: float) -> str:
         """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
         utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
         return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
-
-    def time_text(self, seconds: float) -> str:
-        """Return a time of the account as `Times.find` understands it: UTC, or seconds since boot."""
-        if self.has_utc:
-            return to_clock(seconds + (self.start or 0.0))
-        first = next(iter(self.events), None)
-        return f"{seconds if first is None or first.boot is None else seconds + first.boot - first.time:.1f}"
 
     def story(self, vehicle: str, now: float, at: Event | float | None) -> Story | None:
         """Return what is wrong with a vehicle now, or was in the last minutes, or what a chosen event or time is about.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ _MARGIN: Final = 0.08  # of what is shown, around it
 _FOLLOWED_SIDE: Final = 60.0  # m around a vehicle that is followed
 _LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label
 _MAX_EVENTS: Final = 60
+_SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 
 
 class Map:
@@ -94,6 +96,11 @@ class Map:
             for event, at in placed
         ]  # fmt: skip
         replace(self.events, marks)
+
+    def resize(self, size: str) -> None:
+        """Take the size of the map from a browser, such as 600x500 [pixels]."""
+        if found := _SIZE.fullmatch(size):
+            self.size = float(found[1]), float(found[2])
 
     def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
         """Return from where to where the map is, east and north."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlencode
@@ -34,9 +34,8 @@ _MAX_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the
 _SLOW: Final = 1.0  # s between two pictures from which on the page says so
 _MINUTE: Final = 60.0
 _AROUND: Final = 30.0  # s that are shown before and after a moment that is chosen
-_DAY: Final = 86_400.0
+_SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
 _MAX_DIGITS: Final = 9  # of the number of a picture
-_MAX_SIDE: Final = 20_000  # pixels of a map
 _MAX_SAID: Final = 300  # characters of what a browser asks for
 _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s of a recording
 
@@ -55,7 +54,7 @@ class Viewer:
         asked = _arguments(document)
         self.chosen: str | None = asked.get("vehicle")
         self.pinned: float | None = None  # a moment that is chosen, of live vehicles
-        self._asked_time = asked.get("time")
+        self._asked_time = _seconds_in(asked.get("time", ""))
         self._is_choice = self.chosen is not None
         self._event: Event | None = None  # that is chosen, of the chosen vehicle
         self._is_open = False  # the table of streams
@@ -83,7 +82,7 @@ class Viewer:
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._beat.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
         self._address.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
-        self._said.on_change("value", lambda _, __, said: self._act(said))
+        self._said.on_change("value", lambda _, __, said: self._act(*_action_in(said)))
         self._search.on_change("value_input", lambda _, __, ___: self._show_now())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.told, self._show)
@@ -145,20 +144,13 @@ class Viewer:
             self._player.jump(seconds)
 
     def _go_to_asked(self) -> None:
-        """Go to the moment that the address asks for, as soon as events tell when that was."""
-        events = self._world.events
-        if self._asked_time is None or not events or (self._player is not None and not self._player.recording.length):
-            return
-        near = next((each for each in reversed(events) if each.vehicle == self.chosen), events[-1])
-        with suppress(ValueError):  # an address that was written by hand: no moment is chosen then
-            moment = self._world.times.find(self._asked_time, near)
-            if abs(moment - near.time) < _DAY:
-                if self._player is not None:
-                    if not self._player.recording.has(moment):
-                        return  # it is still read
-                    self._player.toggle(pause=True)
-                self._go_to(moment)
-        self._asked_time = None
+        """Go to the moment that the address asks for, as soon as it was read."""
+        asked, player = self._asked_time, self._player
+        if asked is not None and (player is None or player.recording.has(asked)):
+            if player is not None:
+                player.toggle(pause=True)
+            self._go_to(asked)
+            self._asked_time = None
 
     def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
         """Write all text, the title and the address."""
@@ -187,7 +179,7 @@ class Viewer:
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
             "view": self._map.focus if self._map.focus != "all" else None,
-            "time": self._world.time_text(now) if self.pinned is not None or player is not None else None,
+            "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
         if self._drawn.value:  # a browser that is not there yet would miss it
             self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
@@ -224,13 +216,9 @@ class Viewer:
     def _events_of_chosen(self) -> list[Event]:
         return [event for event in self._world.events if event.vehicle == self.chosen and is_notable(event)]
 
-    def _act(self, said: str) -> None:
+    def _act(self, action: str, value: str) -> None:
         """Do what a click or a key asks for; anything else is ignored."""
-        try:
-            action, value, _ = json.loads(said[:_MAX_SAID])
-        except (ValueError, TypeError):
-            return
-        (name, _, option), value = str(action).partition(":"), str(value)
+        (name, _, option), player = action.partition(":"), self._player
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
                 self._choose(value)
@@ -245,27 +233,18 @@ class Viewer:
             case "streams":
                 self._is_open = not self._is_open
             case "size":
-                sides = [int(side) for side in value.split("x") if side.isdecimal() and 0 < int(side) < _MAX_SIDE]
-                if len(sides) == 2:
-                    self._map.size = float(sides[0]), float(sides[1])
-            case _:
-                self._navigate(name)
-        self._show_now()
-
-    def _navigate(self, key: str) -> None:
-        """Go to another vehicle, event or time."""
-        player = self._player
-        match key.lower():
+                self._map.resize(value)
             case "now":
                 self._go_to(None)
-            case "down" | "up" as side:
-                self._choose_next(1 if side == "down" else -1)
+            case "down" | "up":
+                self._choose_next(1 if name == "down" else -1)
             case "next" | "previous":
-                self._show_next(is_later=key == "next")
+                self._show_next(is_later=name == "next")
             case "play" if player is not None:
                 player.toggle()
-            case "left" | "right" if player is not None:
-                player.jump(player.time + _STEPS.get(key, 0.0))
+            case "left" | "right" | "LEFT" | "RIGHT" if player is not None:
+                player.jump(player.time + _STEPS[name])
+        self._show_now()
 
     def _choose_next(self, step: int) -> None:
         if names := self._listed:  # which goes round
@@ -307,8 +286,22 @@ class Viewer:
         return column(*parts, sizing_mode="stretch_width", stylesheets=page)
 
 
+def _action_in(said: str) -> tuple[str, str]:
+    """Return an action and its value as the page's script sends them, of anything else none."""
+    try:
+        action, value, _ = json.loads(said[:_MAX_SAID])
+    except (ValueError, TypeError):
+        return "", ""
+    return str(action), str(value)
+
+
 def _arguments(document: Document) -> Mapping[str, str]:
     """Return what the address of the page asks for."""
     request = getattr(document.session_context, "request", None)  # none without a browser
     given = request.arguments if request is not None else {}
     return {name: values[0].decode(errors="replace")[:_MAX_SAID] for name, values in given.items() if values}
+
+
+def _seconds_in(text: str) -> float | None:
+    """Return a time in an address by the account's clock [s], None if it is none."""
+    return float(text) if _SECONDS.fullmatch(text) else None
