@@ -10,7 +10,7 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version as version_of
 from itertools import accumulate
 from typing import Any, Final
@@ -34,7 +34,6 @@ SWITCHED_OFF: Final = 3600.0
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
-_OTHER: Final = ("other", "other")
 
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # of a service
@@ -147,15 +146,15 @@ def is_switched_off(health: Health) -> bool:
 def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core.Metric]:
     """Yield the metrics of streams; `messages` is the name of the counter of messages."""
     streams = sorted(streams, key=lambda stream: not stream.health.resets)  # which only positions have
-    named, rest = streams[:MAX_STREAMS], streams[MAX_STREAMS:]
+    named = streams[:MAX_STREAMS]
+    rest = [replace(stream, vehicle="other", topic="other") for stream in streams[MAX_STREAMS:]]
     active = [stream for stream in named if stream.active]
 
-    def count(attribute: str) -> Iterator[tuple[tuple[str, ...], int]]:
-        others: Counter[str] = Counter()
-        for stream in rest:
-            others[stream.source] += getattr(stream.health, attribute)
-        yield from ((stream.labels, getattr(stream.health, attribute)) for stream in named)
-        yield from (((*_OTHER, source), total) for source, total in others.items())
+    def count(attribute: str) -> Iterable[tuple[tuple[str, ...], int]]:
+        totals: Counter[tuple[str, ...]] = Counter()
+        for stream in (*named, *rest):
+            totals[stream.labels] += getattr(stream.health, attribute)
+        return totals.items()
 
     def measure(attribute: str, of: Iterable[Stream] = active) -> Iterator[tuple[tuple[str, ...], float]]:
         values = ((stream.labels, getattr(stream.health, attribute)) for stream in of)

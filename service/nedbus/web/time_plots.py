@@ -47,9 +47,10 @@ class Timeline:
         self._spans = table("begin", "end", "row", "colour")
         self._now = table("time")
         self._style = style
-        self._names: list[str] = []
+        self._ticker = FixedTicker()
         self.range = Range1d()
         self.figure = _time_figure(self.range, clock, y_range=Range1d(), height=100, css_classes=["time"])
+        self.figure.yaxis.ticker = self._ticker
         self.figure.ygrid.grid_line_color = None
         self.figure.hbar(
             y="row", left="begin", right="end", source=self._spans, height=0.28, color="colour", alpha=0.75
@@ -93,13 +94,12 @@ class Timeline:
         ]  # fmt: skip
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
-        if names != self._names:
-            self._names = names
-            axis = self.figure.yaxis[0]
-            axis.ticker = FixedTicker(ticks=list(rows.values()))
-            axis.major_label_overrides = {row: "link, page" if name == ALL else name[:14] for name, row in rows.items()}
-            room = max(_MIN_ROWS - len(names), 0) / 2
-            self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
+        self._ticker.ticks = list(rows.values())
+        self.figure.yaxis.major_label_overrides = {
+            row: "link, page" if name == ALL else name[:14] for name, row in rows.items()
+        }
+        room = max(_MIN_ROWS - len(names), 0) / 2
+        self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
 
 
 class Plots:
