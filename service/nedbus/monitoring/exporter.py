@@ -5,7 +5,6 @@ Needs the extra `metrics`.
 
 from __future__ import annotations
 
-import json
 import socket
 import threading
 import time
@@ -19,7 +18,7 @@ from prometheus_client.core import Metric
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import NedbusError
-from nedbus.events import Account, report_of
+from nedbus.events import report_of
 from nedbus.transport import RouterState, Session, ask_routers
 from nedbus_msgs import Address, Selection
 
@@ -46,7 +45,7 @@ _SESSION_TIMEOUT: Final = 1.0  # s
 
 
 class Exporter:
-    """Read all that a selection matches, and make pages of it.
+    """Read all that a selection matches: an `account` of it, and `pages` by path.
 
     `watch` gets each sample as well, and `on_look` the sight of all vehicles twice a second.
     """
@@ -63,7 +62,14 @@ class Exporter:
         self._bus, self._version = bus, version
         self._watch, self._on_look = watch, on_look
         self._observer = Observer(bus, selection)
-        self._subscription = self._observer.subscription
+        self._subscription, self.account = self._observer.subscription, self._observer.account
+        self.pages: Mapping[str, Callable[[], Page]] = {
+            "/metrics": lambda: metrics_page(self._metrics()),
+            "/healthz": lambda: Page.text("ok"),
+            "/readyz": lambda: Page.verdict(self._faults(), "ready"),
+            "/vehicles": self._vehicles,
+            "/status": self._status,
+        }
         self._alive: Collection[Address] = ()
         self._routers: list[RouterState] = []
         self._session: Session | None = None  # for the queries of routers
@@ -88,24 +94,7 @@ class Exporter:
             for task in tasks:
                 task.result()
 
-    @property
-    def account(self) -> Account:
-        """The account of what happened."""
-        return self._observer.account
-
-    @property
-    def pages(self) -> Mapping[str, Callable[[], Page]]:
-        """The pages by path."""
-        return {
-            "/metrics": lambda: metrics_page(self._metrics()),
-            "/healthz": lambda: Page.text("ok"),
-            "/readyz": lambda: Page.verdict(self._faults(), "ready"),
-            "/vehicles": self._vehicles,
-            "/status": self._status,
-        }
-
     def _metrics(self) -> Iterator[Metric]:
-        """Yield all metrics."""
         counts, streams = self._subscription.counts, self._streams()
         yield build_info(self._version)
         yield from make_metrics({
@@ -163,5 +152,4 @@ class Exporter:
 
     def _status(self) -> Page:
         streams = {str(address): asdict(health) for address, (health, _) in self._observer.measure().items()}
-        status = {"connected": self._bus.connected, **asdict(self._subscription.counts), "streams": streams}
-        return Page(200, "application/json", json.dumps(status, indent=2).encode())
+        return Page.json({"connected": self._bus.connected, **asdict(self._subscription.counts), "streams": streams})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import logging
 import socket
 import threading
@@ -34,6 +35,11 @@ class Page(NamedTuple):
     def text(cls, text: str, *, status: int = 200) -> Page:
         """Return a page of plain text."""
         return cls(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+    @classmethod
+    def json(cls, content: Mapping[str, Any]) -> Page:
+        """Return a page of JSON."""
+        return cls(200, "application/json", json.dumps(content, indent=2).encode())
 
     @classmethod
     def verdict(cls, faults: list[str], good: str) -> Page:

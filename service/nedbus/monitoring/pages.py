@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
@@ -24,7 +23,7 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
         "/healthz": lambda: _health(daemon),
         "/readyz": lambda: Page.verdict(why_not_ready(daemon), "ready"),
         "/vehicles": lambda: vehicles_page(daemon.report()),
-        "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
+        "/status": lambda: Page.json(asdict(daemon.status)),
     }
 
 

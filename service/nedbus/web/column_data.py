@@ -58,18 +58,12 @@ class Tracks:
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
         """Send the new points of these."""
-        begins = tracks != self._tracks  # as after a jump of the time, which makes other histories
-        if begins:
+        if tracks != self._tracks:  # as after a jump of the time, which makes other histories
             self._lay_out(tracks)
         cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
-        if begins:
-            filled: dict[str, Any] = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in cells}
-            for name, column in filled.items():
-                column[list(cells[name])] = list(cells[name].values())
-            self.source.data = filled
-        elif cells["east"]:
+        if cells["east"]:
             self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
 
     def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
@@ -81,6 +75,7 @@ class Tracks:
         written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
         self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
         self._slots = longest // self._step + 2  # with the one that is not complete yet, and the gap
+        self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
 
     def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
         """Add the cells that change, by column and slot."""
