@@ -21,9 +21,9 @@ _MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one is of a
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """All that was seen at one moment [s since the epoch]: published addresses, rejections, and the link.
+    """Streams, new rejections and the link at one moment [s since the epoch].
 
-    `link`: "" or what is wrong with it. `healths`: of all streams. `behind`: what is wrong with this reader itself.
+    `alive`: published addresses; `link`, `behind`: the fault of the link, and of this reader itself, "" without one.
     """
 
     time: float

@@ -38,7 +38,7 @@ def vehicles_page(report: AccountReport) -> Page:
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return what keeps a service from being ready: no router, one that refuses it, or a source that is silent."""
+    """Return the reasons why a service is not ready: no router, one that refuses it, or a source that is silent."""
     if not daemon.ready.is_set():
         return [f"the service starts: {' or '.join(daemon.endpoints)}"]
     reasons = []

@@ -1,4 +1,4 @@
-"""Column data that a viewer is sent: only the points and cells that are new."""
+"""Column data of a viewer, updated by new points and changed columns alone."""
 
 from __future__ import annotations
 

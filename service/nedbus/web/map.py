@@ -103,7 +103,7 @@ class Map:
             self.size = float(found[1]), float(found[2])
 
     def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
-        """Return from where to where the map is, east and north."""
+        """Return the extent of the map: [west, east], [south, north] [m]."""
         points = [np.array([place[:2] for _, place in shown] or [(0.0, 0.0)])]
         points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
         found = np.concatenate(points)
@@ -117,7 +117,7 @@ class Map:
     def _labels(
         self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
     ) -> dict[str, tuple[str, bool]]:
-        """Return the labels that do not lie on each other, the worst first, and which are on the left of their mark."""
+        """Return the labels that do not overlap, the worst first, and whether each is on the left of its mark."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m a pixel

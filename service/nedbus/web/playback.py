@@ -44,8 +44,8 @@ class Recording:
     """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
 
     Of most other messages, which outnumber them, only PX4's time is kept. `whole`: the flight at two points a second;
-    `account`: its events, whose clock is seconds since the first message; `chronicle`: how the page tells them.
-    `entries`: of each message its address, and its payload, timestamp, or why it was rejected; `dues`: when [s].
+    `chronicle`: its events, whose clock is seconds since the first message.
+    `entries`: of each message its address, and its payload, timestamp or reason of rejection; `dues`: its time [s].
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -54,8 +54,7 @@ class Recording:
         spec = parse_source(source_text_of_file(path))
         self.name = path.name
         self.whole = Fleet(long=_WHOLE)
-        self.account = Account(KEPT_OF_FILE)
-        self.chronicle = Chronicle(self.account, times=Times())
+        self.chronicle = Chronicle(Account(KEPT_OF_FILE), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
@@ -83,7 +82,7 @@ class Recording:
     def _read(self) -> None:
         try:
             self.chronicle.times = times_of(self._path, self._run.addresses)
-            for message, reason, payload in follow(self._run.messages, self.account):
+            for message, reason, payload in follow(self._run.messages, self.chronicle.account):
                 self._add(message, reason, payload)
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))

@@ -62,7 +62,7 @@ class Where:
 def serve_live(
     bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
 ) -> None:
-    """Serve the page of what a selection matches until `stop` is set; `tell` gets its address when it is there.
+    """Serve the page of a selection until `stop` is set; call `tell` with its address when it listens.
 
     Raises ConfigError for a bad background, ListenError if it cannot listen.
     """
@@ -93,7 +93,7 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
 
 class LiveFleet:
-    """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop.
+    """Read a selection into a fleet and a chronicle.
 
     `run` reads until an event is set; `pages`: metrics and health, as `nedbus export` serves them.
     """
@@ -115,7 +115,6 @@ class LiveFleet:
         self.run, self.pages = self._exporter.run, self._exporter.pages
 
     def _look(self, sight: Sight) -> None:
-        """Make the picture of now."""
         account = self._exporter.account
         self.fleet.reject(sight.rejected)
         states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
@@ -124,7 +123,7 @@ class LiveFleet:
 
 
 class WebServer:
-    """Serve a page, and pages of text by their path, until it is told to stop.
+    """Serve a page, and pages of text by their path.
 
     A foreign page that is open in the same browser gets nothing, also where its own name leads here (DNS rebinding):
     browsers have to call this one by a name that only leads here, as `HttpServer` has it, or by one of `where.origins`.
@@ -181,7 +180,7 @@ class WebServer:
 
 
 class _Names(NullAuth):
-    """Answer only browsers that may ask."""
+    """Refuse requests under foreign names."""
 
     login_url = "/"  # Bokeh demands it where users are checked; no browser is sent there
 

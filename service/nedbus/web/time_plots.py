@@ -131,7 +131,7 @@ class Plots:
                 source.stream(columns, rollover=history.size)
 
     def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
-        """Show when events of the vehicle happened, and how long they held, up to `end` [s]."""
+        """Mark the times of events of the vehicle, and shade its conditions, up to `end` [s]."""
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [

@@ -43,8 +43,8 @@ _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s 
 class Viewer:
     """One page in one browser; `update` sends what is new of the fleet, ten times a second.
 
-    `world`: the events. `player`: of a recording, of which long histories are whole.
-    What the address of the page asks for is shown first, and the address follows what is shown, so that it can be sent.
+    `world`: the events. `player`: the time in a recording, whose long histories are the whole flight.
+    The address of the page names vehicle, moment, view and theme, and follows them, so that it can be shared.
     """
 
     def __init__(
@@ -76,8 +76,7 @@ class Viewer:
             placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
         )
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"])
-        # What the page and the viewer say to each other: the number of a picture, that it was drawn, a click or a key,
-        # and the address.
+        # Channels between page and viewer: the number of a picture, that it was drawn, a click or a key, the address.
         self._beat, self._drawn, self._said, self._address = (TextInput(visible=False) for _ in range(4))
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._beat.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
@@ -126,7 +125,6 @@ class Viewer:
         self._ticks = 0
 
     def _show(self, event: Event) -> None:
-        """Show when and where something happened."""
         if event.vehicle != ALL:
             self._choose(event.vehicle)
         self._go_to(event.time)
@@ -144,7 +142,7 @@ class Viewer:
             self._player.jump(seconds)
 
     def _go_to_asked(self) -> None:
-        """Go to the moment that the address asks for, as soon as it was read."""
+        """Go to the moment in the address, as soon as the recording has been read that far."""
         asked, player = self._asked_time, self._player
         if asked is not None and (player is None or player.recording.has(asked)):
             if player is not None:
@@ -153,7 +151,6 @@ class Viewer:
             self._asked_time = None
 
     def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
-        """Write all text, the title and the address."""
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
@@ -217,7 +214,7 @@ class Viewer:
         return [event for event in self._world.events if event.vehicle == self.chosen and is_notable(event)]
 
     def _act(self, action: str, value: str) -> None:
-        """Do what a click or a key asks for; anything else is ignored."""
+        """Perform the action of a click or a key; ignore anything else."""
         (name, _, option), player = action.partition(":"), self._player
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
@@ -261,7 +258,7 @@ class Viewer:
     def _on_tap(
         self, source: ColumnDataSource, shown: Callable[[], Sequence[Any]], show: Callable[[Any], object]
     ) -> None:
-        """Show what is tapped, which is no selection: the same may be tapped again."""
+        """Show the tapped row, and clear the selection, so that the same row can be tapped again."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
             if rows and 0 <= rows[0] < len(shown()):
@@ -287,7 +284,7 @@ class Viewer:
 
 
 def _action_in(said: str) -> tuple[str, str]:
-    """Return an action and its value as the page's script sends them, of anything else none."""
+    """Return the action and its value that `actions.js` sent, empty ones for anything else."""
     try:
         action, value, _ = json.loads(said[:_MAX_SAID])
     except (ValueError, TypeError):
@@ -296,7 +293,7 @@ def _action_in(said: str) -> tuple[str, str]:
 
 
 def _arguments(document: Document) -> Mapping[str, str]:
-    """Return what the address of the page asks for."""
+    """Return the arguments in the address of the page."""
     request = getattr(document.session_context, "request", None)  # none without a browser
     given = request.arguments if request is not None else {}
     return {name: values[0].decode(errors="replace")[:_MAX_SAID] for name, values in given.items() if values}
