@@ -15,10 +15,8 @@ from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
-from bokeh.resources import Resources
 from bokeh.server.auth_provider import NullAuth
 from bokeh.server.server import Server
-from bokeh.server.views.static_handler import StaticHandler
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
@@ -159,12 +157,6 @@ class WebServer:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
             raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
-        # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
-        parts = Resources(
-            mode="server", root_url="/", path_versioner=StaticHandler.append_version,
-            components=["bokeh", "bokeh-widgets", "bokeh-tables"],
-        )  # fmt: skip
-        self._server._tornado.resources = lambda *_: parts  # type: ignore[method-assign]  # noqa: SLF001
         shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self._server.port}"
 
