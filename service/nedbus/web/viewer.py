@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -31,7 +30,6 @@ from .time_plots import Plots, Timeline, is_notable, move
 _TICK: Final = 100  # ms between two moves of the map
 _TEXT_TICKS: Final = 5  # moves of the map between two updates of text and plots
 _MAX_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the first of them
-_SLOW: Final = 1.0  # s between two pictures from which on the page says so
 _MINUTE: Final = 60.0
 _AROUND: Final = 30.0  # s that are shown before and after a moment that is chosen
 _SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
@@ -62,7 +60,7 @@ class Viewer:
         self._fleet, self._world, self._player = fleet, world, player
         self._whole = player.recording.whole if player is not None else fleet
         self._style, self._name, self._document = LIGHT if asked.get("theme") == "light" else DARK, title, document
-        self._ticks, self._sent, self._updated, self._slow = 0, 0, time.monotonic(), 0.0
+        self._ticks = self._sent = 0
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
@@ -100,12 +98,10 @@ class Viewer:
         """Send what is new, as soon as the browser has drawn the last: the map each time, the rest twice a second."""
         if self._player is not None:
             self._player.tick()
-        now = time.monotonic()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
-        self._slow = now - self._updated if now - self._updated > _SLOW else 0.0
-        self._sent, self._updated = self._sent + 1, now
+        self._sent += 1
         if self._drawn.value and not self._grid.children:  # map and list are there sooner without
             self._grid.children = [*self._plots.draw()]
         picture = self._fleet.picture
@@ -165,7 +161,7 @@ class Viewer:
             story = self._world.story(chosen.vehicle, now, at)
             if self.pinned is not None:
                 then = replace(chosen, state=self._world.state(chosen.vehicle, now))
-        self._text["head"].text = panels.head(self._name, picture, clock, self._slow)
+        self._text["head"].text = panels.head(self._name, picture, clock)
         self._text["list"].text = panels.vehicles(rows, self.chosen)
         self._text["why"].text = panels.why(then, story, now, self.pinned is not None)
         self._text["nums"].text = panels.numbers(chosen)
