@@ -113,7 +113,7 @@ class Exporter:
     def _streams(self) -> list[Stream]:
         return [
             Stream(
-                address.vehicle, address.stream, self._sources.get(address, ""), health,
+                (address.vehicle, address.stream, self._sources.get(address, "")), health,
                 address in self._alive or not is_switched_off(health), latencies,
             )
             for address, (health, latencies) in self._observer.measure().items()

@@ -327,7 +327,7 @@ def streams(count: int, topic: str = VLP) -> list[Stream]:
     health = StreamHealth(topic)
     for each in range(3):
         health.add(message(each), received=each, lost=each)
-    return [Stream(f"v{number}", topic, f"source {number % 2}", health.snapshot(3)) for number in range(count)]
+    return [Stream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3)) for number in range(count)]
 
 
 def test_number_of_streams_is_bounded() -> None:
@@ -358,7 +358,7 @@ def test_positions_have_labels_before_others() -> None:
 def test_labels_are_escaped() -> None:
     """A source with quotes and line breaks in it is one label, and the page has the metrics of the process."""
     source = 'ulog:a"b\\c\nd{}é'
-    strange = replace(streams(1)[0], source=source, latencies=Histogram((0.001, 1.0)))
+    strange = replace(streams(1)[0], labels=("v0", VLP, source), latencies=Histogram((0.001, 1.0)))
     families = stream_metrics([*streams(3), strange], messages="nedbus_messages_received")
     text = metrics_page(families).content.decode()
     found = read_families(text)
