@@ -68,7 +68,8 @@ class Observer:
         """Look at streams, rejections and the link, and note in the account what changed."""
         now, connected = time.time(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
-        healths = {address: health for address, (health, _) in self.measure().items()}
+        with self._lock:
+            healths = self._monitor.snapshot()
         rejected = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         for report in rejected:
             self.account.reject(report.address, report.reason, report.received / 1e9)
