@@ -86,19 +86,17 @@ class Tracks:
             return
         self._seen[index] = end
         names = (_TRUE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBT)
-        gap = dict.fromkeys(("east", *names), math.nan)
+
+        def put(slot: int, point: Mapping[str, float]) -> None:
+            for name in ("east", *names):
+                for place in (0, ring) if slot == 0 else (slot,):  # so that the line goes on from the last slot
+                    cells[name][index * (ring + 2) + place] = point.get(name, math.nan)
+
         points = history.points(seen // step * step, end)
-        changed: dict[int, dict[str, float]] = {}
         broken = False
         for position, point in enumerate(points.tolist(), end - len(points)):
             east, north, doubtful = point[_EAST], point[_NORTH], point[_DOUBTFUL]
             broken = math.isnan(east) or (broken and position % step > 0)
-            values = {**gap, "east": round(east, 2)}
-            values[names[-1 if doubtful > 0 else 0]] = math.nan if broken else round(north, 2)
-            changed[position // step % ring] = values
-        changed[((end - 1) // step + 1) % ring] = gap
-        if 0 in changed:
-            changed[ring] = changed[0]  # so that the line goes on from the last slot to the first
-        for slot, values in changed.items():
-            for name, value in values.items():
-                cells[name][index * (ring + 2) + slot] = value
+            kind = names[-1 if doubtful > 0 else 0]
+            put(position // step % ring, {"east": round(east, 2), kind: math.nan if broken else round(north, 2)})
+        put(((end - 1) // step + 1) % ring, {})
