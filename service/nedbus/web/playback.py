@@ -26,7 +26,7 @@ from nedbus.sources import (
     source_text_of_file,
     times_of,
 )
-from nedbus_msgs import BY_TOPIC, Address, codec_of
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
 from .fleet import Fleet
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s that are shown before the time that is chosen
 _WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two of them
-_KEPT: Final = ("VehicleStatus", "SensorGps", "BatteryStatus")  # messages whose values the page shows
+_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # whose values are shown
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
@@ -91,12 +91,11 @@ class Recording:
 
     def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
         address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
-        definition = BY_TOPIC.get(address.topic)
         kept: bytes | str | int = stamp if reason is None else reason
-        if payload is not None and definition is not None and (is_position(address) or definition.name in _KEPT):
+        if payload is not None and (is_position(address) or address.topic in _KEPT):
             kept = payload
             if is_position(address):
-                row = codec_of(definition).decode_row(payload)
+                row = codec_of(DEFAULT).decode_row(payload)
                 self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
         offset = self.chronicle.times.offsets.get(address.vehicle)
         if self.chronicle.start is None and reason is None and offset is not None:
