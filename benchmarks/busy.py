@@ -27,11 +27,12 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=int, default=20)
-    parser.add_argument("--forms", default="", help="some of every, latest, raw fifo, raw ring, separated by commas")
+    forms = list(dict.fromkeys(form for form, _ in CASES))
+    parser.add_argument("--forms", nargs="+", choices=forms, default=forms)
     arguments = parser.parse_args()
     print("form      script            received / sent     lost  dropped   age ms: p50     p99     max   steps/s")
     for form, script in CASES:
-        if not arguments.forms or form in arguments.forms.split(","):
+        if form in arguments.forms:
             print(measure(form, script, arguments.seconds), flush=True)
 
 

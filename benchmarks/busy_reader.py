@@ -18,8 +18,9 @@ import zenoh
 
 import nedbus
 
-from .compare.nedbus_ends import TOPIC
+from .compare.case import TOPIC
 from .compare.zenoh_session import KEY, open_session
+from .processes import wait_for_quiet
 
 QUIET = 1.0  # s without a message after which nothing more comes
 PATIENCE = 5.0  # s after the last was sent, whatever is still to come
@@ -30,14 +31,17 @@ Counts = Callable[[], dict[str, int]]
 
 @dataclass
 class Ages:
-    """Age of messages in ns, and the work that the script did meanwhile."""
+    """Age of messages in ns, when the last one came, and the work that the script did meanwhile."""
 
     ages: list[int] = field(default_factory=list)
+    last: float = 0.0
     steps: int = 0
 
     def take(self, stamp: int) -> None:
         """Note one message."""
-        self.ages.append(time.monotonic_ns() - stamp)
+        now = time.monotonic_ns()
+        self.ages.append(now - stamp)
+        self.last = now / 1e9
 
     def compute(self, seconds: float) -> None:
         """Compute in pure Python: the interpreter is busy all the time."""
@@ -81,12 +85,7 @@ def watch(ages: Ages, counts: Counts) -> None:
     """Report once nothing more comes, or soon after the last was sent."""
     start = time.monotonic()
     sys.stdin.readline()
-    before, changed = -1, time.monotonic()
-    end = changed + PATIENCE
-    while time.monotonic() < min(end, changed + QUIET):
-        if len(ages.ages) > before:
-            before, changed = len(ages.ages), time.monotonic()
-        time.sleep(0.05)
+    wait_for_quiet(lambda: ages.last, quiet=QUIET, patience=PATIENCE)
     ages.report(counts(), time.monotonic() - start)
     sys.stdout.flush()
     os._exit(0)

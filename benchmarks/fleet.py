@@ -15,8 +15,8 @@ from tests.flights.first_message import FIELD_TYPES, PAYLOAD_SIZE, encode_array
 
 import nedbus
 
+from .compare.case import TOPIC
 from .compare.fields import FIELDS
-from .compare.nedbus_ends import TOPIC
 
 RATE: Final = 100  # Hz
 NOISY: Final = (

@@ -6,24 +6,13 @@ The bars: below 10 % of a core and below 120 MB.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
+import threading
 import time
-
-import psutil
+from collections import deque
 
 import nedbus
 
-ENDPOINT = "tcp/127.0.0.1:17462"
-
-
-def measure(process: psutil.Process, seconds: float) -> str:
-    """Return CPU in percent of a core over some seconds, and memory."""
-    before, start = process.cpu_times(), time.monotonic()
-    time.sleep(seconds)
-    after, passed = process.cpu_times(), time.monotonic() - start
-    used = after.user + after.system - before.user - before.system
-    return f"{100 * used / passed:.1f} % of a core, {process.memory_info().rss / 1e6:.0f} MB"
+from .processes import Process, cpu_seconds, free_port, memory_mb, nedbus_process
 
 
 def main() -> None:
@@ -31,19 +20,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=15.0)
     seconds = parser.parse_args().seconds
-    command = [sys.executable, "-m", "nedbus", "serve", "-l", ENDPOINT, "-s", "sim:"]
-    service = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    try:
-        with nedbus.connect(ENDPOINT, timeout=10):
-            process = psutil.Process(service.pid)
-            print(f"service, one simulated vehicle, no reader: {measure(process, seconds)} (bars: 10 %, 120 MB)")
-        reader = subprocess.Popen([sys.executable, "-m", "nedbus", "echo", "-c", ENDPOINT], stdout=subprocess.DEVNULL)
-        print(f"service, one simulated vehicle, one reader: {measure(process, seconds)}")
-        reader.terminate()
-        reader.wait(10)
-    finally:
-        service.terminate()
-        service.wait(10)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with nedbus_process("serve", "-l", endpoint, "-s", "sim:") as service:
+        with nedbus.connect(endpoint, timeout=10):
+            print(f"service, one simulated vehicle, no reader: {measure(service, seconds)} (bars: 10 %, 120 MB)")
+        with nedbus.connect(endpoint) as bus, bus.subscribe() as subscription:
+            threading.Thread(target=deque, args=(subscription, 0), daemon=True).start()  # reads all, keeps none
+            print(f"service, one simulated vehicle, one reader: {measure(service, seconds)}")
+
+
+def measure(process: Process, seconds: float) -> str:
+    """Return CPU in percent of a core over some seconds, and memory."""
+    (before,), start = cpu_seconds(process), time.monotonic()
+    time.sleep(seconds)
+    (after,), passed = cpu_seconds(process), time.monotonic() - start
+    return f"{100 * (after - before) / passed:.1f} % of a core, {memory_mb(process):.0f} MB"
 
 
 if __name__ == "__main__":

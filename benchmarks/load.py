@@ -8,9 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 
-import psutil
-
-from .processes import end, expect, router, start, tell
+from .processes import cpu_seconds, end, expect, router, start, tell
 
 VEHICLES = 10
 
@@ -91,14 +89,12 @@ def measure(name: str, publish: str, read: str, seconds: int) -> list[float]:
         publisher = start("-c", publish, str(VEHICLES), str(seconds), endpoint)
         expect(publisher)
         time.sleep(1.0)
-        processes = [psutil.Process(process.pid) for process in (publisher, routing, reader)]
-        before = [sum(process.cpu_times()[:2]) for process in processes]
+        before = cpu_seconds(publisher, routing, reader)
         tell(publisher)
         expect(publisher)
-        used = [
-            (sum(process.cpu_times()[:2]) - each) / seconds for process, each in zip(processes, before, strict=True)
-        ]
+        after = cpu_seconds(publisher, routing, reader)
         end(reader, publisher)
+    used = [(late - early) / seconds for early, late in zip(before, after, strict=True)]
     print(f"{name:40} {used[0]:10.1%} {used[1]:7.1%} {used[2]:7.1%}", flush=True)
     return used
 

@@ -9,7 +9,6 @@ so that what else the machine does hits both: each pair of neighbours gives one 
 from __future__ import annotations
 
 import argparse
-import socket
 import statistics
 import time
 import urllib.request
@@ -18,7 +17,7 @@ from typing import Final, NamedTuple
 
 import psutil
 
-from .processes import PATIENCE, Process, end, start
+from .processes import PATIENCE, Process, end, free_port, start
 
 VEHICLES: Final = 40
 STREAMS: Final = 200
@@ -38,7 +37,7 @@ class Service:
     """A service under measurement."""
 
     def __init__(self) -> None:
-        ports = [_free_port(), _free_port()]
+        ports = [free_port(), free_port()]
         self.url = f"http://127.0.0.1:{ports[0]}"
         sources = [f"--source=sim:?vehicle={number}&seed={number}&speed={SPEED}" for number in range(1, VEHICLES + 1)]
         self.process: Process = start(
@@ -121,12 +120,6 @@ def _time_of(service: Service) -> float:
     begin = time.perf_counter()
     service.get()
     return time.perf_counter() - begin
-
-
-def _free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -18,8 +16,8 @@ from tests.flights.ulogs import write_log
 import nedbus
 
 from .compare.fields import FIELDS
+from .processes import free_port, nedbus_process
 
-ENDPOINT = "tcp/127.0.0.1:17461"
 PERIOD = 10_000  # us
 
 
@@ -31,11 +29,13 @@ def main() -> None:
     fields = {name: value for name, value in FIELDS.items() if name != "timestamp"}
     with tempfile.TemporaryDirectory() as folder:
         path = write_log(Path(folder) / "flight.ulg", range(0, count * PERIOD, PERIOD), **fields)
-        command = [sys.executable, "-m", "nedbus", "serve", "-l", ENDPOINT, "--until-done", "-s", f"ulog:{path}?wait=1"]
-        service = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-        with nedbus.connect(ENDPOINT, timeout=10) as bus, bus.subscribe(mode="every") as subscription:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        with (
+            nedbus_process("serve", "-l", endpoint, "--until-done", "-s", f"ulog:{path}?wait=1"),
+            nedbus.connect(endpoint, timeout=10) as bus,
+            bus.subscribe(mode="every") as subscription,
+        ):
             samples = [subscription.receive(10) for _ in range(count)]
-        service.wait(10)
     sent = [(sample.sent or 0) / 1e3 - sample.message.timestamp for sample in samples]
     start = min(sent)
     errors = sorted((moment - start) / 1e3 for moment in sent)

@@ -8,10 +8,12 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
+
+import psutil
 
 ROOT: Final = Path(__file__).parents[1]
 PATIENCE: Final = 120.0  # s that a process may take to say something
@@ -20,14 +22,15 @@ Process = subprocess.Popen[str]
 
 
 def start(
-    *arguments: str, python: str = sys.executable, environment: Mapping[str, str] | None = None, quiet: bool = True
-) -> Process:
-    """Start a Python process; unless it is quiet, its errors are shown."""
+    *arguments: str, python: str = sys.executable, environment: Mapping[str, str] | None = None,
+    errors: int | IO[str] | None = subprocess.DEVNULL,
+) -> Process:  # fmt: skip
+    """Start a Python process; `errors` gets its stderr, None shows it."""
     return subprocess.Popen(
         [python, *arguments],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL if quiet else None,
+        stderr=errors,
         text=True,
         cwd=ROOT,
         env={**os.environ, **(environment or {})},
@@ -65,18 +68,40 @@ def end(*processes: Process, patience: float = 0.0) -> None:
 
 
 @contextmanager
-def router() -> Iterator[tuple[Process, str]]:
-    """Run a router on a free port, and give its endpoint."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    process = start("-m", "nedbus", "router", "--listen", f"tcp/127.0.0.1:{port}")
+def nedbus_process(*arguments: str) -> Iterator[Process]:
+    """Run a nedbus command until the measurement is over."""
+    process = start("-m", "nedbus", *arguments)
     try:
-        wait_for_router(port, process)
-        yield process, f"tcp/127.0.0.1:{port}"
+        yield process
     finally:
         process.terminate()
-        end(process, patience=5.0)
+        end(process, patience=10.0)
+
+
+@contextmanager
+def router() -> Iterator[tuple[Process, str]]:
+    """Run a router on a free port, and give its endpoint."""
+    port = free_port()
+    with nedbus_process("router", "--listen", f"tcp/127.0.0.1:{port}") as process:
+        wait_for_router(port, process)
+        yield process, f"tcp/127.0.0.1:{port}"
+
+
+def free_port() -> int:
+    """Return a port of the loopback on which nothing listens."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def cpu_seconds(*processes: Process) -> list[float]:
+    """Return the CPU time that each process has used [s]."""
+    return [sum(psutil.Process(process.pid).cpu_times()[:2]) for process in processes]
+
+
+def memory_mb(process: Process) -> float:
+    """Return what a process has in RAM (RSS) [MB]."""
+    return float(psutil.Process(process.pid).memory_info().rss / 2**20)
 
 
 def wait_for_router(port: int, process: Process) -> None:
@@ -88,3 +113,10 @@ def wait_for_router(port: int, process: Process) -> None:
             return
         time.sleep(0.1)
     raise RuntimeError(f"the router does not start on port {port}")
+
+
+def wait_for_quiet(last: Callable[[], float], *, quiet: float, patience: float) -> None:
+    """Wait until nothing has come for `quiet` seconds, at most `patience`; `last` is when something came."""
+    start = time.monotonic()
+    while (now := time.monotonic()) < start + patience and now <= max(start, last()) + quiet:
+        time.sleep(0.05)

@@ -8,18 +8,15 @@ The memory is what the recorder has in RAM (RSS).
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
-import psutil
 from mcap.reader import make_reader
 
 from .fleet import RATE
-from .processes import Process, end, expect, router, start, tell
+from .processes import Process, cpu_seconds, end, expect, memory_mb, router, start, tell
 
 SAMPLES: Final = 20  # of the memory
 ENDS: Final = 60.0  # s that the recorder has to write the rest
@@ -34,29 +31,25 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, router() as (_, endpoint):
         path, log = Path(folder) / "fleet.mcap", Path(folder) / "log"
         with log.open("w") as errors:
-            command = [sys.executable, "-m", "nedbus", "record", "-c", endpoint, "-o", str(path)]
-            recorder = subprocess.Popen(command, stderr=errors)
-        publisher = start(
-            "-m", "benchmarks.fleet", str(arguments.vehicles), str(arguments.seconds), endpoint, "noise"
-        )  # fmt: skip
+            recorder = start("-m", "nedbus", "record", "-c", endpoint, "-o", str(path), errors=errors)
+        count, seconds = arguments.vehicles, arguments.seconds
+        publisher = start("-m", "benchmarks.fleet", str(count), str(seconds), endpoint, "noise")
         try:
-            record(recorder, publisher, path, sent=arguments.vehicles * arguments.seconds * RATE)
+            record(recorder, publisher, path, sent=count * seconds * RATE)
         finally:
-            recorder.kill()
-            end(publisher)
+            end(recorder, publisher)
         print(f"its log: {log.read_text().strip()}")
 
 
-def record(recorder: subprocess.Popen[bytes], publisher: Process, path: Path, *, sent: int) -> None:
+def record(recorder: Process, publisher: Process, path: Path, *, sent: int) -> None:
     """Let the publisher send, watch the recorder, and print what it wrote of what was sent."""
     expect(publisher)
     time.sleep(1.0)
-    measured = psutil.Process(recorder.pid)
-    before = sum(measured.cpu_times()[:2])
+    (before,) = cpu_seconds(recorder)
     tell(publisher)
-    memory, late = watch(measured, publisher)
+    memory, late = watch(recorder, publisher)
     time.sleep(3.0)
-    used = sum(measured.cpu_times()[:2]) - before
+    used = cpu_seconds(recorder)[0] - before
     recorder.terminate()
     recorder.wait(ENDS)
     with path.open("rb") as file:
@@ -70,7 +63,7 @@ def record(recorder: subprocess.Popen[bytes], publisher: Process, path: Path, *,
     )
 
 
-def watch(recorder: psutil.Process, publisher: Process) -> tuple[list[float], str]:
+def watch(recorder: Process, publisher: Process) -> tuple[list[float], str]:
     """Return the recorder's memory over time in MB, and what the publisher prints at its end."""
     begin = time.monotonic()
     memory: list[float] = []
@@ -79,7 +72,7 @@ def watch(recorder: psutil.Process, publisher: Process) -> tuple[list[float], st
         try:
             return memory, expect(publisher, interval)
         except TimeoutError:
-            memory.append(recorder.memory_info().rss / 2**20)
+            memory.append(memory_mb(recorder))
             print(f"{time.monotonic() - begin:6.0f} s  {memory[-1]:6.1f} MB", flush=True)
             interval = max(1.0, (time.monotonic() - begin) / SAMPLES * 2)
 

@@ -11,10 +11,8 @@ import argparse
 import json
 import time
 
-import psutil
-
 from .fleet import RATE
-from .processes import end, expect, router, start, tell
+from .processes import cpu_seconds, end, expect, memory_mb, router, start, tell
 
 READER = """
 import json, sys
@@ -67,16 +65,14 @@ def measure(vehicles: int, readers: int, seconds: int, way: str) -> str:
         publisher = start("-m", "benchmarks.fleet", str(vehicles), str(seconds), endpoint)
         expect(publisher)
         time.sleep(1.0)
-        processes = [psutil.Process(process.pid) for process in (publisher, routing, taking[0])]
-        before = [sum(process.cpu_times()[:2]) for process in processes]
+        processes = (publisher, routing, taking[0])
+        before = cpu_seconds(*processes)
         tell(publisher)
-        late = expect(publisher)
+        delay = expect(publisher)
         time.sleep(2.0)
         sent = vehicles * seconds * RATE
-        used = [
-            (sum(process.cpu_times()[:2]) - each) / sent * 1e6 for process, each in zip(processes, before, strict=True)
-        ]
-        memory = [process.memory_info().rss / 2**20 for process in processes]
+        used = [(late - early) / sent * 1e6 for early, late in zip(before, cpu_seconds(*processes), strict=True)]
+        memory = [memory_mb(process) for process in processes]
         for reader in taking:
             tell(reader)
         told = [json.loads(expect(reader)) for reader in taking]
@@ -85,7 +81,7 @@ def measure(vehicles: int, readers: int, seconds: int, way: str) -> str:
     return (
         f"{vehicles:8} {readers:7} {seconds:8}  {received:8} / {sent:<8} {lost:8}"
         f"  {used[0]:23.1f} {used[1]:6.1f} {used[2]:6.1f}   {memory[0]:.0f} {memory[1]:.0f} {memory[2]:.0f}"
-        f"   {way}, publisher at most {late} s late"
+        f"   {way}, publisher at most {delay} s late"
     )
 
 

@@ -18,7 +18,8 @@ from typing import Final
 
 import nedbus
 
-from .compare.nedbus_ends import TOPIC
+from .compare.case import TOPIC
+from .processes import wait_for_quiet
 
 QUIET: Final = 3.0  # s without a message after which nothing more comes
 PATIENCE: Final = 60.0  # s for it
@@ -59,7 +60,7 @@ def main() -> None:
         sys.stdin.readline()
         reads_on.set()
         sys.stdin.readline()
-        wait_for_quiet(got)
+        wait_for_quiet(lambda: max(each.last for each in got.values()), quiet=QUIET, patience=PATIENCE)
         report = {
             vehicle: {
                 "received": got[vehicle].received,
@@ -82,15 +83,6 @@ def read(subscription: nedbus.Subscription, got: Got, habit: str, reads_on: thre
         got.take(sample.message.timestamp)
         if not reads_on.is_set():
             reads_on.wait(PAUSE)
-
-
-def wait_for_quiet(got: dict[str, Got]) -> None:
-    """Wait until nothing has come for some seconds."""
-    start = time.monotonic()
-    while (now := time.monotonic()) < start + PATIENCE:
-        if now > max(start, *(each.last for each in got.values())) + QUIET:
-            return
-        time.sleep(0.05)
 
 
 if __name__ == "__main__":

@@ -21,8 +21,8 @@ OURS = {
     for node in ast.walk(ast.parse(path.read_text()))
     if isinstance(node, ast.ClassDef)
 }
-# Generic over all messages, or returned by properties for other libraries only.
-ALLOWED = {"Definition"}
+# Generic over all messages, or parts of the file of a message, which no script imports.
+ALLOWED = {"Definition", "FieldType", "Layout", "Older", "Rule"}
 
 
 @pytest.mark.parametrize("name", ["nedbus", "nedbus_msgs"])

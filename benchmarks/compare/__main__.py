@@ -6,14 +6,14 @@ with the messages of other flights.
 Rounds are interleaved, and medians taken, as machines are shared and noisy; only the ratios of one run mean something.
 Peers are installed in environments of their own under build/bench; one that cannot be is named as such.
 The results are written to docs/explanation/performance.json and, as tables, into the page beside it and the README;
-those of a part, as with `--forms raw,models --loads 1kHz --flights "no origin"`, are only printed.
+those of a part, as with `--forms raw models --loads 1kHz --flights "no origin"`, are only printed.
 """
 
 from __future__ import annotations
 
 import argparse
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -57,7 +57,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Compare nedbus with its peers.")
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     for name, known in (("forms", whole.forms), ("loads", whole.loads), ("flights", whole.flights)):
-        parser.add_argument(f"--{name}", type=_chooser(known), default=known, help=f"some of {', '.join(known)}")
+        parser.add_argument(f"--{name}", nargs="+", choices=known, default=known)
     arguments = parser.parse_args()
     part = Part(arguments.forms, arguments.loads, arguments.flights)
     results = measure(part, arguments.rounds)
@@ -131,19 +131,6 @@ def print_medians(results: Results) -> None:
         print(f"{flight}, {name}, {form}: {medians}" + "".join(f"; {each}" for each in ratios))
     for form, reason in results.failed.items():
         print(f"{form}: {reason}")
-
-
-def _chooser(known: Sequence[str]) -> Callable[[str], list[str]]:
-    """Return what argparse reads a list of names with; semicolons separate names that have commas."""
-
-    def choose(text: str) -> list[str]:
-        chosen = [text] if text in known else text.split(";" if ";" in text else ",")
-        unknown = [name for name in chosen if name not in known]
-        if unknown:
-            raise argparse.ArgumentTypeError(f"{', '.join(unknown)}: choose from {', '.join(known)}")
-        return chosen
-
-    return choose
 
 
 if __name__ == "__main__":

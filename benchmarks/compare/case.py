@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+TOPIC = "vehicle_local_position"
+
 
 @dataclass(frozen=True)
 class Case:

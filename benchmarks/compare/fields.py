@@ -44,3 +44,17 @@ PROVIDED: Final = _read(FLIGHT)
 
 FIELDS: Final = _complete(PROVIDED)
 """All 53 fields."""
+
+
+def _type_of(name: str, value: object) -> str:
+    if isinstance(value, bool):
+        return "bool"
+    if isinstance(value, int):
+        return "uint64" if "timestamp" in name else "uint8"
+    if isinstance(value, tuple):
+        return "float32[2]"
+    return "float64" if name in {"ref_lat", "ref_lon"} else "float32"
+
+
+TYPES: Final = {name: _type_of(name, value) for name, value in FIELDS.items()}
+"""PX4's type of each field."""

@@ -35,7 +35,7 @@ def _run(name: str, python: str, load: Load, *, flight: str, endpoint: str, quie
                 "-m", "benchmarks.compare.role", name, role, endpoint, str(load.messages), str(load.rate), vehicles,
                 python=python,
                 environment={VARIABLE: flight},
-                quiet=quiet,
+                errors=subprocess.DEVNULL if quiet else None,
             )  # fmt: skip
             ends.append(process)
             if expect(process) != "ready":

@@ -1,33 +1,53 @@
 """A plain Zenoh client, as the forms without nedbus use it."""
 
 import json
+from collections.abc import Callable, Mapping
 
 import zenoh
 
-from .case import Case
+from .case import TOPIC, Case
 
-KEY = "bench/1/vehicle_local_position"  # of forms that know one vehicle only
+KEY = f"bench/1/{TOPIC}"  # of forms that know one vehicle only
 
 
-def open_session(endpoint: str) -> zenoh.Session:
-    """Open a client of this router, with shared memory and scouting off, as nedbus has it."""
+def client_config(endpoint: str, more: Mapping[str, object] | None = None) -> zenoh.Config:
+    """Return the settings of a client of this router, with shared memory and scouting off, as nedbus has it."""
     config = zenoh.Config()
-    for key, value in {
+    settings = {
         "mode": "client",
         "connect/endpoints": [endpoint],
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-    }.items():
+    }
+    for key, value in {**settings, **(more or {})}.items():
         config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+    return config
+
+
+def open_session(endpoint: str) -> zenoh.Session:
+    """Open a client of this router."""
+    return zenoh.open(client_config(endpoint))
 
 
 def key(vehicle: str) -> str:
     """Return the key of a vehicle, or the key expression of all."""
-    return f"bench/{vehicle}/vehicle_local_position"
+    return f"bench/{vehicle}/{TOPIC}"
 
 
 def declare_publishers(session: zenoh.Session, case: Case) -> list[zenoh.Publisher]:
     """Declare a publisher for each vehicle."""
     control = zenoh.CongestionControl.BLOCK if case.lossless else zenoh.CongestionControl.DROP
     return [session.declare_publisher(key(vehicle), congestion_control=control) for vehicle in case.vehicles]
+
+
+def receive_each(
+    case: Case, ready: Callable[[], None], seen: Callable[[int], bool], stamp: Callable[[bytes], int]
+) -> None:
+    """Take payloads until `seen` says that it is enough; `stamp` decodes one and returns its timestamp."""
+    with open_session(case.endpoint) as session:
+        subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
+        ready()
+        for sample in subscriber:
+            if not seen(stamp(sample.payload.to_bytes())):
+                break
+        subscriber.undeclare()

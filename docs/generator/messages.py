@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from nedbus_msgs import Definition, hash_of, ros2_type
-from nedbus_msgs.model.rules import FiniteWhile, NotLater, Rule, UnitQuaternion
+from nedbus_msgs.model.rules import FiniteWhile, NotLater, Rule
 
 from .markdown import section, table
 
@@ -15,21 +15,18 @@ from .markdown import section, table
 def page(definition: Definition[Any]) -> str:
     """Return the page of a message."""
     doc = inspect.cleandoc(definition.model.__doc__ or "")
-    cls = definition.model
     parts = [f"<!-- Made by `make generated` from nedbus_msgs/messages. -->\n# {definition.name}\n\n{doc}"]
     parts.append(_topics(definition))
     fields = [[f"`{name}`", str(kind), definition.meaning(name)] for name, kind in definition.types.items()]
     parts.append(section("Fields", table(["field", "type", "meaning"], fields)))
-    for field, prefix in getattr(cls, "ENUMS", {}).items():
-        constants = sorted((value, name) for name, value in vars(cls).items() if name.startswith(prefix))
-        rows = [[str(value), f"`{name}`"] for value, name in constants]
-        parts.append(section(f"`{field}`", table(["value", "constant"], rows)))
+    constants = [[f"`{name}`", str(value)] for name, value in vars(definition.model).items() if type(value) is int]
+    parts.append(section("Constants", table(["constant", "value"], constants)))
     parts.append(_layouts(definition))
     rules = [row for rule in definition.rules for row in rows_of(rule)]
     parts.append(section("Rules", table(["fields", "rule"], rules)))
     older = [
-        [f"`{name}`", " and ".join(map(_place, old.new)) + ", in other units" * bool(old.up)]
-        for name, old in getattr(cls, "OLDER", {}).items()
+        [f"`{old.name}`", " and ".join(map(_place, old.places)) + ", in other units" * bool(old.up)]
+        for old in definition.older.values()
     ]
     parts.append(section("Older names", table(["older field", "now"], older)))
     return "\n\n".join(filter(None, parts)) + "\n"
@@ -62,7 +59,7 @@ def rows_of(rule: Rule) -> list[list[str]]:
         return [[names(fields), f"must be finite while `{flag}` is true"] for flag, fields in rule.flags.items()]
     if isinstance(rule, NotLater):
         return [[f"`{rule.fields[0]}`", f"must not be later than `{rule.fields[1]}`"]]
-    return [[names(rule.fields), getattr(rule, "reason", UnitQuaternion.reason)]]
+    return [[names(rule.fields), rule.reason]]
 
 
 def names(fields: Iterable[str]) -> str:

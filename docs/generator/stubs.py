@@ -20,10 +20,10 @@ def stub() -> str:
 
 
 CALLS = {  # protocol: what it returns for a message, and its options
-    "Subscribe": ("Subscription[{}]", "Options"),
-    "AsyncSubscribe": ("AsyncSubscription[{}]", "Options"),
-    "Latest": ("list[Sample[{}]]", "LatestOptions"),
-    "AsyncLatest": ("Awaitable[list[Sample[{}]]]", "LatestOptions"),
+    "Subscribe": ("Sync[{}]", "Options"),
+    "AsyncSubscribe": ("Async[{}]", "Options"),
+    "Latest": ("Samples[{}]", "Query"),
+    "AsyncLatest": ("Soon[{}]", "Query"),
 }
 HEAD = """# Made by `make generated` from nedbus_msgs/messages.
 from collections.abc import Awaitable, Callable
@@ -33,8 +33,12 @@ from typing_extensions import Unpack
 
 import nedbus_msgs.messages as m
 
-from .sample import Mode, Sample
-from .subscription import AsyncSubscription, Subscription
+from .sample import M_co, Mode, Sample
+from .subscription import AsyncSubscription as Async
+from .subscription import Subscription as Sync
+
+Samples = list[Sample[M_co]]
+Soon = Awaitable[list[Sample[M_co]]]
 
 class Options(TypedDict, total=False):
     vehicle: str | int
@@ -42,7 +46,7 @@ class Options(TypedDict, total=False):
     mode: Mode
     max_rate: float | None
 
-class LatestOptions(TypedDict, total=False):
+class Query(TypedDict, total=False):
     vehicle: str | int
     instance: int | None
     timeout: float

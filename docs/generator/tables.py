@@ -127,6 +127,16 @@ def keys_page() -> str:
     )
 
 
+_CODES = {
+    "ARMED",
+    "MIN_FIX_TYPE",
+    "EARTH_RADIUS",
+    "FOXGLOVE_PORT",
+    "NUMBERS",
+    "PALETTE",
+}  # constants that limit nothing
+
+
 def limits_page() -> str:
     """Return the page of limits: the numbers of the code that a line of it explains."""
     parts: dict[str, list[list[str]]] = {title: [] for title in _PARTS}
@@ -138,7 +148,7 @@ def limits_page() -> str:
             tree = ast.parse(path.read_text())
             numbers = dict(_numbers(tree))
             for name, text in constants_of(tree):
-                if name in numbers and not name.startswith("_"):
+                if name in numbers and not name.startswith("_") and name not in _CODES:
                     parts[title].append([cell(text), code(numbers[name]), code(name)])
     return page(
         "Limits and constants",

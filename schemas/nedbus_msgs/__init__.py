@@ -11,7 +11,7 @@ from .errors import (
     NedbusError,
     UnknownLayoutError,
 )
-from .flags import DOUBT_FLAGS, FLAGS, Flag, describe_flags, message_doubts
+from .flags import DOUBT_FLAGS, FLAG_FIELDS, describe_flags, message_doubts
 from .frames import (
     GlobalPosition,
     MapProjection,
@@ -36,20 +36,19 @@ from .functions import (
     decode,
     definition_of,
     encode,
+    json_schema_of,
+    layout_table_of,
+    schema_of,
 )
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
-from .model.definition import Definition, Row
-from .model.layouts import upgrade_fields, upgrade_with
+from .model.definition import BY_TOPIC, MESSAGES, TOPICS, Definition, Row, upgrade_fields, upgrade_with
 from .model.message import Message
 from .model.px4_types import BASES, FieldType, field_type
-from .model.registry import BY_TOPIC, MESSAGES, TOPICS
 from .model.rules import UnitQuaternion
-from .model.schema import json_schema_of, layout_table_of, schema_of
 from .provenance import Provenance, encoding_of, message_name_of, provenance_of
 from .resets import RESET_COUNTERS, Continuous, Quantity, ResetTracker
 from .ros2.msg_file import MsgError, bases_of_msg, define_msg, hash_of_msg, read_msg
-from .ros2.topics import ros2_topic_of, split_ros2_topic
 from .ros2.types import dds_type, definition_text, hash_of, message_of_type_hash, ros2_type, ros2_types
 from .topics import (
     ANY,
@@ -59,25 +58,26 @@ from .topics import (
     ack_key,
     address_of_alive_key,
     address_of_rejected_key,
-    alive_key_expr,
     check_prefix,
     check_vehicle,
     get_topic,
     rejected_key_expr,
+    ros2_topic_of,
     schema_key,
+    split_ros2_topic,
     status_key,
     vehicle_name,
 )
 from .undeclared import define
 
 __all__ = [
-    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAGS",
+    "ALL", "ANY", "BASES", "BY_TOPIC", "DEFAULT", "DEFAULT_PREFIX", "DEFAULT_TOPIC", "DOUBT_FLAGS", "FLAG_FIELDS",
     "MESSAGES", "PAYLOAD_LIMIT", "RELEASES", "RESET_COUNTERS", "TOPICS", "Address", "AddressError", "Codec",
-    "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType", "Flag", "GlobalPosition",
+    "Continuous", "DecodeError", "Definition", "EncodeError", "FieldType", "GlobalPosition",
     "InvalidMessageError", "Layout", "LayoutError", "MapProjection", "Message", "MsgError", "NedbusError",
     "NoOrigin", "Provenance", "Quantity", "ResetTracker", "Row", "Selection", "Topic", "UnitQuaternion",
     "UnknownLayoutError", "Vector", "VehicleLocalPosition", "ack_key", "address_of_alive_key",
-    "address_of_rejected_key", "alive_key_expr", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of",
+    "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of",
     "dds_type", "decode", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
     "describe_flags", "encode", "encode_with", "encoding_of", "enu_to_ned", "euler_to_quaternion",
     "field_type", "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "json_schema_of",

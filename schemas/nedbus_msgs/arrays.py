@@ -1,22 +1,225 @@
-"""Messages as NumPy arrays, as functions: of the first message unless another one is named.
+"""Messages as a structured array of NumPy: decoding, encoding and validation of many at once.
 
+Types, offsets and rules come from the same definition as those of a single message.
 Import this module only where arrays are used: NumPy takes longer to load than all the rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final, cast
+import struct
+import sys
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any, Final, Generic, cast
 
 import numpy as np
+import numpy.typing as npt
 
-from .codecs.arrays import Arrays, MessageArray, arrays_of
+from .codecs.cdr import HEAD, cdr_layout
+from .codecs.msgpack import codec_of
+from .errors import InvalidMessageError
 from .functions import DEFAULT, M, definition_of
+from .model.declaration import Layout
+from .model.definition import Definition
 from .model.message import Message
+from .model.px4_types import BASES, FieldType
+from .model.rules import passes_all, wrong_columns
+from .model.validation import Values
 
 __all__ = [
     "DTYPE", "Arrays", "MessageArray", "arrays_of", "dtype_of", "to_array", "to_message",
 ]  # fmt: skip
+
+
+MessageArray = npt.NDArray[np.void]
+"""A structured array: one element per message, one column per field, such as `array["x"]`."""
+
+_CAST_FROM: Final = 256
+"""Messages from which NumPy's cast of all fields is faster than taking the bytes one by one."""
+_COLUMNS_FROM: Final = 20
+"""Messages from which checking the rules column by column is faster than one message after the other."""
+
+
+def _numpy_type(kind: FieldType) -> Any:
+    return np.dtype((BASES[kind.base].code, kind.length or ()))
+
+
+class Arrays(Generic[M]):
+    """The messages of one definition as structured arrays.
+
+    `dtype`: PX4's fields in the order of the model, with PX4's types.
+    """
+
+    def __init__(self, definition: Definition[M]) -> None:
+        types = definition.types
+        self.definition = definition
+        self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
+        self._codec = codec_of(definition)
+        self._size = size = self._codec.size
+        # The same bytes as the dtype, and a payload without its tags: one name for each value, also of arrays.
+        named = [(f"{name}.{part}", self.dtype[name].base, offset) for name, part, offset in self._codec.offsets]
+        self._native = np.dtype([(name, kind) for name, kind, _ in named])
+        self._wire = np.dtype(
+            {
+                "names": [name for name, _, _ in named],
+                "formats": [kind.newbyteorder(">") for _, kind, _ in named],
+                "offsets": [offset for _, _, offset in named],
+                "itemsize": size,
+            }
+        )
+        self._from_wire = np.fromiter(_wire_offsets(named), np.intp, self.dtype.itemsize)
+        self._to_wire = np.zeros(size, np.intp)
+        self._to_wire[self._from_wire] = np.arange(self.dtype.itemsize)
+        self._tags = np.frombuffer(self._codec.tags.to_bytes(size, "big"), np.uint8)
+        self._tag_mask = np.frombuffer(self._codec.tag_mask.to_bytes(size, "big"), np.uint8)
+        self._value_mask = ~self._tag_mask
+        self._arrays = [index for index, kind in enumerate(types.values()) if kind.length]
+        ruled = {name for rule in definition.rules for name in rule.fields}
+        # The fields that rules look at, unpacked from the bytes of an element: as a struct, and their places in it.
+        steps, places, index = [], dict[str, str](), 0
+        for name, kind in types.items():
+            if name not in ruled:
+                steps.append(f"{self.dtype[name].itemsize}x")
+                continue
+            steps.append(f"{kind.count}{BASES[kind.base].code}")
+            places[name] = f"values[{index}:{index + kind.count}]" if kind.length else f"values[{index}]"
+            index += kind.count
+        self._ruled = struct.Struct("=" + "".join(steps))
+        self._passes_rules = passes_all(definition.rules, places.__getitem__)
+        self._wrong_columns = wrong_columns(
+            definition.rules, isfinite=np.isfinite, any=np.logical_or.reduce, squared_norm=_squared_norms
+        )
+
+    def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
+        """Return the messages of concatenated payloads of the codec's size, and a mask of those that are valid.
+
+        A payload that is False in the mask may still be valid: the codec decides.
+        """
+        # Leaves zeros where the tags are right, and makes the bools 0 or 1.
+        wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
+        wrong = wire & self._tag_mask
+        if not np.count_nonzero(wrong):
+            array = self._to_native(wire)
+            return array, self.valid_mask(array)
+        array = self._to_native(wire & self._value_mask)
+        return array, self.valid_mask(array) & ~wrong.any(axis=1)
+
+    def encode(self, array: MessageArray) -> bytes:
+        """Return the concatenated payloads of messages, without validating them."""
+        if len(array) < _CAST_FROM:
+            native = np.frombuffer(array.tobytes(), np.uint8).reshape(-1, self.dtype.itemsize)
+            wire = native.take(self._to_wire, axis=1)
+            wire &= self._value_mask
+        else:
+            wire = np.zeros((len(array), self._size), np.uint8)
+            np.ndarray(len(array), self._wire, wire)[:] = array.view(self._native)
+        wire |= self._tags
+        return wire.tobytes()
+
+    def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
+        """Return a mask of the messages that pass the rules between fields; the array has this dtype."""
+        if len(array) < _COLUMNS_FROM:
+            return np.fromiter(map(self._passes_rules, self._ruled.iter_unpack(array.tobytes())), np.bool_, len(array))
+        invalid = np.zeros(len(array), np.bool_)
+        for is_wrong in self._wrong_columns:
+            invalid |= is_wrong(array)
+        return ~invalid
+
+    def require_valid(self, array: MessageArray) -> None:
+        """Raise InvalidMessageError for the first message that breaks a rule between fields, with its index."""
+        for index in np.flatnonzero(~self.valid_mask(array)).tolist():
+            try:
+                self._codec.encode_row(self.to_row(array[index]))
+            except InvalidMessageError as exc:
+                raise InvalidMessageError(
+                    exc.reason, exc.violations, message=self.definition.name, index=index
+                ) from exc
+
+    def of(self, messages: Sequence[M]) -> MessageArray:
+        """Return messages as a structured array."""
+        return np.array([tuple(message.__dict__.values()) for message in messages], self.dtype)
+
+    def absent(self, count: int) -> MessageArray:
+        """Return `count` messages of which nothing is provided: NaN, false and 0."""
+        return np.repeat(np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype), count)
+
+    def to_row(self, element: np.void) -> Values:
+        """Return the values of one element in PX4's order, arrays as tuples."""
+        values = list(element.item())
+        for index in self._arrays:
+            values[index] = tuple(values[index].tolist())
+        return tuple(values)
+
+    def to_message(self, element: np.void) -> M:
+        """Return one element as a message; raise pydantic.ValidationError if it is invalid."""
+        fields: dict[str, Any] = dict(zip(self.definition.names, self.to_row(element), strict=True))
+        return self.definition.model(**fields)
+
+    def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
+        """Return the CDR payloads of messages in a layout of fields of the model, one per element, not validated."""
+        cdr = self._cdr(layout)
+        payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), cdr)
+        for name in layout.types:
+            payloads[name] = array[name]
+        return payloads
+
+    def decode_cdr(self, payloads: Sequence[bytes], layout: Layout) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
+        """Return the messages of CDR payloads of a layout of fields of the model, and a mask of those that are valid.
+
+        A payload that is False in the mask may still be valid: `decode_cdr` and the model decide.
+        """
+        zeros = cdr_layout(layout).zeros
+        fits = np.array([len(each) == len(zeros) and each[:2] == HEAD[:2] for each in payloads], bool)
+        data = b"".join(each if fit else zeros for each, fit in zip(payloads, fits.tolist(), strict=True))
+        packed = np.frombuffer(data, self._cdr(layout))
+        bytes_of = np.frombuffer(data, np.uint8).reshape(-1, len(zeros))
+        whole = layout is self.definition.current
+        array = packed.astype(self.dtype) if whole else self.absent(len(payloads))
+        for name, kind in layout.types.items():
+            if not whole:
+                array[name] = packed[name]
+            if kind.base == "bool":
+                offset = cdr_layout(layout).offsets[name]
+                fits &= (bytes_of[:, offset : offset + kind.count] <= 1).all(axis=1)
+        return array, fits & self.valid_mask(array)
+
+    @staticmethod
+    def _cdr(layout: Layout) -> np.dtype[np.void]:
+        cdr = cdr_layout(layout)
+        return np.dtype(
+            {
+                "names": list(layout.types),
+                "formats": [_numpy_type(kind).newbyteorder("<") for kind in layout.types.values()],
+                "offsets": list(cdr.offsets.values()),
+                "itemsize": len(cdr.zeros),
+            }
+        )
+
+    def _to_native(self, wire: npt.NDArray[np.uint8]) -> MessageArray:
+        """Return the messages of payloads without their tags, of shape (n, size)."""
+        if len(wire) < _CAST_FROM:
+            return np.ndarray(len(wire), self.dtype, wire.take(self._from_wire, axis=1))
+        return np.ndarray(len(wire), self._wire, wire).astype(self._native).view(self.dtype)
+
+
+@cache
+def arrays_of(definition: Definition[M]) -> Arrays[M]:
+    """Return the arrays of the messages of a definition."""
+    return Arrays(definition)
+
+
+def _squared_norms(quaternions: npt.NDArray[np.float32]) -> Any:
+    """Return the squares of the norms, in float64, of quaternions of shape (4, n)."""
+    w, x, y, z = quaternions.astype(float)
+    return w * w + x * x + y * y + z * z
+
+
+def _wire_offsets(named: Sequence[tuple[str, np.dtype[Any], int]]) -> Iterator[int]:
+    """Yield the offset in a payload of each byte of an element."""
+    for _, kind, offset in named:
+        indexes = range(offset, offset + kind.itemsize)
+        yield from reversed(indexes) if sys.byteorder == "little" else indexes
+
 
 DTYPE: Final = arrays_of(DEFAULT).dtype
 """The dtype of an array of VehicleLocalPosition: PX4's fields in PX4's order, with PX4's types."""

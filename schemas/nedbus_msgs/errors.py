@@ -46,7 +46,7 @@ class DecodeError(NedbusError, ValueError):
 class UnknownLayoutError(DecodeError):
     """Raised when a payload has a layout number that this reader does not know.
 
-    `layout` is that number, `count` how many fields follow it, `known` the numbers that can be decoded.
+    `layout` is that number, `count` the number of fields behind it, `known` the numbers that can be decoded.
     """
 
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
@@ -62,7 +62,7 @@ class UnknownLayoutError(DecodeError):
 class InvalidMessageError(NedbusError, ValueError):
     """Raised when a message that is published has a wrong type, an unknown field, or breaks a rule.
 
-    `reason` is one line: each field, what is wrong with it, and its value.
+    `reason` is one line: each field, the rule that it breaks, and its value.
     `violations` has the field and the rule of each, without the value; `index` is the message's in an array.
     """
 

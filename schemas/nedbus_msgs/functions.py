@@ -1,4 +1,4 @@
-"""The contract as functions: a message to its payload, and back."""
+"""The contract as functions: a message to its payload and back, and its schema."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing_extensions import TypeVar
 from .codecs.msgpack import Newer, codec_of
 from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.declaration import DEFAULT_TOPIC
-from .model.definition import Definition
+from .model.definition import BY_TOPIC, MESSAGES, Definition
 from .model.message import Message
-from .model.registry import BY_TOPIC, MESSAGES
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 _FIRST: Final = cast("type[Any]", VehicleLocalPosition)
@@ -46,3 +45,29 @@ def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = N
     not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
     """
     return cast("M", codec_of(definition_of(message)).decode(payload, newer=newer))
+
+
+def schema_of(definition: Definition[Any]) -> dict[str, object]:
+    """Return the description of a message that publishers answer queries with: its JSON Schema and its layouts."""
+    return {"json_schema": json_schema_of(definition), "layouts": layout_table_of(definition)}
+
+
+def json_schema_of(definition: Definition[Any]) -> dict[str, object]:
+    """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
+    schema = definition.model.model_json_schema()
+    # JSON has no NaN, and a writer should leave out what is not provided: defaults stay in the model.
+    for field in schema["properties"].values():
+        field.pop("default", None)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def layout_table_of(definition: Definition[Any]) -> list[dict[str, object]]:
+    """Return every layout as name, number on the wire (or None), and its fields in order, each with name and type."""
+    return [
+        {
+            "name": layout.name,
+            "wire": layout.wire,
+            "fields": [{"name": name, "type": str(kind)} for name, kind in layout.types.items()],
+        }
+        for layout in definition.layouts.values()
+    ]

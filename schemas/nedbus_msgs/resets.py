@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from operator import add, sub
+from typing import Final, Literal, NamedTuple
 
 from .frames import MapProjection, wrap
 from .messages.vehicle_local_position import VehicleLocalPosition as Message
@@ -19,14 +20,23 @@ from .messages.vehicle_local_position import VehicleLocalPosition as Message
 Quantity = Literal["xy", "z", "vxy", "vz", "heading", "dist_bottom"]
 
 
-@dataclass(frozen=True, slots=True)
-class _Fields:
+Point = tuple[float, ...]
+
+
+class _Fields(NamedTuple):
     """The fields of one quantity: its values, their delta, its reset counter, and their rates."""
 
     values: tuple[str, ...]
     delta: str
     counter: str
     rates: tuple[str, ...] = ()
+
+    @property
+    def zero(self) -> Point:
+        return (0.0,) * len(self.values)
+
+    def of(self, message: Message) -> Point:
+        return tuple(getattr(message, name) for name in self.values)
 
 
 _QUANTITIES: Final[Mapping[Quantity, _Fields]] = {
@@ -41,8 +51,6 @@ RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: fields.counter for name, 
 """The field that counts the resets of each quantity, modulo 256."""
 
 _TOLERANCE: Final = 2.0  # m between a jump at a new origin and the candidate that explains it
-
-Point = tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +86,7 @@ class ResetTracker:
 
     def __init__(self) -> None:
         self._last: Message | None = None
-        self._jumps: dict[Quantity, Point] = {name: _zero(fields) for name, fields in _QUANTITIES.items()}
+        self._jumps: dict[Quantity, Point] = {name: fields.zero for name, fields in _QUANTITIES.items()}
         self._resets: dict[Quantity, int] = dict.fromkeys(_QUANTITIES, 0)
 
     def add(self, message: Message) -> Continuous:
@@ -90,29 +98,25 @@ class ResetTracker:
         reset: set[Quantity] = set()
         discontinued: set[Quantity] = set()
         origin_changed = last is not None and _origin(last) != _origin(message)
-        if last is not None and message.timestamp < last.timestamp:
-            discontinued.update(_QUANTITIES)
-        elif last is not None:
-            for name, fields in _QUANTITIES.items():
+        rebooted = last is not None and message.timestamp < last.timestamp
+        values: dict[str, float] = {}
+        for name, fields in _QUANTITIES.items():
+            count, jump = 0, None if rebooted else fields.zero
+            if last is not None and not rebooted:
                 count = (getattr(message, fields.counter) - getattr(last, fields.counter)) % 256
-                shifts = origin_changed and name in ("xy", "z")
-                if not count and not shifts:
-                    continue
-                if count:
-                    reset.add(name)
-                    self._resets[name] += count
-                jump = _jump_of_new_origin(name, last, message, count) if shifts else _delta(fields, message, count)
-                if jump is None:
-                    discontinued.add(name)
-                else:
-                    self._jumps[name] = tuple(a + b for a, b in zip(self._jumps[name], jump, strict=True))
-        for name in discontinued:
-            self._jumps[name] = _zero(_QUANTITIES[name])
-        values = {
-            field_name: value - jump
-            for name, fields in _QUANTITIES.items()
-            for field_name, value, jump in zip(fields.values, _values(fields, message), self._jumps[name], strict=True)
-        }
+                if origin_changed and name in ("xy", "z"):
+                    jump = _jump_of_new_origin(name, last, message, count)
+                elif count:
+                    jump = _delta(fields, message, count)
+            if count:
+                reset.add(name)
+                self._resets[name] += count
+            if jump is None:
+                discontinued.add(name)
+                self._jumps[name] = fields.zero
+            elif any(jump):
+                self._jumps[name] = tuple(map(add, self._jumps[name], jump))
+            values |= zip(fields.values, map(sub, fields.of(message), self._jumps[name]), strict=True)
         values["heading"] = wrap(values["heading"])
         return Continuous(
             **values,
@@ -133,13 +137,12 @@ def _delta(fields: _Fields, message: Message, count: int) -> Point | None:
 def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
     """Return the jump at a new origin: none, the delta, or the shift between the origins, whichever fits the values."""
     fields = _QUANTITIES[name]
-    candidates = [_zero(fields), _delta(fields, message, count), _shift_of_origin(name, last, message)]
+    candidates = [fields.zero, _delta(fields, message, count), _shift_of_origin(name, last, message)]
     seconds = (message.timestamp - last.timestamp) / 1e6
     rates = [getattr(last, rate) for rate in fields.rates]
     motion = [rate * seconds if math.isfinite(rate) else 0.0 for rate in rates]
     observed = [
-        now - before - moved
-        for now, before, moved in zip(_values(fields, message), _values(fields, last), motion, strict=True)
+        now - before - moved for now, before, moved in zip(fields.of(message), fields.of(last), motion, strict=True)
     ]
     tolerance = _TOLERANCE + math.hypot(*motion) / 2
     best = min((jump for jump in candidates if jump is not None), key=lambda jump: math.dist(jump, observed))
@@ -147,7 +150,7 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
 
 
 def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point | None:
-    """Return how far a fixed point moves in the local frame when its origin changes."""
+    """Return the move of a fixed point in the local frame as its origin changes."""
     if name == "z":
         step = message.ref_alt - last.ref_alt
         return (step,) if math.isfinite(step) else None
@@ -160,11 +163,3 @@ def _origin(message: Message) -> tuple[float | None, ...]:
     """Return the origin with None for NaN, so that two missing origins are equal."""
     values = (message.ref_lat, message.ref_lon, message.ref_alt)
     return tuple(value if math.isfinite(value) else None for value in values)
-
-
-def _values(fields: _Fields, message: Message) -> Point:
-    return tuple(getattr(message, name) for name in fields.values)
-
-
-def _zero(fields: _Fields) -> Point:
-    return (0.0,) * len(fields.values)

@@ -1,4 +1,4 @@
-"""Addresses and selections of streams, and their key expressions."""
+"""Addresses and selections of streams, their key expressions, and their topics in ROS 2."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final, cast
 
 from .errors import AddressError
 from .model.declaration import Topic
-from .model.registry import MESSAGES, TOPICS
+from .model.definition import MESSAGES, TOPICS
 
 ANY: Final = "*"
 DEFAULT_PREFIX: Final = "nedbus"
@@ -21,6 +21,8 @@ _SIMILAR: Final = 0.9  # of two names from which one is taken for a misspelling 
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
 _RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is downsampled
+_ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
+_PX4_PATH: Final = ("fmu", "out")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -48,12 +50,11 @@ class Address:
         chunks = key.removeprefix(prefix + "/").split("/")
         if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
-        instance = None
-        if len(chunks) == 3:
-            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", chunks[2]):
-                raise AddressError("instance", chunks[2], f"0 to {_INSTANCES - 1}")
-            instance = int(chunks[2])
-        return cls(chunks[0], chunks[1], instance)
+        vehicle, topic, *instances = chunks
+        for instance in instances:
+            if not re.fullmatch(r"0|[1-9][0-9]{0,2}", instance):
+                raise AddressError("instance", instance, f"0 to {_INSTANCES - 1}")
+        return cls(vehicle, topic, *map(int, instances))
 
     def key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the Zenoh key expression of this address."""
@@ -92,7 +93,7 @@ class Address:
 class Selection:
     """The addresses with this topic, vehicle and instance; "*" and None stand for any.
 
-    Raises AddressError for what no address has.
+    Raises AddressError for a vehicle, topic or instance that no address can have.
     """
 
     topic: str = ANY
@@ -120,10 +121,9 @@ class Selection:
         """Return the Zenoh key expression that matches the keys of these addresses."""
         if self.topic == ANY:
             return f"{prefix}/{self.vehicle}/**"
-        key, instances = f"{prefix}/{self.vehicle}/{self.topic}", get_topic(self.topic).instances
-        if self.instance is not None:
-            return f"{key}/{self.instance}"
-        return {True: f"{key}/{ANY}", False: key, None: f"{key}/**"}[instances]
+        any_instance = {True: f"/{ANY}", False: "", None: "/**"}[get_topic(self.topic).instances]
+        instance = any_instance if self.instance is None else f"/{self.instance}"
+        return f"{prefix}/{self.vehicle}/{self.topic}{instance}"
 
     def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression that matches the liveliness tokens of these addresses."""
@@ -132,11 +132,6 @@ class Selection:
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of these streams, downsampled to `rate` messages a second; "*" is any rate."""
         return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
-
-
-def alive_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key expression for the liveliness tokens of all addresses."""
-    return f"{prefix}/*/@alive/**"
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
@@ -176,9 +171,9 @@ def ack_key(key_expr: str) -> str:
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by its name; one that has no file here may be any other of PX4's, with instances or without.
+    """Return a topic by its name; one without a file here is taken for another one of PX4's.
 
-    Raises AddressError for what is not lower_snake_case, and for a misspelling of a topic that has a file here.
+    Raises AddressError for a name that is not lower_snake_case, and for a misspelling of a topic that has a file here.
     """
     if not isinstance(name, str):
         raise AddressError("topic", name, 'one name: several topics need a call each, or "*" where all are read')
@@ -195,6 +190,31 @@ def _other_topic(name: str) -> Topic:
     if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
         raise AddressError("topic", name, f"{' or '.join(meant)}, of which it looks like a misspelling")
     return Topic(name, 0.0, "another topic of PX4's", instances=None)
+
+
+def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
+    """Return the namespace, the uORB topic and the instance that the name of a ROS 2 topic stands for.
+
+    `px4_1/fmu/out/estimator_local_position_0` is namespace `px4_1` and instance 0.
+    The `_v1` of a versioned topic is ignored.
+
+    Raises AddressError for another name than PX4's.
+    """
+    *path, name = topic.strip("/").split("/")
+    if tuple(path[-2:]) == _PX4_PATH:
+        path = path[:-2]
+    found = None if name in TOPICS else _ROS2_TOPIC.fullmatch(name)
+    uorb, number = found.groups() if found else (name, None)
+    if number is None and get_topic(uorb).instances:
+        number = 0
+    return "/".join(path), uorb, None if number is None else int(number)
+
+
+def ros2_topic_of(address: Address, namespace: str) -> str:
+    """Return the name of an address's ROS 2 topic, without a leading slash; an empty namespace stands for none."""
+    plain = address.instance is None or (address.instance == 0 and get_topic(address.topic).plain_first)
+    topic = address.topic if plain else f"{address.topic}_{address.instance}"
+    return "/".join(filter(None, (namespace.strip("/"), *_PX4_PATH, topic)))
 
 
 def vehicle_name(vehicle: str | int) -> str:

@@ -9,10 +9,10 @@ from typing import Any, Final
 from pydantic import Field, create_model
 
 from .codecs.msgpack import PAYLOAD_LIMIT, full_width
-from .model.declaration import EVERY
+from .model.declaration import Layout
 from .model.definition import Definition
 from .model.message import Message
-from .model.px4_types import FieldType
+from .model.px4_types import FieldType, Timestamp
 from .model.rules import Rule
 
 PX4: Final = "PX4"
@@ -34,7 +34,7 @@ def define(
 
     `meanings` has unit and meaning of fields.
 
-    Raises ValueError for what cannot be a message: a name that is none, no timestamp, too many fields, too many bytes.
+    Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
     """
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r:.100} is no name of a message: expected CamelCase of at most 64 characters")
@@ -56,12 +56,10 @@ def define(
         raise ValueError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
     described = meanings or {}
     annotated: dict[str, Any] = {
-        field: (
-            kind.annotation,
-            Field(*(() if field == "timestamp" else (kind.absent,)), description=described.get(field)),
-        )
-        for field, kind in types.items()
+        name: (Timestamp if name == "timestamp" else kind.annotation, Field(description=described.get(name)))
+        for name, kind in types.items()
     }
     model = create_model(name, __base__=Message, __doc__="A message of PX4 that has no file in nedbus.", **annotated)
-    model.DEFINITION = Definition(model, layouts={PX4: EVERY}, rules=rules)
+    model.LAYOUTS, model.RULES = (Layout(PX4, "*"),), rules
+    model.DEFINITION = Definition(model)
     return model.DEFINITION

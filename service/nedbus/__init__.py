@@ -106,12 +106,11 @@ __all__ = [
     "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
-# `nedbus --version` needs none of these, and a script that uses no arrays does not wait for NumPy.
-_MODULES = ("nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client")
-_WITH_NUMPY = {
-    "nedbus_msgs.arrays": ("DTYPE", "MessageArray", "dtype_of", "to_array", "to_message"),
-    "nedbus.recording": ("UtcOffset", "addresses_of", "align", "missing_of", "read", "utc_of"),
-}
+# Imported at the first use of a name: `nedbus --version` needs none, and only the last two load NumPy.
+_MODULES = (
+    "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client", "nedbus_msgs.arrays",
+    "nedbus.recording",
+)  # fmt: skip
 
 
 def __dir__() -> list[str]:
@@ -124,8 +123,7 @@ if not TYPE_CHECKING:  # else type checkers would accept any name
     def __getattr__(name: str) -> object:
         """Import the module of a public name when it is first used."""
         if name in __all__:
-            modules = [module for module, names in _WITH_NUMPY.items() if name in names] or _MODULES
-            module = next(each for each in map(_import_module, modules) if name in each.__all__)
+            module = next(each for each in map(_import_module, _MODULES) if name in each.__all__)
             return globals().setdefault(name, getattr(module, name))
         if name in _import_module("nedbus_msgs").MESSAGES:
             return getattr(_import_module("nedbus_msgs.messages"), name)

@@ -135,7 +135,7 @@ class OutputError(NedbusError, OSError):
 
 
 class ClosedError(NedbusError, RuntimeError):
-    """Raised when something is asked of a bus, a subscription or a publisher that was closed."""
+    """Raised when a bus, a subscription or a publisher is used after it was closed."""
 
     def __init__(self) -> None:
         super().__init__("this is closed, or the bus that it came from is: connect again")

@@ -6,28 +6,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nedbus_msgs import DOUBT_FLAGS, FLAGS, VehicleLocalPosition, describe_flags, message_doubts
-from tests.flights.first_message import FIELD_TYPES, row_of
+import nedbus_msgs
+from nedbus_msgs import DOUBT_FLAGS, VehicleLocalPosition, describe_flags, message_doubts
+from tests.flights.first_message import row_of
 
 from .strategies import FLAG_FIELDS, messages
 
 GOOD = {"xy_valid": 1.0, "z_valid": 1.0, "v_xy_valid": 1.0, "v_z_valid": 1.0, "dead_reckoning": 0.0}
 
 
-def test_table_has_every_bool_field() -> None:
-    """Each bool of the message has a row, and each other field that a row names is a float."""
-    assert set(FLAGS) == {name for name, kind in FIELD_TYPES.items() if kind == "bool"}
-    assert {name: flag.name for name, flag in FLAGS.items()} == {name: name for name in FLAGS}
-    assert {name: flag.fields for name, flag in FLAGS.items() if flag.fields} == FLAG_FIELDS
-    others = {"xy_global": "reference", "z_global": "reference", "dist_bottom_valid": "terrain"}
-    assert {name: flag.kind for name, flag in FLAGS.items()} == dict.fromkeys(FLAGS, "estimate") | others
-
-
-def test_doubts_are_the_flags_with_a_label() -> None:
+def test_doubts_are_validity_and_dead_reckoning() -> None:
     """Validity and dead reckoning are shown; global references, terrain and heading are not."""
     assert DOUBT_FLAGS == ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dead_reckoning")
-    assert [FLAGS[name].label for name in DOUBT_FLAGS] == ["xy", "z", "vxy", "vz", "dead reckoning"]
-    assert [name for name in FLAGS if FLAGS[name].inverted] == ["dead_reckoning"]
+    assert nedbus_msgs.FLAG_FIELDS == FLAG_FIELDS
 
 
 @pytest.mark.parametrize(

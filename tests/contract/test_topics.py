@@ -19,7 +19,6 @@ from nedbus_msgs import (
     Selection,
     ack_key,
     address_of_alive_key,
-    alive_key_expr,
     check_prefix,
     schema_key,
     status_key,
@@ -115,7 +114,7 @@ def test_selection_matches_what_its_key_expression_includes(address: Address, pr
 @given(addresses(), PREFIXES)
 def test_selection_does_not_include_other_keys(address: Address, prefix: str) -> None:
     """The liveliness tokens, rejections and acknowledgements of an address are not messages."""
-    assert zenoh.KeyExpr(alive_key_expr(prefix=prefix)).includes(address.alive_key(prefix=prefix))
+    assert zenoh.KeyExpr(Selection().alive_key_expr(prefix=prefix)).includes(address.alive_key(prefix=prefix))
     key_expr = zenoh.KeyExpr(Selection().key_expr(prefix=prefix))
     assert not key_expr.intersects(address.alive_key(prefix=prefix))
     assert not key_expr.intersects(address.rejected_key(prefix=prefix))

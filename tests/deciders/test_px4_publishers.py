@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from nedbus.sources.options import Px4ZenohOptions
-from nedbus.sources.px4.publishers import PublisherTable
-from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry, track_sequence
+from nedbus.sources.px4.streams import NotAcceptedError, Px4Stream, StreamRegistry
 from nedbus.transport import Attachment, PublisherToken, TopicKey, publisher_token
 from nedbus_msgs import DecodeError, dds_type
 from tests.flights.first_message import ROS2_TYPE, type_hash
@@ -37,10 +36,7 @@ def node(session: str, name: str = "talker") -> PublisherToken:
 
 def send(streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
     """Pass one message on; return what was lost before it, and whether its vehicle rebooted."""
-    attachment = Attachment(sequence, 0, gid)
-    streams.claim(stream, attachment, now)
-    lost, restarted = track_sequence(stream, attachment, now)
-    return lost, restarted and streams.is_reboot(stream)
+    return streams.accept(stream, Attachment(sequence, 0, gid), now)
 
 
 @pytest.fixture
@@ -68,14 +64,14 @@ def test_other_tokens_are_refused(text: str) -> None:
 
 def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
     """From the second token on nothing is accepted; afterwards the sequence starts anywhere: no loss, no reboot."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
     for number in range(100):
         with pytest.raises(NotAcceptedError, match="two vehicles are alike, with one key and one gid: give each"):
             send(streams, stream, number, 100.2 + number)
-    streams.publishers.remove(px4("a"), 201.0)
+    streams.remove_publisher(px4("a"), 201.0)
     with pytest.raises(NotAcceptedError, match="alike"):
         send(streams, stream, 900, 201.9)  # what it sent last comes after its token
     assert send(streams, stream, 30, 202.1) == (0, False)
@@ -84,21 +80,20 @@ def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) 
 
 def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: StreamRegistry) -> None:
     """A link that breaks takes both; what waits of them cannot be told apart, and the key is free at once."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     for session in ("a", "b"):
         streams.add_publisher(px4(session), 0.0)
-    for session in ("a", "b"):
-        streams.publishers.remove(px4(session), 10.0)
-    assert not streams.publishers.has(key())
+    assert not streams.remove_publisher(px4("a"), 10.0)
+    assert streams.remove_publisher(px4("b"), 10.0)
     with pytest.raises(NotAcceptedError, match="alike"):
         send(streams, stream, 1, 10.9)
-    streams.publishers.report(11.0)
+    streams.report(11.0)
     assert send(streams, stream, 2, 11.0) == (0, False)
 
 
 def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
     """Two publishers of one session, and two sessions with different topics, are one vehicle each."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
         streams.add_publisher(token, 100.0)
     assert send(streams, stream, 1, 100.1) == (0, False)
@@ -106,18 +101,18 @@ def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
 
 def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistry) -> None:
     """A router notices after up to 10 s that a link is dead: who was silent for 3 s is not in the way of who is new."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
     streams.add_publisher(px4("b"), 103.0)
     assert send(streams, stream, 1, 103.1) == (0, True)
-    streams.publishers.remove(px4("a"), 109.0)
+    streams.remove_publisher(px4("a"), 109.0)
     assert send(streams, stream, 2, 109.1) == (0, False)
 
 
 def test_ros_2_nodes_of_one_name_are_told_apart_by_their_gids(streams: StreamRegistry) -> None:
     """The first one is published, and the other one's messages are rejected, as long as both are there."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
     streams.add_publisher(node("b"), 100.0)
@@ -128,10 +123,10 @@ def test_ros_2_nodes_of_one_name_are_told_apart_by_their_gids(streams: StreamReg
 
 def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegistry) -> None:
     """Its token says that the one before it is gone: a reboot, and nothing is lost."""
-    stream = streams.register(str(key()))
+    stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
-    streams.publishers.remove(node("a"), 100.1)
+    streams.remove_publisher(node("a"), 100.1)
     streams.add_publisher(node("b"), 100.2)
     assert send(streams, stream, 1, 100.3, b"b" * 16) == (0, True)
     assert send(streams, stream, 2, 100.4, b"b" * 16) == (0, False)
@@ -140,8 +135,8 @@ def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegist
 def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
     """A reboot counts once for a vehicle, whichever of its topics tells it first, and again the next time."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
-    vehicle = [streams.register(str(key(topic))) for topic in topics]
-    other = streams.register(str(key(domain=1)))
+    vehicle = [streams.hear(str(key(topic)), 0.0) for topic in topics]
+    other = streams.hear(str(key(domain=1)), 0.0)
     for now in (100.0, 110.0, 120.0):
         sequence = round(50 - now / 10)
         reboots = [send(streams, stream, sequence, now)[1] for stream in [*vehicle, other]]
@@ -150,39 +145,25 @@ def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
         vehicle.reverse()
 
 
-def test_tokens_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
     """A peer that declares tokens without end is followed up to a limit, and costs nothing once they are gone."""
-    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_PUBLISHERS", 10)
-    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_KEYS", 2)
-    alive = PublisherTable()
-    tokens = [node(str(number)) for number in range(15)]
+    tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
-        alive.add(token, "", 0.0)
-    assert [alive.is_alive(token) for token in tokens] == 10 * [True] + 5 * [False]
-    for token in tokens[:-6]:
-        alive.remove(token, 0.0)
-    alive.add(tokens[-1], "", 0.0)
-    assert alive.is_alive(tokens[-1])
-    others = [px4("a", f"topic_{number}") for number in range(3)]
-    for token in others:
-        alive.add(token, "", 0.0)
-    assert [alive.is_alive(token) for token in others] == [True, False, False]
-    for token in (tokens[9], tokens[-1]):
-        alive.remove(token, 0.0)
-    alive.add(others[1], "", 0.0)
-    assert alive.is_alive(others[1])
+        streams.add_publisher(token, 0.0)
+    assert len(streams.hear(str(key()), 0.0).tokens) == 64
+    for token in tokens:
+        streams.remove_publisher(token, 0.0)
+    streams.report(1.0)
+    assert not streams._streams
 
 
-def test_tokens_of_all_keys_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over all keys the number of publishers has a limit, and those that have gone do not count."""
-    monkeypatch.setattr("nedbus.sources.px4.publishers._MAX_TOKENS", 3)
-    alive = PublisherTable()
-    tokens = [px4("a", f"topic_{number}") for number in range(5)]
-    for token in tokens:
-        alive.add(token, "", 0.0)
-    assert [alive.is_alive(token) for token in tokens] == [True, True, True, False, False]
-    alive.remove(tokens[0], 0.0)
-    alive.forget(tokens[1].key)
-    for token in tokens[3:]:
-        alive.add(token, "", 0.0)
-        assert alive.is_alive(token)
+def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry) -> None:
+    """Announced or not, keys have a limit; those of which nothing was accepted and that are gone do not count."""
+    monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
+    streams.add_publisher(px4("a"), 0.0)
+    for domain in (1, 2):
+        streams.hear(str(key(domain=domain)), 0.0)
+    with pytest.raises(NotAcceptedError, match="more than 3 keys: name a domain"):
+        streams.hear(str(key(domain=3)), 0.0)
+    streams.report(0.0)
+    streams.hear(str(key(domain=3)), 0.0)

@@ -16,7 +16,7 @@ TOPIC = f"fmu/out/{VLP}"
 
 
 def make(namespaces: Mapping[str, str] | None = None) -> Ros2Arbiter:
-    return Ros2Arbiter(plain="1", namespaces=namespaces or {})
+    return Ros2Arbiter(namespaces or {})
 
 
 def actions(
@@ -27,7 +27,7 @@ def actions(
 
 
 def test_topic_has_a_namespace_by_vehicle() -> None:
-    """The plain vehicle has none, a given one wins, else it is the vehicle's name as ROS 2 allows it."""
+    """Vehicle 1 has none, a given one wins, else it is the vehicle's name as ROS 2 allows it."""
     arbiter = make({"named": "/fleet/a/", "bare": ""})
     estimator = Address("wing-2", "estimator_local_position", 1)
     assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"

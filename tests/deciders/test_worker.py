@@ -11,6 +11,7 @@ import pytest
 
 from nedbus import SourceStatus
 from nedbus.client import PublisherRegistry
+from nedbus.daemon import Planned
 from nedbus.daemon.worker import Clock, Worker
 from nedbus.errors import AddressInUseError, ClosedError, SourceError
 from nedbus.events import Account
@@ -100,7 +101,7 @@ class FakeReplay:
     def open(self) -> ReplayRun:
         if self.failures:
             raise self.failures.pop(0)
-        addresses = tuple(dict.fromkeys(each.address for each in self.messages))
+        addresses = {each.address: each.definition for each in self.messages}
         return ReplayRun(self.run() if self.run else iter(self.messages), addresses, len(self.messages), "a flight")
 
 
@@ -139,10 +140,9 @@ class Ran:
     def __init__(self, source: object, clock: StandingClock, *, retry: bool = True) -> None:
         self.ends = 0
         self.registry = FakeRegistry(clock)
-        given = cast("Source", source), cast("PublisherRegistry", self.registry)
         self.worker = Worker(
-            "ulog:flight.ulg",
-            *given,
+            Planned(0, "ulog:flight.ulg", "1", cast("Source", source)),
+            cast("PublisherRegistry", self.registry),
             clock=cast("Clock", clock),
             account=Account(),
             retry=retry,

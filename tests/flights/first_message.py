@@ -34,6 +34,7 @@ from nedbus_msgs import encoding_of as _encoding_of
 from nedbus_msgs import provenance_of as _provenance_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 from nedbus_msgs.codecs.msgpack import Newer
+from nedbus_msgs.model.definition import require_fields
 
 M = TypeVar("M", bound=Message, default=VehicleLocalPosition)
 LAYOUTS: Final = DEFAULT.layouts
@@ -104,15 +105,15 @@ def upgrade(fields: Mapping[str, object], layout: str | None = None, message: ty
 
     Raises LayoutError for other fields than the layout's, pydantic.ValidationError for an invalid message.
     """
-    return upgrade_with(definition_of(message), fields, layout)
+    definition = definition_of(message)
+    if layout is not None:
+        require_fields(definition, fields, definition.layouts[layout])
+    return upgrade_with(definition, fields)
 
 
 def downgrade(message: Message, layout: str) -> dict[str, object]:
-    """Return a message as the fields of an older layout, in that layout's order; what the layout lacks is dropped.
-
-    Raises LayoutError for an unknown layout.
-    """
-    return message.DEFINITION.downgrade(message.__dict__, message.DEFINITION.get_layout(layout))
+    """Return a message as the fields of an older layout, in that layout's order; what the layout lacks is dropped."""
+    return message.DEFINITION.downgrade(message.__dict__, message.DEFINITION.layouts[layout])
 
 
 def find_layout(names: Iterable[str], message: type[Message] | str = _FIRST) -> Layout | None:
@@ -147,16 +148,16 @@ def encode_cdr(fields: Mapping[str, object], *, layout: str, message: type[Messa
 def type_hash(layout: str, *, message: type[Message] | str = _FIRST, name: str | None = None) -> str:
     """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016), `RIHS01_` and 64 hex digits.
 
-    `name` is the type, if it is not px4_msgs' own. Raises LayoutError for an unknown layout.
+    `name` is the type, if it is not px4_msgs' own.
     """
     definition = definition_of(message)
-    return hash_of(definition.get_layout(layout), name or ros2_type(definition))
+    return hash_of(definition.layouts[layout], name or ros2_type(definition))
 
 
 def message_definition(layout: str, message: type[Message] | str = _FIRST) -> str:
-    """Return the .msg file of a layout, with unit and meaning of each field; LayoutError for an unknown layout."""
+    """Return the .msg file of a layout, with unit and meaning of each field."""
     definition = definition_of(message)
-    return definition_text(definition, definition.get_layout(layout))
+    return definition_text(definition, definition.layouts[layout])
 
 
 def json_schema(message: type[Message] | str = _FIRST) -> dict[str, object]:
@@ -173,7 +174,7 @@ def _layout(text: str, message: type[Message] | str) -> tuple[Definition[Any], L
     found = message_of_type_hash(text)
     if found is None:
         definition = definition_of(message)
-        return definition, definition.get_layout(text)
+        return definition, definition.layouts[text]
     return found
 
 

@@ -87,6 +87,8 @@ async def read_and_publish() -> None:
         await publisher.publish(nedbus.VehicleAttitude(timestamp=1))
         await publisher.publish_row(sample.message)
         assert_type(await publisher.flush(), bool)
+        await publisher.flush("1")  # type: ignore[arg-type] # seconds
+        assert_type(await bus.vehicles(timeout=1.0), dict[str, list[nedbus.Address]])
         assert_type(await bus.latest(), list[nedbus.Sample])
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import nedbus
 from benchmarks.compare.case import Case
 from benchmarks.compare.fields import FIELDS
-from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 from nedbus_msgs.arrays import to_array
 
 from . import rows
+from .models import open_publishers, open_subscription
 
 BATCH = 1000  # messages that are sent at once, where they are not paced
 

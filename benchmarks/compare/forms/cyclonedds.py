@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
@@ -13,7 +12,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from benchmarks.compare.case import Case
-from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.fields import FIELDS, TYPES
 
 PACKAGES = ["cyclonedds==11.0.1"]
 
@@ -25,19 +24,12 @@ LOOPBACK = """<CycloneDDS><Domain Id="any">
 QOS = Qos(Policy.Reliability.Reliable(duration(infinite=True)), Policy.History.KeepAll)
 
 
-def field_type(name: str, value: object) -> Any:
-    """Choose the type that PX4 has."""
-    if type(value) is bool:
-        return bool
-    if type(value) is int:
-        return types.uint64 if "timestamp" in name else types.uint8
-    if type(value) is tuple:
-        return types.array[types.float32, 2]
-    return types.float64 if name in {"ref_lat", "ref_lon"} else types.float32
-
-
+IDL_TYPES = {
+    "bool": bool, "uint64": types.uint64, "uint8": types.uint8, "float32[2]": types.array[types.float32, 2],
+    "float64": types.float64, "float32": types.float32,
+}  # fmt: skip
 Position = make_idl_struct(
-    "Position", "bench.Position", {name: field_type(name, value) for name, value in FIELDS.items()}
+    "Position", "bench.Position", {name: IDL_TYPES[type_name] for name, type_name in TYPES.items()}
 )
 
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 import nedbus
 from benchmarks.compare.case import Case
 from benchmarks.compare.fields import PROVIDED
-from benchmarks.compare.nedbus_ends import open_publishers
 
 from . import models
 
@@ -18,7 +17,7 @@ def publish(case: Case) -> Iterator[list[Send]]:
     def make_send(publisher: nedbus.Publisher) -> Send:
         return lambda stamp: publisher.publish({**PROVIDED, "timestamp": stamp})
 
-    with open_publishers(case) as publishers:
+    with models.open_publishers(case) as publishers:
         yield list(map(make_send, publishers))
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import lcm
 
 from benchmarks.compare.case import Case
-from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.fields import FIELDS, TYPES
 
 PACKAGES = ["lcm==1.5.3"]
 
@@ -20,22 +20,21 @@ URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4194304"
 CHANNEL = "vehicle_local_position"
 
 
-def field(name: str, value: object) -> str:
-    """Declare it with the type that PX4 has, but signed where LCM has no other."""
-    if type(value) is bool:
-        return f"boolean {name};"
-    if type(value) is int:
-        return f"{'int64_t' if 'timestamp' in name else 'byte'} {name};"
-    if type(value) is tuple:
-        return f"float {name}[2];"
-    return f"{'double' if name in {'ref_lat', 'ref_lon'} else 'float'} {name};"
+# Signed where LCM has no other.
+LCM_TYPES = {"bool": "boolean", "uint64": "int64_t", "uint8": "byte", "float32": "float", "float64": "double"}
+
+
+def field(name: str, type_name: str) -> str:
+    """Declare a field."""
+    kind, bracket, rest = type_name.partition("[")
+    return f"{LCM_TYPES[kind]} {name}{bracket}{rest};"
 
 
 def generate() -> Any:
     """Run lcm-gen, as a build does, and import what it wrote."""
     with tempfile.TemporaryDirectory() as directory:
         source = Path(directory, "position.lcm")
-        source.write_text(f"struct bench_position {{ {' '.join(field(*item) for item in FIELDS.items())} }}")
+        source.write_text(f"struct bench_position {{ {' '.join(field(*item) for item in TYPES.items())} }}")
         subprocess.run([Path(lcm.LCM_BIN_DIR, "lcm-gen"), "-p", "--ppath", directory, source], check=True)
         sys.path.insert(0, directory)
         try:

@@ -4,11 +4,24 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import nedbus
-from benchmarks.compare.case import Case
+from benchmarks.compare.case import TOPIC, Case
 from benchmarks.compare.fields import PROVIDED
-from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 
 Send = Callable[[int], None]
+
+
+@contextmanager
+def open_publishers(case: Case) -> Iterator[list[nedbus.Publisher]]:
+    """Open one publisher for each vehicle."""
+    with nedbus.connect(case.endpoint) as bus:
+        yield [bus.publisher(TOPIC, vehicle=vehicle, lossless=case.lossless) for vehicle in case.vehicles]
+
+
+@contextmanager
+def open_subscription(case: Case) -> Iterator[nedbus.Subscription]:
+    """Subscribe to every sample."""
+    with nedbus.connect(case.endpoint) as bus, bus.subscribe(TOPIC, vehicle=case.vehicle, mode="every") as subscription:
+        yield subscription
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import zenoh
 
 from benchmarks.compare.case import Case
 from benchmarks.compare.fields import FIELDS
-from benchmarks.compare.zenoh_session import KEY, open_session
+from benchmarks.compare.zenoh_session import KEY, open_session, receive_each
 
 PACKAGES = ["msgspec==0.22.0", "eclipse-zenoh==1.10.2"]
 
@@ -30,11 +30,9 @@ def publish(case: Case) -> Iterator[list[Callable[[int], None]]]:
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
     decoder = msgspec.msgpack.Decoder(Position)
-    with open_session(case.endpoint) as session:
-        subscriber = session.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1024))
-        ready()
-        for sample in subscriber:
-            message = decoder.decode(sample.payload.to_bytes())
-            if not seen(message.timestamp if message.x else 0):
-                break
-        subscriber.undeclare()
+
+    def stamp(payload: bytes) -> int:
+        message = decoder.decode(payload)
+        return message.timestamp if message.x else 0
+
+    receive_each(case, ready, seen, stamp)

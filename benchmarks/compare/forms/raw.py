@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import zenoh
 
 from benchmarks.compare.case import Case
-from benchmarks.compare.zenoh_session import declare_publishers, key, open_session
+from benchmarks.compare.zenoh_session import declare_publishers, open_session, receive_each
 
 SIZE = 244
 
@@ -25,10 +25,4 @@ def publish(case: Case) -> Iterator[list[Send]]:
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    with open_session(case.endpoint) as session:
-        subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
-        ready()
-        for sample in subscriber:
-            if not seen(int.from_bytes(sample.payload.to_bytes()[:8], "big")):
-                break
-        subscriber.undeclare()
+    receive_each(case, ready, seen, lambda payload: int.from_bytes(payload[:8], "big"))

@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import nedbus
 from benchmarks.compare.case import Case
 from benchmarks.compare.fields import FIELDS, PROVIDED
-from benchmarks.compare.nedbus_ends import open_publishers, open_subscription
 
 from . import fields_in
+from .models import open_publishers, open_subscription
 
 Send = Callable[[int], None]
 

@@ -5,11 +5,11 @@ from contextlib import contextmanager
 
 import msgpack
 import zenoh
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import ConfigDict, create_model
 
 from benchmarks.compare.case import Case
 from benchmarks.compare.fields import FIELDS
-from benchmarks.compare.zenoh_session import declare_publishers, key, open_session
+from benchmarks.compare.zenoh_session import declare_publishers, open_session, receive_each
 
 Position = create_model(
     "Position",
@@ -34,11 +34,8 @@ def publish(case: Case) -> Iterator[list[Send]]:
 
 
 def receive(case: Case, ready: Callable[[], None], seen: Callable[[int], bool]) -> None:
-    with open_session(case.endpoint) as session:
-        subscriber = session.declare_subscriber(key(case.vehicle), zenoh.handlers.FifoChannel(1024))
-        ready()
-        for sample in subscriber:
-            message: BaseModel = Position.model_validate(msgpack.unpackb(sample.payload.to_bytes(), use_list=False))
-            if not seen(message.timestamp if message.x else 0):
-                break
-        subscriber.undeclare()
+    def stamp(payload: bytes) -> int:
+        message = Position.model_validate(msgpack.unpackb(payload, use_list=False))
+        return message.timestamp if message.x else 0
+
+    receive_each(case, ready, seen, stamp)

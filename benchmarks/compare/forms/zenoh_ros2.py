@@ -11,7 +11,7 @@ from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.qos import QosHistoryKind, QosProfile
 
 from benchmarks.compare.case import Case
-from benchmarks.compare.fields import FIELDS
+from benchmarks.compare.fields import FIELDS, TYPES
 
 PACKAGES = ["zenoh-ros2-sdk==0.1.8"]
 
@@ -28,17 +28,6 @@ OVERRIDE = ";".join(
 VALUES = {name: np.array(value, np.float32) if type(value) is tuple else value for name, value in FIELDS.items()}
 
 
-def field_type(name: str, value: object) -> str:
-    """Choose the type that px4_msgs has."""
-    if type(value) is bool:
-        return "bool"
-    if type(value) is int:
-        return "uint64" if "timestamp" in name else "uint8"
-    if type(value) is tuple:
-        return "float32[2]"
-    return "float64" if name in {"ref_lat", "ref_lon"} else "float32"
-
-
 def options(endpoint: str) -> dict[str, Any]:
     """Say what both ends must agree on."""
     os.environ["ZENOH_CONFIG_OVERRIDE"] = OVERRIDE
@@ -46,7 +35,7 @@ def options(endpoint: str) -> dict[str, Any]:
     return {
         "topic": "/fmu/out/vehicle_local_position",
         "msg_type": "px4_msgs/msg/VehicleLocalPosition",
-        "msg_definition": "".join(f"{field_type(name, value)} {name}\n" for name, value in FIELDS.items()),
+        "msg_definition": "".join(f"{type_name} {name}\n" for name, type_name in TYPES.items()),
         "router_ip": host,
         "router_port": int(port),
         "qos": QosProfile(history_kind=QosHistoryKind.KEEP_ALL),

@@ -7,21 +7,18 @@ Any other valid msgpack encoding of the array is decoded as well.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, Generic, cast
 
 import msgpack
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
 from nedbus_msgs.errors import DecodeError, EncodeError, InvalidMessageError, UnknownLayoutError
-from nedbus_msgs.model.definition import Definition, M
-from nedbus_msgs.model.layouts import upgrade_with
+from nedbus_msgs.model.definition import Definition, M, upgrade_with
 from nedbus_msgs.model.message import fill
 from nedbus_msgs.model.px4_types import BASES, FieldType
-from nedbus_msgs.model.rules import evaluated
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
@@ -86,11 +83,10 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
-    name_values, template_of_fields = validation.name, validation.template
+    name_values, template, flatten = validation.name, validation.template, validation.flatten
     count, head = len(types), struct.pack(">BHB", 0xDC, 1 + len(types), cast("int", definition.current.wire))
-    tags, tag_mask, packed = _forms(types, head)
+    tags, tag_mask, packed, offsets = _forms(types, head)
     size, pack_flat = packed.size, packed.pack
-    flatten = _flattener([kind.length is not None for kind in types.values()])
     new_row, unpack, from_bytes, all_fields = tuple.__new__, msgpack.unpackb, int.from_bytes, definition.all_fields
 
     def pack(row: Values) -> bytes:
@@ -147,8 +143,8 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         row = decode_full_width(payload)
         if row is None:
             return decode_any(payload, newer)
-        values = template_of_fields.copy()
-        values.update(zip(template_of_fields, row, strict=True))
+        values = template.copy()
+        values.update(zip(template, row, strict=True))
         return fill(model.__new__(model), values, all_fields)
 
     def decode_row(payload: bytes, *, newer: Newer | None = None) -> M:  # for type checkers
@@ -157,50 +153,36 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
         return cast("M", new_row(make_row, values))
 
     return Codec(
-        definition, size, tags, tag_mask, tuple(_offsets(types, len(head))),
+        definition, size, tags, tag_mask, offsets,
         encode, encode_fields, encode_row, decode, decode_row,
     )  # fmt: skip
 
 
-def _forms(types: Mapping[str, FieldType], head: bytes) -> tuple[int, int, struct.Struct]:
-    """Return the tags of a payload, the mask of what is no value, and the values as a struct."""
-    forms = [full_width(kind) for kind in types.values()]
-    template = head + b"".join(tags for tags, _, _ in forms)
-    value_mask = int.from_bytes(bytes(len(head)) + b"".join(values for _, _, values in forms), "big")
-    packed = struct.Struct(f">{len(head)}x" + "".join(form for _, form, _ in forms))
-    return int.from_bytes(template, "big"), ((1 << 8 * len(template)) - 1) ^ value_mask, packed
+def _forms(
+    types: Mapping[str, FieldType], head: bytes
+) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
+    """Return tags, mask of the bits that are no values, values as a struct, and the offset of each value."""
+    tags, values, code = head, bytes(len(head)), f">{len(head)}x"
+    offsets: list[tuple[str, int, int]] = []
+    for name, kind in types.items():
+        own_tags, own_code, own_values = full_width(kind)
+        tags, values, code = tags + own_tags, values + own_values, code + own_code
+        tag = int(kind.base != "bool")  # bytes of it beside a value
+        step = tag + kind.size
+        offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
+    mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
+    return int.from_bytes(tags, "big"), mask, struct.Struct(code), tuple(offsets)
 
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:
     """Return a validation error in one line: each field, the reason, and its value."""
-    return "; ".join(_describe(detail, definition) for detail in error.errors(include_url=False))
-
-
-def _describe(detail: ErrorDetails, definition: Definition[Any]) -> str:
-    text = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
-    if detail["type"] == "missing":
-        return text
-    if detail["type"] == "extra_forbidden":
-        text = definition.explain_unknown_field(str(detail["loc"][0]))
-    return f"{text} (is {detail['input']!r:.40})"
-
-
-def _flattener(is_array: Sequence[bool]) -> Callable[[Values], Values]:
-    """Return a function that returns the values of a row with those of its arrays in their place."""
-    parts, start = [], 0
-    for index in [index for index, each in enumerate(is_array) if each]:
-        parts += [f"*row[{start}:{index}]", f"*row[{index}]"]
-        start = index + 1
-    return evaluated(f"lambda row: ({', '.join(parts)}, *row[{start}:])") if parts else tuple
-
-
-def _offsets(types: Mapping[str, FieldType], offset: int) -> Iterator[tuple[str, int, int]]:
-    for name, kind in types.items():
-        _, _, bits = full_width(kind)
-        step = kind.size + (kind.base != "bool")
-        first = len(bits) - kind.count * step + (kind.base != "bool")
-        yield from ((name, part, offset + first + part * step) for part in range(kind.count))
-        offset += len(bits)
+    reasons = []
+    for detail in error.errors(include_url=False):
+        reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
+        if detail["type"] == "extra_forbidden":
+            reason = definition.explain_unknown_field(str(detail["loc"][0]))
+        reasons.append(reason if detail["type"] == "missing" else f"{reason} (is {detail['input']!r:.40})")
+    return "; ".join(reasons)
 
 
 def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) -> dict[str, object]:
@@ -225,7 +207,7 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
     for name, value in zip(names, values, strict=True):
         # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
         parts = value if isinstance(value, tuple) else (value,)
-        if isinstance(value, tuple) and any(isinstance(part, tuple) for part in parts):
+        if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: an array within an array")
         if any(isinstance(part, str) for part in parts):  # which the model accepts as "NaN", from JSON
             raise reject(f"{name}: text, where msgpack has numbers and bools")

@@ -1,15 +1,7 @@
-"""EstimatorStatusFlags: what an estimator fuses, and which faults it sees."""
+"""EstimatorStatusFlags: sensors that an estimator fuses, and faults that it sees."""
 
-from __future__ import annotations
-
-from typing import ClassVar
-
-from pydantic import Field
-
-from nedbus_msgs.model.declaration import Topic, older
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import Bool, Uint32, Uint64
-from nedbus_msgs.model.rules import NotLater
+from nedbus_msgs.model import Layout, Message, NotLater, Older, Topic
+from nedbus_msgs.model.px4_types import Bool, Uint32, Uint64, field
 
 
 class EstimatorStatusFlags(Message):
@@ -23,14 +15,14 @@ class EstimatorStatusFlags(Message):
     In those layouts cs_gnss_pos stands for position and velocity of GNSS; since 1.16 cs_gnss_vel is a flag of its own.
     """
 
-    TOPICS: ClassVar = (
+    TOPICS = (
         Topic(
             "estimator_status_flags", 1.0, "each EKF instance, one or several",
             instances=True, on_change=True, plain_first=True,
         ),
     )  # fmt: skip
-    LAYOUTS: ClassVar = {
-        "1.13": """
+    LAYOUTS = (
+        Layout("1.13", """
             timestamp timestamp_sample control_status_changes cs_tilt_align cs_yaw_align cs_gps cs_opt_flow
             cs_mag_hdg cs_mag_3d cs_mag_dec cs_in_air cs_wind cs_baro_hgt cs_rng_hgt cs_gps_hgt cs_ev_pos cs_ev_yaw
             cs_ev_hgt cs_fuse_beta cs_mag_field_disturbed cs_fixed_wing cs_mag_fault cs_fuse_aspd cs_gnd_effect
@@ -41,123 +33,122 @@ class EstimatorStatusFlags(Message):
             fs_bad_pos_e fs_bad_pos_d fs_bad_acc_bias fs_bad_acc_vertical fs_bad_acc_clipping
             innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos reject_ver_pos reject_mag_x
             reject_mag_y reject_mag_z reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x
-            reject_optflow_y""",
-        "1.14": """
+            reject_optflow_y"""),
+        Layout("1.14", """
             1.13, without reject_mag_x reject_mag_y reject_mag_z, cs_rng_kin_consistent: cs_fake_pos cs_fake_hgt
-            cs_gravity_vector""",
-        "1.15": """
+            cs_gravity_vector"""),
+        Layout("1.15", """
             1.14, without fs_bad_vel_n fs_bad_vel_e fs_bad_vel_d fs_bad_pos_n fs_bad_pos_e fs_bad_pos_d,
-            cs_gravity_vector: cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos""",
-        "1.16": """
+            cs_gravity_vector: cs_mag cs_ev_yaw_fault cs_mag_heading_consistent cs_aux_gpos"""),
+        Layout("1.16", """
             1.15, without cs_gps cs_gps_yaw cs_gps_yaw_fault fs_bad_acc_bias, cs_yaw_align: cs_gnss_pos,
             cs_rng_stuck: cs_gnss_yaw, cs_vehicle_at_rest: cs_gnss_yaw_fault, cs_aux_gpos: cs_rng_terrain
-            cs_opt_flow_terrain cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel""",
-        "1.17": "1.16, cs_gnss_vel: cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault",
-        "1.18": """
+            cs_opt_flow_terrain cs_valid_fake_pos cs_constant_pos cs_baro_fault cs_gnss_vel"""),
+        Layout("1.17", "1.16, cs_gnss_vel: cs_gnss_fault cs_yaw_manual cs_gnss_hgt_fault"),
+        Layout("1.18", """
             1.17, without innovation_fault_status_changes reject_hor_vel reject_ver_vel reject_hor_pos
             reject_ver_pos reject_yaw reject_airspeed reject_sideslip reject_hagl reject_optflow_x reject_optflow_y,
-            cs_gnss_hgt_fault: cs_in_transition cs_heading_observable""",
-    }  # fmt: skip
-    OLDER: ClassVar = {
-        "cs_gps": older("cs_gnss_pos"),
-        "cs_gps_yaw": older("cs_gnss_yaw"),
-        "cs_gps_yaw_fault": older("cs_gnss_yaw_fault"),
-    }
-    RULES: ClassVar = (NotLater("timestamp_sample", "timestamp"),)
+            cs_gnss_hgt_fault: cs_in_transition cs_heading_observable"""),
+    )  # fmt: skip
+    OLDER = (
+        Older("cs_gps", "cs_gnss_pos"),
+        Older("cs_gps_yaw", "cs_gnss_yaw"),
+        Older("cs_gps_yaw_fault", "cs_gnss_yaw_fault"),
+    )
+    RULES = (NotLater("timestamp_sample", "timestamp"),)
 
-    timestamp: Uint64 = Field(description="Time since boot [us]")
-    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the sensor data behind this [us], <= timestamp")
 
-    control_status_changes: Uint32 = Field(0, description="Count of changes of the flags cs_")
-    cs_tilt_align: Bool = Field(False, description="Tilt is aligned")
-    cs_yaw_align: Bool = Field(False, description="Yaw is aligned")
-    cs_gnss_pos: Bool = Field(False, description="GNSS position is fused")
-    cs_opt_flow: Bool = Field(False, description="Optical flow is fused")
-    cs_mag_hdg: Bool = Field(False, description="Magnetic heading is fused")
-    cs_mag_3d: Bool = Field(False, description="The magnetometer's three axes are fused")
-    cs_mag_dec: Bool = Field(False, description="Magnetic declination is fused")
-    cs_in_air: Bool = Field(False, description="The vehicle is taken to be in the air")
-    cs_wind: Bool = Field(False, description="Wind is estimated")
-    cs_baro_hgt: Bool = Field(False, description="Height of the barometer is fused")
-    cs_rng_hgt: Bool = Field(False, description="Height of the range finder is fused")
-    cs_gps_hgt: Bool = Field(False, description="Height of GNSS is fused")
-    cs_ev_pos: Bool = Field(False, description="Position of external vision is fused")
-    cs_ev_yaw: Bool = Field(False, description="Yaw of external vision is fused")
-    cs_ev_hgt: Bool = Field(False, description="Height of external vision is fused")
-    cs_fuse_beta: Bool = Field(False, description="A sideslip of zero is fused")
-    cs_mag_field_disturbed: Bool = Field(False, description="The magnetic field is not as expected here")
-    cs_fixed_wing: Bool = Field(False, description="The vehicle is taken to fly as a fixed wing")
-    cs_mag_fault: Bool = Field(False, description="The magnetometer is faulty and no longer used")
-    cs_fuse_aspd: Bool = Field(False, description="Airspeed is fused")
-    cs_gnd_effect: Bool = Field(False, description="Baro height is guarded against ground effect")
-    cs_rng_stuck: Bool = Field(False, description="The range finder's values do not change as they should")
-    cs_gnss_yaw: Bool = Field(False, description="Yaw of GNSS (two antennas) is fused")
-    cs_mag_aligned_in_flight: Bool = Field(False, description="The magnetic field was aligned in flight")
-    cs_ev_vel: Bool = Field(False, description="Velocity of external vision is fused")
-    cs_synthetic_mag_z: Bool = Field(False, description="The magnetometer's z is computed, not measured")
-    cs_vehicle_at_rest: Bool = Field(False, description="The vehicle is taken to be at rest")
-    cs_gnss_yaw_fault: Bool = Field(False, description="Yaw of GNSS is faulty and not used")
-    cs_rng_fault: Bool = Field(False, description="The range finder is faulty and not used")
-    cs_inertial_dead_reckoning: Bool = Field(False, description="Nothing that is fused bounds horizontal drift")
-    cs_wind_dead_reckoning: Bool = Field(False, description="Only airspeed or sideslip bounds horizontal drift")
-    cs_rng_kin_consistent: Bool = Field(False, description="The range finder agrees with vertical velocity")
-    cs_fake_pos: Bool = Field(False, description="A constant position is fused, for lack of a measured one")
-    cs_fake_hgt: Bool = Field(False, description="A constant height is fused, for lack of a measured one")
-    cs_gravity_vector: Bool = Field(False, description="Gravity, by the accelerometer, is fused")
-    cs_mag: Bool = Field(False, description="The magnetometer is fused, for the magnetic field only")
-    cs_ev_yaw_fault: Bool = Field(False, description="Yaw of external vision is faulty and not used")
-    cs_mag_heading_consistent: Bool = Field(False, description="Magnetic heading agrees with the estimate")
-    cs_aux_gpos: Bool = Field(False, description="An auxiliary global position is fused")
-    cs_rng_terrain: Bool = Field(False, description="The range finder is fused for terrain")
-    cs_opt_flow_terrain: Bool = Field(False, description="Optical flow is fused for terrain")
-    cs_valid_fake_pos: Bool = Field(False, description="A constant position is fused, and is a valid one")
-    cs_constant_pos: Bool = Field(False, description="The vehicle is taken to stay at its position")
-    cs_baro_fault: Bool = Field(False, description="The barometer is faulty and not used")
-    cs_gnss_vel: Bool = Field(False, description="GNSS velocity is fused")
-    cs_gnss_fault: Bool = Field(False, description="GNSS is faulty and not used")
-    cs_yaw_manual: Bool = Field(False, description="Yaw was set by the user")
-    cs_gnss_hgt_fault: Bool = Field(False, description="Height of GNSS is faulty and not used")
-    cs_in_transition: Bool = Field(False, description="A VTOL is in transition")
-    cs_heading_observable: Bool = Field(False, description="The vehicle's motion shows its heading")
+    control_status_changes: Uint32 = field("Count of changes of the flags cs_")
+    cs_tilt_align: Bool = field("Tilt is aligned")
+    cs_yaw_align: Bool = field("Yaw is aligned")
+    cs_gnss_pos: Bool = field("GNSS position is fused")
+    cs_opt_flow: Bool = field("Optical flow is fused")
+    cs_mag_hdg: Bool = field("Magnetic heading is fused")
+    cs_mag_3d: Bool = field("The magnetometer's three axes are fused")
+    cs_mag_dec: Bool = field("Magnetic declination is fused")
+    cs_in_air: Bool = field("The vehicle is taken to be in the air")
+    cs_wind: Bool = field("Wind is estimated")
+    cs_baro_hgt: Bool = field("Height of the barometer is fused")
+    cs_rng_hgt: Bool = field("Height of the range finder is fused")
+    cs_gps_hgt: Bool = field("Height of GNSS is fused")
+    cs_ev_pos: Bool = field("Position of external vision is fused")
+    cs_ev_yaw: Bool = field("Yaw of external vision is fused")
+    cs_ev_hgt: Bool = field("Height of external vision is fused")
+    cs_fuse_beta: Bool = field("A sideslip of zero is fused")
+    cs_mag_field_disturbed: Bool = field("The magnetic field is not as expected here")
+    cs_fixed_wing: Bool = field("The vehicle is taken to fly as a fixed wing")
+    cs_mag_fault: Bool = field("The magnetometer is faulty and no longer used")
+    cs_fuse_aspd: Bool = field("Airspeed is fused")
+    cs_gnd_effect: Bool = field("Baro height is guarded against ground effect")
+    cs_rng_stuck: Bool = field("The range finder's values do not change as they should")
+    cs_gnss_yaw: Bool = field("Yaw of GNSS (two antennas) is fused")
+    cs_mag_aligned_in_flight: Bool = field("The magnetic field was aligned in flight")
+    cs_ev_vel: Bool = field("Velocity of external vision is fused")
+    cs_synthetic_mag_z: Bool = field("The magnetometer's z is computed, not measured")
+    cs_vehicle_at_rest: Bool = field("The vehicle is taken to be at rest")
+    cs_gnss_yaw_fault: Bool = field("Yaw of GNSS is faulty and not used")
+    cs_rng_fault: Bool = field("The range finder is faulty and not used")
+    cs_inertial_dead_reckoning: Bool = field("Nothing that is fused bounds horizontal drift")
+    cs_wind_dead_reckoning: Bool = field("Only airspeed or sideslip bounds horizontal drift")
+    cs_rng_kin_consistent: Bool = field("The range finder agrees with vertical velocity")
+    cs_fake_pos: Bool = field("A constant position is fused, for lack of a measured one")
+    cs_fake_hgt: Bool = field("A constant height is fused, for lack of a measured one")
+    cs_gravity_vector: Bool = field("Gravity, by the accelerometer, is fused")
+    cs_mag: Bool = field("The magnetometer is fused, for the magnetic field only")
+    cs_ev_yaw_fault: Bool = field("Yaw of external vision is faulty and not used")
+    cs_mag_heading_consistent: Bool = field("Magnetic heading agrees with the estimate")
+    cs_aux_gpos: Bool = field("An auxiliary global position is fused")
+    cs_rng_terrain: Bool = field("The range finder is fused for terrain")
+    cs_opt_flow_terrain: Bool = field("Optical flow is fused for terrain")
+    cs_valid_fake_pos: Bool = field("A constant position is fused, and is a valid one")
+    cs_constant_pos: Bool = field("The vehicle is taken to stay at its position")
+    cs_baro_fault: Bool = field("The barometer is faulty and not used")
+    cs_gnss_vel: Bool = field("GNSS velocity is fused")
+    cs_gnss_fault: Bool = field("GNSS is faulty and not used")
+    cs_yaw_manual: Bool = field("Yaw was set by the user")
+    cs_gnss_hgt_fault: Bool = field("Height of GNSS is faulty and not used")
+    cs_in_transition: Bool = field("A VTOL is in transition")
+    cs_heading_observable: Bool = field("The vehicle's motion shows its heading")
 
-    fault_status_changes: Uint32 = Field(0, description="Count of changes of the flags fs_")
-    fs_bad_mag_x: Bool = Field(False, description="Fusion of the magnetometer's x failed numerically")
-    fs_bad_mag_y: Bool = Field(False, description="Fusion of the magnetometer's y failed numerically")
-    fs_bad_mag_z: Bool = Field(False, description="Fusion of the magnetometer's z failed numerically")
-    fs_bad_hdg: Bool = Field(False, description="Fusion of heading failed numerically")
-    fs_bad_mag_decl: Bool = Field(False, description="Fusion of magnetic declination failed numerically")
-    fs_bad_airspeed: Bool = Field(False, description="Fusion of airspeed failed numerically")
-    fs_bad_sideslip: Bool = Field(False, description="Fusion of sideslip failed numerically")
-    fs_bad_optflow_x: Bool = Field(False, description="Fusion of optical flow's x failed numerically")
-    fs_bad_optflow_y: Bool = Field(False, description="Fusion of optical flow's y failed numerically")
-    fs_bad_acc_vertical: Bool = Field(False, description="The accelerometer's vertical values are bad")
-    fs_bad_acc_clipping: Bool = Field(False, description="The accelerometer clips")
+    fault_status_changes: Uint32 = field("Count of changes of the flags fs_")
+    fs_bad_mag_x: Bool = field("Fusion of the magnetometer's x failed numerically")
+    fs_bad_mag_y: Bool = field("Fusion of the magnetometer's y failed numerically")
+    fs_bad_mag_z: Bool = field("Fusion of the magnetometer's z failed numerically")
+    fs_bad_hdg: Bool = field("Fusion of heading failed numerically")
+    fs_bad_mag_decl: Bool = field("Fusion of magnetic declination failed numerically")
+    fs_bad_airspeed: Bool = field("Fusion of airspeed failed numerically")
+    fs_bad_sideslip: Bool = field("Fusion of sideslip failed numerically")
+    fs_bad_optflow_x: Bool = field("Fusion of optical flow's x failed numerically")
+    fs_bad_optflow_y: Bool = field("Fusion of optical flow's y failed numerically")
+    fs_bad_acc_vertical: Bool = field("The accelerometer's vertical values are bad")
+    fs_bad_acc_clipping: Bool = field("The accelerometer clips")
 
     # Up to 1.17:
-    innovation_fault_status_changes: Uint32 = Field(0, description="Count of changes of the flags reject_")
-    reject_hor_vel: Bool = Field(False, description="Horizontal velocity was rejected")
-    reject_ver_vel: Bool = Field(False, description="Vertical velocity was rejected")
-    reject_hor_pos: Bool = Field(False, description="Horizontal position was rejected")
-    reject_ver_pos: Bool = Field(False, description="Vertical position was rejected")
-    reject_yaw: Bool = Field(False, description="Yaw was rejected")
-    reject_airspeed: Bool = Field(False, description="Airspeed was rejected")
-    reject_sideslip: Bool = Field(False, description="Sideslip was rejected")
-    reject_hagl: Bool = Field(False, description="Height above ground was rejected")
-    reject_optflow_x: Bool = Field(False, description="Optical flow's x was rejected")
-    reject_optflow_y: Bool = Field(False, description="Optical flow's y was rejected")
+    innovation_fault_status_changes: Uint32 = field("Count of changes of the flags reject_")
+    reject_hor_vel: Bool = field("Horizontal velocity was rejected")
+    reject_ver_vel: Bool = field("Vertical velocity was rejected")
+    reject_hor_pos: Bool = field("Horizontal position was rejected")
+    reject_ver_pos: Bool = field("Vertical position was rejected")
+    reject_yaw: Bool = field("Yaw was rejected")
+    reject_airspeed: Bool = field("Airspeed was rejected")
+    reject_sideslip: Bool = field("Sideslip was rejected")
+    reject_hagl: Bool = field("Height above ground was rejected")
+    reject_optflow_x: Bool = field("Optical flow's x was rejected")
+    reject_optflow_y: Bool = field("Optical flow's y was rejected")
 
     # Up to 1.15:
-    fs_bad_acc_bias: Bool = Field(False, description="The accelerometer's bias is estimated badly")
+    fs_bad_acc_bias: Bool = field("The accelerometer's bias is estimated badly")
 
     # Up to 1.14:
-    fs_bad_vel_n: Bool = Field(False, description="Fusion of north velocity failed numerically")
-    fs_bad_vel_e: Bool = Field(False, description="Fusion of east velocity failed numerically")
-    fs_bad_vel_d: Bool = Field(False, description="Fusion of down velocity failed numerically")
-    fs_bad_pos_n: Bool = Field(False, description="Fusion of north position failed numerically")
-    fs_bad_pos_e: Bool = Field(False, description="Fusion of east position failed numerically")
-    fs_bad_pos_d: Bool = Field(False, description="Fusion of down position failed numerically")
+    fs_bad_vel_n: Bool = field("Fusion of north velocity failed numerically")
+    fs_bad_vel_e: Bool = field("Fusion of east velocity failed numerically")
+    fs_bad_vel_d: Bool = field("Fusion of down velocity failed numerically")
+    fs_bad_pos_n: Bool = field("Fusion of north position failed numerically")
+    fs_bad_pos_e: Bool = field("Fusion of east position failed numerically")
+    fs_bad_pos_d: Bool = field("Fusion of down position failed numerically")
 
     # Up to 1.13:
-    reject_mag_x: Bool = Field(False, description="The magnetometer's x was rejected")
-    reject_mag_y: Bool = Field(False, description="The magnetometer's y was rejected")
-    reject_mag_z: Bool = Field(False, description="The magnetometer's z was rejected")
+    reject_mag_x: Bool = field("The magnetometer's x was rejected")
+    reject_mag_y: Bool = field("The magnetometer's y was rejected")
+    reject_mag_z: Bool = field("The magnetometer's z was rejected")

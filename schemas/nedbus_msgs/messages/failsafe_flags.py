@@ -1,14 +1,7 @@
-"""FailsafeFlags: what a mode lacks, and what may trigger a failsafe."""
+"""FailsafeFlags: missing requirements of modes, and triggers of failsafes."""
 
-from __future__ import annotations
-
-from typing import ClassVar
-
-from pydantic import Field
-
-from nedbus_msgs.model.declaration import Topic, older
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, Uint64
+from nedbus_msgs.model import Layout, Message, Older, Topic
+from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, field
 
 
 class FailsafeFlags(Message):
@@ -20,9 +13,9 @@ class FailsafeFlags(Message):
     primary_geofence_breached (1.14) and local_position_accuracy_low (up to 1.16) have their newer names here.
     """
 
-    TOPICS: ClassVar = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)
-    LAYOUTS: ClassVar = {
-        "1.14": """
+    TOPICS = (Topic("failsafe_flags", 2.0, "the commander", on_change=True),)
+    LAYOUTS = (
+        Layout("1.14", """
             timestamp mode_req_angular_velocity mode_req_attitude mode_req_local_alt mode_req_local_position
             mode_req_local_position_relaxed mode_req_global_position mode_req_mission mode_req_offboard_signal
             mode_req_home_position mode_req_wind_and_flight_time_compliance mode_req_prevent_arming
@@ -32,93 +25,71 @@ class FailsafeFlags(Message):
             gcs_connection_lost battery_warning battery_low_remaining_time battery_unhealthy
             primary_geofence_breached mission_failure vtol_fixed_wing_system_failure wind_limit_exceeded
             flight_time_limit_exceeded local_position_accuracy_low fd_critical_failure fd_esc_arming_failure
-            fd_imbalanced_prop fd_motor_failure""",
-        "1.15": "1.14, without primary_geofence_breached, battery_unhealthy: geofence_breached",
-        "1.16": "1.15, local_position_accuracy_low: navigator_failure",
-        "1.17": """
+            fd_imbalanced_prop fd_motor_failure"""),
+        Layout("1.15", "1.14, without primary_geofence_breached, battery_unhealthy: geofence_breached"),
+        Layout("1.16", "1.15, local_position_accuracy_low: navigator_failure"),
+        Layout("1.17", """
             1.16, without local_position_accuracy_low, mode_req_global_position: mode_req_global_position_relaxed,
             global_position_invalid: global_position_invalid_relaxed, flight_time_limit_exceeded:
-            position_accuracy_low""",
-        "1.18": """
-            timestamp mode_req_angular_velocity mode_req_attitude mode_req_local_alt mode_req_local_position
-            mode_req_local_position_relaxed mode_req_global_position mode_req_global_position_relaxed
-            mode_req_mission mode_req_offboard_signal mode_req_home_position
-            mode_req_wind_and_flight_time_compliance mode_req_prevent_arming mode_req_manual_control mode_req_other
-            angular_velocity_invalid attitude_invalid local_altitude_invalid local_position_invalid
-            local_position_invalid_relaxed local_velocity_invalid global_position_invalid
-            global_position_invalid_relaxed auto_mission_missing offboard_control_signal_lost home_position_invalid
-            manual_control_signal_lost gcs_connection_lost battery_warning battery_low_remaining_time
-            battery_unhealthy fd_critical_failure fd_esc_arming_failure fd_imbalanced_prop fd_motor_failure
-            fd_alt_loss geofence_breached mission_failure vtol_fixed_wing_system_failure wind_limit_exceeded
-            flight_time_limit_exceeded position_accuracy_low navigator_failure parachute_unhealthy
-            remote_id_unhealthy gnss_lost""",
-        "main": "*",
-    }  # fmt: skip
-    OLDER: ClassVar = {
-        "primary_geofence_breached": older("geofence_breached"),
-        "local_position_accuracy_low": older("position_accuracy_low"),
-    }
-
-    timestamp: Uint64 = Field(description="Time since boot [us]")
-
-    mode_req_angular_velocity: Uint32 = Field(0, description="Modes that need angular velocity, as bits")
-    mode_req_attitude: Uint32 = Field(0, description="Modes that need attitude, as bits")
-    mode_req_local_alt: Uint32 = Field(0, description="Modes that need local altitude, as bits")
-    mode_req_local_position: Uint32 = Field(0, description="Modes that need local position, as bits")
-    mode_req_local_position_relaxed: Uint32 = Field(
-        0, description="Modes that need local position, even inaccurate, as bits"
-    )
-    mode_req_global_position: Uint32 = Field(0, description="Modes that need global position, as bits")
-    mode_req_global_position_relaxed: Uint32 = Field(
-        0, description="Modes that need global position, even inaccurate, as bits"
-    )
-    mode_req_mission: Uint32 = Field(0, description="Modes that need a mission, as bits")
-    mode_req_offboard_signal: Uint32 = Field(0, description="Modes that need setpoints from a companion, as bits")
-    mode_req_home_position: Uint32 = Field(0, description="Modes that need home, as bits")
-    mode_req_wind_and_flight_time_compliance: Uint32 = Field(
-        0, description="Modes that need wind and time of flight within limits, as bits"
-    )
-    mode_req_prevent_arming: Uint32 = Field(0, description="Modes in which the vehicle cannot be armed, as bits")
-    mode_req_manual_control: Uint32 = Field(0, description="Modes that need manual control, as bits")
-    mode_req_other: Uint32 = Field(0, description="Modes that need something else, as bits")
-
-    angular_velocity_invalid: Bool = Field(False, description="Angular velocity is not valid")
-    attitude_invalid: Bool = Field(False, description="Attitude is not valid")
-    local_altitude_invalid: Bool = Field(False, description="Local altitude is not valid")
-    local_position_invalid: Bool = Field(False, description="Local position is not valid")
-    local_position_invalid_relaxed: Bool = Field(False, description="Local position is not valid, not even inaccurate")
-    local_velocity_invalid: Bool = Field(False, description="Local velocity is not valid")
-    global_position_invalid: Bool = Field(False, description="Global position is not valid")
-    global_position_invalid_relaxed: Bool = Field(
-        False, description="Global position is not valid, not even inaccurate"
+            position_accuracy_low"""),
+        Layout("1.18", "main, without traffic_avoidance_unhealthy"),
+        Layout("main", "*"),
+    )  # fmt: skip
+    OLDER = (
+        Older("primary_geofence_breached", "geofence_breached"),
+        Older("local_position_accuracy_low", "position_accuracy_low"),
     )
 
-    auto_mission_missing: Bool = Field(False, description="There is no mission")
-    offboard_control_signal_lost: Bool = Field(False, description="There are no setpoints from a companion")
-    home_position_invalid: Bool = Field(False, description="Home is not set")
-    manual_control_signal_lost: Bool = Field(False, description="Manual control (RC, joystick) is lost")
-    gcs_connection_lost: Bool = Field(False, description="The link to the ground station is lost")
-
-    battery_warning: Uint8 = Field(
-        0, description="Battery's warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed ..."
+    mode_req_angular_velocity: Uint32 = field("Modes that need angular velocity, as bits")
+    mode_req_attitude: Uint32 = field("Modes that need attitude, as bits")
+    mode_req_local_alt: Uint32 = field("Modes that need local altitude, as bits")
+    mode_req_local_position: Uint32 = field("Modes that need local position, as bits")
+    mode_req_local_position_relaxed: Uint32 = field("Modes that need local position, even inaccurate, as bits")
+    mode_req_global_position: Uint32 = field("Modes that need global position, as bits")
+    mode_req_global_position_relaxed: Uint32 = field("Modes that need global position, even inaccurate, as bits")
+    mode_req_mission: Uint32 = field("Modes that need a mission, as bits")
+    mode_req_offboard_signal: Uint32 = field("Modes that need setpoints from a companion, as bits")
+    mode_req_home_position: Uint32 = field("Modes that need home, as bits")
+    mode_req_wind_and_flight_time_compliance: Uint32 = field(
+        "Modes that need wind and time of flight within limits, as bits"
     )
-    battery_low_remaining_time: Bool = Field(False, description="The time until empty is too short")
-    battery_unhealthy: Bool = Field(False, description="A battery has a fault")
+    mode_req_prevent_arming: Uint32 = field("Modes in which the vehicle cannot be armed, as bits")
+    mode_req_manual_control: Uint32 = field("Modes that need manual control, as bits")
+    mode_req_other: Uint32 = field("Modes that need something else, as bits")
 
-    fd_critical_failure: Bool = Field(False, description="Failure detector: roll, pitch, or told from outside")
-    fd_esc_arming_failure: Bool = Field(False, description="Failure detector: an ESC does not arm")
-    fd_imbalanced_prop: Bool = Field(False, description="Failure detector: a propeller is out of balance")
-    fd_motor_failure: Bool = Field(False, description="Failure detector: a motor failed")
-    fd_alt_loss: Bool = Field(False, description="Failure detector: altitude is lost, uncommanded")
+    angular_velocity_invalid: Bool = field("Angular velocity is not valid")
+    attitude_invalid: Bool = field("Attitude is not valid")
+    local_altitude_invalid: Bool = field("Local altitude is not valid")
+    local_position_invalid: Bool = field("Local position is not valid")
+    local_position_invalid_relaxed: Bool = field("Local position is not valid, not even inaccurate")
+    local_velocity_invalid: Bool = field("Local velocity is not valid")
+    global_position_invalid: Bool = field("Global position is not valid")
+    global_position_invalid_relaxed: Bool = field("Global position is not valid, not even inaccurate")
 
-    geofence_breached: Bool = Field(False, description="The vehicle is outside its geofence")
-    mission_failure: Bool = Field(False, description="The mission failed")
-    vtol_fixed_wing_system_failure: Bool = Field(False, description="A VTOL left fixed wing flight for a failure")
-    wind_limit_exceeded: Bool = Field(False, description="The wind is above its limit")
-    flight_time_limit_exceeded: Bool = Field(False, description="The time of flight is above its limit")
-    position_accuracy_low: Bool = Field(False, description="The position is valid, but inaccurate")
-    navigator_failure: Bool = Field(False, description="The navigator cannot carry out its mode")
-    parachute_unhealthy: Bool = Field(False, description="The parachute is missing or does not work")
-    traffic_avoidance_unhealthy: Bool = Field(False, description="Traffic avoidance is missing or does not work")
-    remote_id_unhealthy: Bool = Field(False, description="Remote ID is missing or does not work")
-    gnss_lost: Bool = Field(False, description="GNSS receivers are missing or disagree")
+    auto_mission_missing: Bool = field("There is no mission")
+    offboard_control_signal_lost: Bool = field("There are no setpoints from a companion")
+    home_position_invalid: Bool = field("Home is not set")
+    manual_control_signal_lost: Bool = field("Manual control (RC, joystick) is lost")
+    gcs_connection_lost: Bool = field("The link to the ground station is lost")
+
+    battery_warning: Uint8 = field("Battery's warning: 0 none, 1 low, 2 critical, 3 emergency, 4 failed ...")
+    battery_low_remaining_time: Bool = field("The time until empty is too short")
+    battery_unhealthy: Bool = field("A battery has a fault")
+
+    fd_critical_failure: Bool = field("Failure detector: roll, pitch, or told from outside")
+    fd_esc_arming_failure: Bool = field("Failure detector: an ESC does not arm")
+    fd_imbalanced_prop: Bool = field("Failure detector: a propeller is out of balance")
+    fd_motor_failure: Bool = field("Failure detector: a motor failed")
+    fd_alt_loss: Bool = field("Failure detector: altitude is lost, uncommanded")
+
+    geofence_breached: Bool = field("The vehicle is outside its geofence")
+    mission_failure: Bool = field("The mission failed")
+    vtol_fixed_wing_system_failure: Bool = field("A VTOL left fixed wing flight for a failure")
+    wind_limit_exceeded: Bool = field("The wind is above its limit")
+    flight_time_limit_exceeded: Bool = field("The time of flight is above its limit")
+    position_accuracy_low: Bool = field("The position is valid, but inaccurate")
+    navigator_failure: Bool = field("The navigator cannot carry out its mode")
+    parachute_unhealthy: Bool = field("The parachute is missing or does not work")
+    traffic_avoidance_unhealthy: Bool = field("Traffic avoidance is missing or does not work")
+    remote_id_unhealthy: Bool = field("Remote ID is missing or does not work")
+    gnss_lost: Bool = field("GNSS receivers are missing or disagree")

@@ -1,14 +1,7 @@
-"""TimesyncStatus: how far a companion's clock is from the vehicle's."""
+"""TimesyncStatus: offset of a companion's clock to the vehicle's."""
 
-from __future__ import annotations
-
-from typing import ClassVar
-
-from pydantic import Field
-
-from nedbus_msgs.model.declaration import Topic
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64
+from nedbus_msgs.model import Layout, Message, Topic
+from nedbus_msgs.model.px4_types import Int64, Uint8, Uint32, Uint64, field
 
 
 class TimesyncStatus(Message):
@@ -19,20 +12,13 @@ class TimesyncStatus(Message):
     There is no message unless the other side answers; right after a start the offset may be off by milliseconds.
     """
 
-    TOPICS: ClassVar = (Topic("timesync_status", 10.0, "the MAVLink or DDS module, while a companion answers"),)
-    LAYOUTS: ClassVar = {
-        "1.13": "*",
-    }  # fmt: skip
-    ENUMS: ClassVar = {"source_protocol": "SOURCE_PROTOCOL_"}
+    TOPICS = (Topic("timesync_status", 10.0, "the MAVLink or DDS module, while a companion answers"),)
+    LAYOUTS = (Layout("1.13", "*"),)
 
-    SOURCE_PROTOCOL_UNKNOWN: ClassVar = 0
-    SOURCE_PROTOCOL_MAVLINK: ClassVar = 1
-    SOURCE_PROTOCOL_DDS: ClassVar = 2
+    SOURCE_PROTOCOL_UNKNOWN, SOURCE_PROTOCOL_MAVLINK, SOURCE_PROTOCOL_DDS = range(3)
 
-    timestamp: Uint64 = Field(description="Time since boot [us]")
-
-    source_protocol: Uint8 = Field(0, description="Protocol: 0 not known, 1 MAVLink, 2 DDS")
-    remote_timestamp: Uint64 = Field(0, description="Time of the other side [us]")
-    observed_offset: Int64 = Field(0, description="Vehicle's time minus remote time, by this exchange [us]")
-    estimated_offset: Int64 = Field(0, description="Vehicle's time minus remote time, filtered [us]")
-    round_trip_time: Uint32 = Field(0, description="Time of the exchange, there and back [us]")
+    source_protocol: Uint8 = field("Protocol: 0 not known, 1 MAVLink, 2 DDS")
+    remote_timestamp: Uint64 = field("Time of the other side [us]")
+    observed_offset: Int64 = field("Vehicle's time minus remote time, by this exchange [us]")
+    estimated_offset: Int64 = field("Vehicle's time minus remote time, filtered [us]")
+    round_trip_time: Uint32 = field("Time of the exchange, there and back [us]")

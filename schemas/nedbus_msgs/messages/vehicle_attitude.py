@@ -1,15 +1,7 @@
-"""VehicleAttitude: where the vehicle's body points."""
+"""VehicleAttitude: orientation of the vehicle's body."""
 
-from __future__ import annotations
-
-from typing import ClassVar
-
-from pydantic import Field
-
-from nedbus_msgs.model.declaration import Topic
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import NAN, Float32x4, Uint8, Uint64
-from nedbus_msgs.model.rules import NotLater, UnitQuaternion
+from nedbus_msgs.model import Layout, Message, NotLater, Topic, UnitQuaternion
+from nedbus_msgs.model.px4_types import Float32x4, Uint8, Uint64, field
 
 
 class VehicleAttitude(Message):
@@ -23,22 +15,17 @@ class VehicleAttitude(Message):
     It is all 0 in some ground truth, which is no rotation at all.
     """
 
-    TOPICS: ClassVar = (
+    TOPICS = (
         Topic("vehicle_attitude", 50.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
         Topic("vehicle_attitude_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_attitude", 50.0, "an external INS driver (VectorNav, ...)"),
         Topic("estimator_attitude", 2.0, "each EKF instance, when several run", instances=True),
     )
-    LAYOUTS: ClassVar = {
-        "1.13": "*",
-    }  # fmt: skip
-    RULES: ClassVar = (NotLater("timestamp_sample", "timestamp"), UnitQuaternion("q"))
+    LAYOUTS = (Layout("1.13", "*"),)
+    RULES = (NotLater("timestamp_sample", "timestamp"), UnitQuaternion("q"))
 
-    timestamp: Uint64 = Field(description="Time since boot [us]")
-    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the sensor data behind this [us], <= timestamp")
 
-    q: Float32x4 = Field((NAN,) * 4, description="Rotation from FRD body to NED, Hamilton (w, x, y, z)")
-    delta_q_reset: Float32x4 = Field(
-        (NAN,) * 4, description="Change of q at its latest reset: q after = this * q before"
-    )
-    quat_reset_counter: Uint8 = Field(0, description="Count of q resets, wraps at 255")
+    q: Float32x4 = field("Rotation from FRD body to NED, Hamilton (w, x, y, z)")
+    delta_q_reset: Float32x4 = field("Change of q at its latest reset: q after = this * q before")
+    quat_reset_counter: Uint8 = field("Count of q resets, wraps at 255")

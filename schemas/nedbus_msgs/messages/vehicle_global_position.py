@@ -1,15 +1,7 @@
-"""VehicleGlobalPosition: where the vehicle is on the globe."""
+"""VehicleGlobalPosition: latitude, longitude and altitude of the vehicle."""
 
-from __future__ import annotations
-
-from typing import ClassVar
-
-from pydantic import Field
-
-from nedbus_msgs.model.declaration import Topic
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float64, Uint8, Uint64
-from nedbus_msgs.model.rules import FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model import FiniteWhile, Layout, Message, NotLater, NotNegative, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, field
 
 
 class VehicleGlobalPosition(Message):
@@ -21,19 +13,17 @@ class VehicleGlobalPosition(Message):
     alt_ellipsoid is often alt in simulators, and 0 in some ground truth.
     """
 
-    TOPICS: ClassVar = (
+    TOPICS = (
         Topic("vehicle_global_position", 50.0, "EKF2, or the EKF2 selector of several"),
         Topic("vehicle_global_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
         Topic("external_ins_global_position", 50.0, "an external INS driver (VectorNav, ...)"),
         Topic("estimator_global_position", 2.0, "each EKF instance, when several run", instances=True),
     )
-    LAYOUTS: ClassVar = {
-        "1.13": """
-            timestamp timestamp_sample lat lon alt alt_ellipsoid delta_alt lat_lon_reset_counter alt_reset_counter
-            eph epv terrain_alt terrain_alt_valid dead_reckoning""",
-        "1.16": "*",
-    }  # fmt: skip
-    RULES: ClassVar = (
+    LAYOUTS = (
+        Layout("1.13", "1.16, without lat_lon_valid alt_valid delta_terrain terrain_reset_counter"),
+        Layout("1.16", "*"),
+    )
+    RULES = (
         NotLater("timestamp_sample", "timestamp"),
         Within("lat", 90.0),
         Within("lon", 180.0),
@@ -41,27 +31,26 @@ class VehicleGlobalPosition(Message):
         FiniteWhile({"lat_lon_valid": ("lat", "lon"), "alt_valid": ("alt",), "terrain_alt_valid": ("terrain_alt",)}),
     )
 
-    timestamp: Uint64 = Field(description="Time since boot [us]")
-    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this [us], <= timestamp")
+    timestamp_sample: Uint64 = field("Time of the sensor data behind this [us], <= timestamp")
 
-    lat: Float64 = Field(NAN, description="Latitude [deg] [WGS84]")
-    lon: Float64 = Field(NAN, description="Longitude [deg] [WGS84]")
-    alt: Float32 = Field(NAN, description="Altitude above mean sea level [m]")
-    alt_ellipsoid: Float32 = Field(NAN, description="Altitude above the ellipsoid [m] [WGS84]")
+    lat: Float64 = field("Latitude [deg] [WGS84]")
+    lon: Float64 = field("Longitude [deg] [WGS84]")
+    alt: Float32 = field("Altitude above mean sea level [m]")
+    alt_ellipsoid: Float32 = field("Altitude above the ellipsoid [m] [WGS84]")
 
-    lat_lon_valid: Bool = Field(False, description="lat and lon are valid")
-    alt_valid: Bool = Field(False, description="alt is valid")
+    lat_lon_valid: Bool = field("lat and lon are valid")
+    alt_valid: Bool = field("alt is valid")
 
-    delta_alt: Float32 = Field(NAN, description="Jump of alt at its latest reset [m], up")
-    delta_terrain: Float32 = Field(NAN, description="Jump of terrain_alt at its latest reset [m], up")
-    lat_lon_reset_counter: Uint8 = Field(0, description="Count of lat, lon resets, wraps at 255")
-    alt_reset_counter: Uint8 = Field(0, description="Count of alt resets, wraps at 255")
-    terrain_reset_counter: Uint8 = Field(0, description="Count of terrain_alt resets, wraps at 255")
+    delta_alt: Float32 = field("Jump of alt at its latest reset [m], up")
+    delta_terrain: Float32 = field("Jump of terrain_alt at its latest reset [m], up")
+    lat_lon_reset_counter: Uint8 = field("Count of lat, lon resets, wraps at 255")
+    alt_reset_counter: Uint8 = field("Count of alt resets, wraps at 255")
+    terrain_reset_counter: Uint8 = field("Count of terrain_alt resets, wraps at 255")
 
-    eph: Float32 = Field(NAN, description="Standard deviation of horizontal position [m]")
-    epv: Float32 = Field(NAN, description="Standard deviation of altitude [m]")
+    eph: Float32 = field("Standard deviation of horizontal position [m]")
+    epv: Float32 = field("Standard deviation of altitude [m]")
 
-    terrain_alt: Float32 = Field(NAN, description="Altitude of the ground below [m], NaN if not known")
-    terrain_alt_valid: Bool = Field(False, description="terrain_alt is valid")
+    terrain_alt: Float32 = field("Altitude of the ground below [m], NaN if not known")
+    terrain_alt_valid: Bool = field("terrain_alt is valid")
 
-    dead_reckoning: Bool = Field(False, description="The position is estimated by dead reckoning")
+    dead_reckoning: Bool = field("The position is estimated by dead reckoning")

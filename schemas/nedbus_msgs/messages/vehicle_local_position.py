@@ -1,18 +1,14 @@
-"""VehicleLocalPosition: where a vehicle is, how fast it moves, and how well that is known.
+"""VehicleLocalPosition: position and velocity of a vehicle, and their accuracy.
 
 Names, order, types and meaning follow PX4's `msg/versioned/VehicleLocalPosition.msg` (1.16 to main).
 """
-
-from __future__ import annotations
 
 from typing import ClassVar
 
 from pydantic import Field
 
-from nedbus_msgs.model.declaration import Topic, older
-from nedbus_msgs.model.message import Message
-from nedbus_msgs.model.px4_types import NAN, Bool, Float32, Float32x2, Float64, Uint8, Uint64
-from nedbus_msgs.model.rules import FLOAT32_PI, FiniteWhile, NotLater, NotNegative, Within
+from nedbus_msgs.model import FLOAT32_PI, FiniteWhile, Layout, Message, NotLater, NotNegative, Older, Topic, Within
+from nedbus_msgs.model.px4_types import Bool, Float32, Float32x2, Float64, Timestamp, Uint8, Uint64, field
 
 
 class VehicleLocalPosition(Message):
@@ -29,44 +25,34 @@ class VehicleLocalPosition(Message):
     Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
     """
 
-    TOPICS: ClassVar = (
+    TOPICS = (
         Topic("vehicle_local_position", 100.0, "EKF2, or the EKF2 selector of several", priority="data_high"),
         Topic("vehicle_local_position_groundtruth", 50.0, "simulators (SITL, HITL)"),
-        Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)", cache=2000),
+        Topic("external_ins_local_position", 50.0, "an external INS driver (VectorNav, ...)"),
         Topic("estimator_local_position", 2.0, "each EKF instance, when several run", instances=True),
     )
-    LAYOUTS: ClassVar = {
-        "1.13": """
-            timestamp timestamp_sample xy_valid z_valid v_xy_valid v_z_valid x y z delta_xy xy_reset_counter delta_z
-            z_reset_counter vx vy vz z_deriv delta_vxy vxy_reset_counter delta_vz vz_reset_counter ax ay az heading
-            delta_heading heading_reset_counter heading_good_for_control xy_global z_global ref_timestamp ref_lat
-            ref_lon ref_alt dist_bottom dist_bottom_valid dist_bottom_sensor_bitfield eph epv evh evv vxy_max vz_max
-            hagl_min hagl_max""",
-        "1.14": "1.13, evv: dead_reckoning",
-        "1.15": "1.14, heading: heading_var unaided_heading, heading_good_for_control: tilt_var",
-        "V0": """
-            timestamp timestamp_sample xy_valid z_valid v_xy_valid v_z_valid x y z delta_xy xy_reset_counter delta_z
-            z_reset_counter vx vy vz z_deriv delta_vxy vxy_reset_counter delta_vz vz_reset_counter ax ay az heading
-            heading_var unaided_heading delta_heading heading_reset_counter heading_good_for_control tilt_var
-            xy_global z_global ref_timestamp ref_lat ref_lon ref_alt dist_bottom_valid dist_bottom dist_bottom_var
-            delta_dist_bottom dist_bottom_reset_counter dist_bottom_sensor_bitfield eph epv evh evv dead_reckoning
-            vxy_max vz_max hagl_min hagl_max""",
-        "1.16": "*",
-    }  # fmt: skip
-    WIRE: ClassVar = {0: "V0", 1: "1.16"}
-    ALWAYS: ClassVar = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
-    ALIASES: ClassVar = {  # the types of PX4's translation node
-        "V0": ("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0"),
-    }
-    OLDER: ClassVar = {
+    LAYOUTS = (
+        Layout("1.13", "1.14, without dead_reckoning"),
+        Layout("1.14", "1.15, without heading_var unaided_heading tilt_var"),
+        Layout("1.15", """
+            V0, without dist_bottom dist_bottom_var delta_dist_bottom dist_bottom_reset_counter,
+            ref_alt: dist_bottom"""),
+        Layout(
+            "V0", "1.16, without hagl_max_z hagl_max_xy, hagl_min: hagl_max", wire=0,
+            aliases=("px4_msgs_old/msg/VehicleLocalPositionV0", "px4_msgs/msg/VehicleLocalPositionV0"),
+        ),
+        Layout("1.16", "*", wire=1),
+    )  # fmt: skip
+    ALWAYS = "timestamp x y z vx vy vz xy_valid z_valid v_xy_valid v_z_valid"
+    OLDER = (
         # As in PX4's own translation:
-        "hagl_max": older(("hagl_max_z", "hagl_max_xy"), doc="Greatest height above ground [m]"),
+        Older("hagl_max", "hagl_max_z hagl_max_xy", doc="Greatest height above ground [m]"),
         # Up to 1.11:
-        "yaw": older("heading"),
-        "delta_yaw": older("delta_heading"),
-        "yaw_reset_counter": older("heading_reset_counter"),
-    }
-    RULES: ClassVar = (
+        Older("yaw", "heading"),
+        Older("delta_yaw", "delta_heading"),
+        Older("yaw_reset_counter", "heading_reset_counter"),
+    )
+    RULES = (
         FiniteWhile({
             "xy_valid": ("x", "y"),
             "z_valid": ("z",),
@@ -85,72 +71,70 @@ class VehicleLocalPosition(Message):
     )  # fmt: skip
 
     MESSAGE_VERSION: ClassVar = 1
-    DIST_BOTTOM_SENSOR_NONE: ClassVar = 0
-    DIST_BOTTOM_SENSOR_RANGE: ClassVar = 1
-    DIST_BOTTOM_SENSOR_FLOW: ClassVar = 2
+    DIST_BOTTOM_SENSOR_NONE, DIST_BOTTOM_SENSOR_RANGE, DIST_BOTTOM_SENSOR_FLOW = range(3)
 
-    timestamp: Uint64 = Field(description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)")
-    timestamp_sample: Uint64 = Field(0, description="Time of the sensor data behind this estimate [us], <= timestamp")
-
-    xy_valid: Bool = Field(False, description="x and y are valid")
-    z_valid: Bool = Field(False, description="z is valid")
-    v_xy_valid: Bool = Field(False, description="vx and vy are valid")
-    v_z_valid: Bool = Field(False, description="vz is valid")
-
-    x: Float32 = Field(NAN, description="North position [m] [local NED]")
-    y: Float32 = Field(NAN, description="East position [m] [local NED]")
-    z: Float32 = Field(NAN, description="Down position, negative altitude [m] [local NED]")
-    delta_xy: Float32x2 = Field((NAN, NAN), description="Jump of x and y at their latest reset [m] [local NED]")
-    xy_reset_counter: Uint8 = Field(0, description="Count of x, y resets, wraps at 255")
-    delta_z: Float32 = Field(NAN, description="Jump of z at its latest reset [m] [local NED]")
-    z_reset_counter: Uint8 = Field(0, description="Count of z resets, wraps at 255")
-
-    vx: Float32 = Field(NAN, description="North velocity [m/s] [local NED]")
-    vy: Float32 = Field(NAN, description="East velocity [m/s] [local NED]")
-    vz: Float32 = Field(NAN, description="Down velocity [m/s] [local NED]")
-    z_deriv: Float32 = Field(NAN, description="Time derivative of z [m/s] [local NED]")
-    delta_vxy: Float32x2 = Field((NAN, NAN), description="Jump of vx and vy at their latest reset [m/s] [local NED]")
-    vxy_reset_counter: Uint8 = Field(0, description="Count of vx, vy resets, wraps at 255")
-    delta_vz: Float32 = Field(NAN, description="Jump of vz at its latest reset [m/s] [local NED]")
-    vz_reset_counter: Uint8 = Field(0, description="Count of vz resets, wraps at 255")
-
-    ax: Float32 = Field(NAN, description="North velocity derivative [m/s^2] [local NED]")
-    ay: Float32 = Field(NAN, description="East velocity derivative [m/s^2] [local NED]")
-    az: Float32 = Field(NAN, description="Down velocity derivative [m/s^2] [local NED]")
-
-    heading: Float32 = Field(NAN, description="Euler yaw, body frame to local NED [rad], within [-pi, pi]")
-    heading_var: Float32 = Field(NAN, description="Variance of heading [rad^2]")
-    unaided_heading: Float32 = Field(NAN, description="Heading from gyros alone [rad]: only differences mean anything")
-    delta_heading: Float32 = Field(NAN, description="Jump of heading at its latest reset [rad]")
-    heading_reset_counter: Uint8 = Field(0, description="Count of heading resets, wraps at 255")
-    heading_good_for_control: Bool = Field(False, description="heading is good enough to control the vehicle with")
-    tilt_var: Float32 = Field(NAN, description="Variance of tilt [rad^2]")
-
-    xy_global: Bool = Field(False, description="x and y have a global origin (ref_lat, ref_lon)")
-    z_global: Bool = Field(False, description="z has a global origin (ref_alt)")
-    ref_timestamp: Uint64 = Field(0, description="Time when the origin was set, since boot [us]")
-    ref_lat: Float64 = Field(NAN, description="Latitude of the origin [deg] [WGS84], NaN while there is none")
-    ref_lon: Float64 = Field(NAN, description="Longitude of the origin [deg] [WGS84], NaN while there is none")
-    ref_alt: Float32 = Field(
-        NAN, description="Altitude of the origin above mean sea level [m], NaN while there is none"
+    timestamp: Timestamp = Field(
+        description="Time since boot [us] (Unix time with uXRCE time sync and in some SITL logs)"
     )
+    timestamp_sample: Uint64 = field("Time of the sensor data behind this estimate [us], <= timestamp")
 
-    dist_bottom_valid: Bool = Field(False, description="dist_bottom is valid")
-    dist_bottom: Float32 = Field(NAN, description="Distance down to the ground [m], written even when not valid")
-    dist_bottom_var: Float32 = Field(NAN, description="Variance of the terrain estimate [m^2]")
-    delta_dist_bottom: Float32 = Field(NAN, description="Jump of dist_bottom at its latest reset [m]")
-    dist_bottom_reset_counter: Uint8 = Field(0, description="Count of dist_bottom resets, wraps at 255")
-    dist_bottom_sensor_bitfield: Uint8 = Field(0, description="Sensors behind dist_bottom: 0 none, 1 range, 2 flow")
+    xy_valid: Bool = field("x and y are valid")
+    z_valid: Bool = field("z is valid")
+    v_xy_valid: Bool = field("vx and vy are valid")
+    v_z_valid: Bool = field("vz is valid")
 
-    eph: Float32 = Field(NAN, description="Standard deviation of north and east position combined [m]")
-    epv: Float32 = Field(NAN, description="Standard deviation of down position [m]")
-    evh: Float32 = Field(NAN, description="Standard deviation of north and east velocity combined [m/s]")
-    evv: Float32 = Field(NAN, description="Standard deviation of down velocity [m/s]")
+    x: Float32 = field("North position [m] [local NED]")
+    y: Float32 = field("East position [m] [local NED]")
+    z: Float32 = field("Down position, negative altitude [m] [local NED]")
+    delta_xy: Float32x2 = field("Jump of x and y at their latest reset [m] [local NED]")
+    xy_reset_counter: Uint8 = field("Count of x, y resets, wraps at 255")
+    delta_z: Float32 = field("Jump of z at its latest reset [m] [local NED]")
+    z_reset_counter: Uint8 = field("Count of z resets, wraps at 255")
 
-    dead_reckoning: Bool = Field(False, description="The position is estimated by dead reckoning")
+    vx: Float32 = field("North velocity [m/s] [local NED]")
+    vy: Float32 = field("East velocity [m/s] [local NED]")
+    vz: Float32 = field("Down velocity [m/s] [local NED]")
+    z_deriv: Float32 = field("Time derivative of z [m/s] [local NED]")
+    delta_vxy: Float32x2 = field("Jump of vx and vy at their latest reset [m/s] [local NED]")
+    vxy_reset_counter: Uint8 = field("Count of vx, vy resets, wraps at 255")
+    delta_vz: Float32 = field("Jump of vz at its latest reset [m/s] [local NED]")
+    vz_reset_counter: Uint8 = field("Count of vz resets, wraps at 255")
 
-    vxy_max: Float32 = Field(NAN, description="Limit of horizontal speed [m/s]; none: infinity (0 in ground truth)")
-    vz_max: Float32 = Field(NAN, description="Limit of vertical speed [m/s]; none: infinity (0 in ground truth)")
-    hagl_min: Float32 = Field(NAN, description="Least height above ground [m]; none: infinity (0 in ground truth)")
-    hagl_max_z: Float32 = Field(NAN, description="Greatest height above ground for z control [m]; none: infinity")
-    hagl_max_xy: Float32 = Field(NAN, description="Greatest height above ground for xy control [m]; none: infinity")
+    ax: Float32 = field("North velocity derivative [m/s^2] [local NED]")
+    ay: Float32 = field("East velocity derivative [m/s^2] [local NED]")
+    az: Float32 = field("Down velocity derivative [m/s^2] [local NED]")
+
+    heading: Float32 = field("Euler yaw, body frame to local NED [rad], within [-pi, pi]")
+    heading_var: Float32 = field("Variance of heading [rad^2]")
+    unaided_heading: Float32 = field("Heading from gyros alone [rad]: only differences mean anything")
+    delta_heading: Float32 = field("Jump of heading at its latest reset [rad]")
+    heading_reset_counter: Uint8 = field("Count of heading resets, wraps at 255")
+    heading_good_for_control: Bool = field("heading is good enough to control the vehicle with")
+    tilt_var: Float32 = field("Variance of tilt [rad^2]")
+
+    xy_global: Bool = field("x and y have a global origin (ref_lat, ref_lon)")
+    z_global: Bool = field("z has a global origin (ref_alt)")
+    ref_timestamp: Uint64 = field("Time when the origin was set, since boot [us]")
+    ref_lat: Float64 = field("Latitude of the origin [deg] [WGS84], NaN while there is none")
+    ref_lon: Float64 = field("Longitude of the origin [deg] [WGS84], NaN while there is none")
+    ref_alt: Float32 = field("Altitude of the origin above mean sea level [m], NaN while there is none")
+
+    dist_bottom_valid: Bool = field("dist_bottom is valid")
+    dist_bottom: Float32 = field("Distance down to the ground [m], written even when not valid")
+    dist_bottom_var: Float32 = field("Variance of the terrain estimate [m^2]")
+    delta_dist_bottom: Float32 = field("Jump of dist_bottom at its latest reset [m]")
+    dist_bottom_reset_counter: Uint8 = field("Count of dist_bottom resets, wraps at 255")
+    dist_bottom_sensor_bitfield: Uint8 = field("Sensors behind dist_bottom: 0 none, 1 range, 2 flow")
+
+    eph: Float32 = field("Standard deviation of north and east position combined [m]")
+    epv: Float32 = field("Standard deviation of down position [m]")
+    evh: Float32 = field("Standard deviation of north and east velocity combined [m/s]")
+    evv: Float32 = field("Standard deviation of down velocity [m/s]")
+
+    dead_reckoning: Bool = field("The position is estimated by dead reckoning")
+
+    vxy_max: Float32 = field("Limit of horizontal speed [m/s]; none: infinity (0 in ground truth)")
+    vz_max: Float32 = field("Limit of vertical speed [m/s]; none: infinity (0 in ground truth)")
+    hagl_min: Float32 = field("Least height above ground [m]; none: infinity (0 in ground truth)")
+    hagl_max_z: Float32 = field("Greatest height above ground for z control [m]; none: infinity")
+    hagl_max_xy: Float32 = field("Greatest height above ground for xy control [m]; none: infinity")

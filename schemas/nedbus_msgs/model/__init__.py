@@ -1,1 +1,10 @@
 """The definition of a message: fields and types, layouts, rules, validation; made from its file in `messages/`."""
+
+from .declaration import Layout, Older, Topic
+from .message import Message
+from .rules import FLOAT32_PI, FiniteWhile, InRange, NotLater, NotNegative, UnitQuaternion, Within
+
+__all__ = [
+    "FLOAT32_PI", "FiniteWhile", "InRange", "Layout", "Message", "NotLater", "NotNegative", "Older", "Topic",
+    "UnitQuaternion", "Within",
+]  # fmt: skip

@@ -1,18 +1,22 @@
-"""Definition of a message in one object, made from the class in its file; everything else is derived from it."""
+"""The definition of a message in one object, the table of all, and the conversion of PX4's layouts to the model.
+
+A layout is found by its field names or given by its name; never by MESSAGE_VERSION, which two layouts may share.
+"""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Self, TypeVar
 
 from nedbus_msgs.errors import LayoutError
 
-from .declaration import ALL, DEFAULT_TOPIC, EVERY, RELEASES, Layout, Older, Topic
-from .px4_types import FieldType, field_type, type_of_marks
-from .rules import Rule
+from .declaration import ALL, DEFAULT_TOPIC, RELEASES, Layout, Topic
+from .px4_types import NAN, FieldType, field_type
 from .validation import Validation, Values
 
 if TYPE_CHECKING:
@@ -66,59 +70,37 @@ class Plan(NamedTuple):
 
 
 class Definition(Generic[M_co]):
-    """Everything that is known of one message.
+    """Everything that is known of one message, of the class in its file.
 
     `name`: PX4's name of it, such as VehicleAttitude. `model`: its Pydantic model.
     `types`: PX4's type of every field of the model, in its order.
-    `topics`: by name. `layouts`: by name, oldest first; `current` is the one with the fields of the model.
-    `wire_layouts`: those that a payload may have, by its first value, the number of the layout.
+    `topics` and `older` fields: by name. `rules`: those between its fields.
     `always`: the fields that it has in every log, however old.
-    `aliases`: names of ROS 2 types that hold layouts of this message under another name, by layout.
     """
 
-    def __init__(
-        self,
-        model: type[M_co],
-        *,
-        topics: Iterable[Topic] = (),
-        layouts: Mapping[str, str] | None = None,
-        wire: Mapping[int, str] | None = None,
-        rules: Sequence[Rule] = (),
-        older: Mapping[str, Older] | None = None,
-        aliases: Mapping[str, Sequence[str]] | None = None,
-        always: str = "timestamp",
-    ) -> None:
+    def __init__(self, model: type[M_co]) -> None:
         self.name = model.__name__
         self.model = model
         self.types: Mapping[str, FieldType] = {
-            name: type_of_marks(field.metadata) for name, field in model.__pydantic_fields__.items()
+            name: next(mark for mark in field.metadata if isinstance(mark, FieldType))
+            for name, field in model.__pydantic_fields__.items()
         }
         self.names = tuple(self.types)
         self.all_fields = frozenset(self.names)
-        self.topics = {topic.name: topic for topic in topics}
-        self.rules = rules
-        self.aliases = aliases or {}
-        self.always = frozenset(always.split())
-        self._older = older or {}
-        self._wire, self._texts = wire, layouts or {}
+        self.topics = {topic.name: topic for topic in model.TOPICS}
+        self.older = {old.name: old for old in model.OLDER}
+        self.rules = model.RULES
+        self.always = frozenset(model.ALWAYS.split())
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
         """PX4's layouts by name, oldest first; the last one is the model's own."""
-        numbers = {name: number for number, name in (self._wire or {}).items()}
-        found: dict[str, Layout] = {}
-        for name, text in self._texts.items():
-            try:
-                types = self.types if text == EVERY else self._types_of(text, found)
-            except (KeyError, ValueError) as exc:
-                raise LayoutError(f"layout {name} of {self.name}: {exc}: no field or layout is called so") from None
-            found[name] = Layout(name, numbers.get(name), types)
-        if not self._wire:
-            name = next(
-                (name for name, layout in found.items() if [*layout.types.items()] == [*self.types.items()]), ALL
-            )
-            found.pop(name, None)
-            found[name] = Layout(name, 0, self.types)
+        found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
+        if all(layout.wire is None for layout in found.values()):
+            fields = list(self.types.items())
+            own = next((layout for layout in found.values() if list(layout.types.items()) == fields), None)
+            own = replace(found.pop(own.name) if own else Layout(ALL, "*"), wire=0, types=self.types)
+            found[own.name] = own
         return found
 
     @cached_property
@@ -142,13 +124,6 @@ class Definition(Generic[M_co]):
         places: dict[str, Any] = {name: property(itemgetter(index)) for index, name in enumerate(self.names)}
         return type(f"{self.name}Row", (Row,), {**places, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
-    def get_layout(self, name: str) -> Layout:
-        """Return a layout by its name; raise LayoutError for an unknown one."""
-        try:
-            return self.layouts[name]
-        except KeyError:
-            raise LayoutError(f"unknown layout {name!r}: choose from {', '.join(self.layouts)}") from None
-
     def layout_of_release(self, release: str) -> Layout | None:
         """Return the layout of a release of PX4, or that with this name; None for a message that it does not have."""
         if release in self.layouts or release not in RELEASES:
@@ -162,12 +137,12 @@ class Definition(Generic[M_co]):
         return next((layout for layout in self.layouts.values() if given == layout.types.keys()), None)
 
     @cached_property
-    def known_types(self) -> Mapping[str, frozenset[FieldType]]:
+    def known_types(self) -> Mapping[str, Set[FieldType]]:
         """The types that each field has, or had in an older layout."""
-        known = {name: frozenset({kind}) for name, kind in self.types.items()}
+        known: dict[str, set[FieldType]] = {}
         for layout in self.layouts.values():
             for name, kind in layout.types.items():
-                known[name] = known.get(name, frozenset()) | {kind}
+                known.setdefault(name, set()).add(kind)
         return known
 
     def recorded_layout(self, provided: frozenset[str]) -> Layout:
@@ -180,7 +155,7 @@ class Definition(Generic[M_co]):
         return next((layout for layout in self.layouts.values() if layout.types.keys() == provided), self.current)
 
     def plan(self, names: Iterable[str]) -> Plan:
-        """Return how these fields, of any PX4 release, become those of the model; unknown names are ignored."""
+        """Return the mapping of these fields, of any PX4 release, to the model; unknown names are ignored."""
         return _plan(self, tuple(names))
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
@@ -190,10 +165,10 @@ class Definition(Generic[M_co]):
     def meaning(self, name: str) -> str:
         """Return unit and meaning of a field of any layout."""
         field = self.model.model_fields.get(name)
-        return (field.description if field else self._older[name].doc if name in self._older else "") or ""
+        return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 
     def explain_unknown_field(self, name: str) -> str:
-        """Return what to say of a name that no field has: the names that may have been meant, if there are any."""
+        """Return the error text for a name that no field has, with the names that may have been meant."""
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
         schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
@@ -206,16 +181,18 @@ class Definition(Generic[M_co]):
     def __reduce__(self) -> tuple[object, ...]:
         return attrgetter("DEFINITION"), (self.model,)
 
-    def _types_of(self, text: str, before: Mapping[str, Layout]) -> Mapping[str, FieldType]:
-        """Parse the fields of a layout, or its changes: `1.13, without a b, c: d e` has d and e behind c."""
+    def _types_of(self, text: str) -> Mapping[str, FieldType]:
+        """Return the fields of a layout, given its text."""
         base, *changes = (part.strip() for part in text.split(","))
-        if not changes:
-            return dict(map(self._field, text.split()))
-        fields = list(before[base].types.items())
+        same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
+        if same or base == "*":
+            fields = list((self._types_of(same.text) if same else self.types).items())
+        else:
+            fields = list(map(self._field, base.split()))
         for change in changes:
             if change.startswith("without "):
-                for gone in change.split()[1:]:
-                    fields.remove((gone, dict(fields)[gone]))
+                gone = change.split()[1:]
+                fields = [field for field in fields if field[0] not in gone]
             else:
                 after, _, names = change.partition(":")
                 place = [name for name, _ in fields].index(after) + 1
@@ -223,51 +200,110 @@ class Definition(Generic[M_co]):
         return dict(fields)
 
     def _field(self, text: str) -> tuple[str, FieldType]:
-        """Parse `name`, or `name:type` where the type is not the model's."""
+        """Return name and type of `name`, or of `name:type` where the type is not the model's."""
         name, _, kind = text.partition(":")
-        if kind:
-            return name, field_type(kind)
-        if name in self.types:
-            return name, self.types[name]
-        old = self._older[name]
-        base, index = old.new[0]
-        return name, old.type or (self.types[base] if index is None else FieldType(self.types[base].base))
+        if kind or name in self.types:
+            return name, field_type(kind) if kind else self.types[name]
+        old = self.older[name]
+        base, index = old.places[0]
+        return name, field_type(old.type or (str(self.types[base]) if index is None else self.types[base].base))
 
     def _down(self, name: str, kind: FieldType, values: Mapping[str, Any]) -> object:
         if self.types.get(name) is kind:
             return values[name]
         value = values.get(name, kind.absent)
-        if old := self._older.get(name):
-            base, index = old.new[0]
+        if old := self.older.get(name):
+            base, index = old.places[0]
             value = values[base] if index is None else values[base][index]
             value = old.down(value) if old.down else value
         least, greatest = kind.limits
         return value if kind.length or kind.is_float or least <= value <= greatest else kind.absent
 
-    def make_plan(self, names: Sequence[str]) -> Plan:
-        """Make what `plan` returns, and keeps."""
-        older = {name: self._older[name] for name in names if name in self._older}
-        direct: dict[str, str] = {name: name for name in names if name in self.types}
-        converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
-        parts: dict[str, list[str | None]] = {}
-        for name, old in older.items():
-            for base, index in old.new:
-                if base in direct or base in converted:
-                    continue
-                if index is not None:
-                    parts.setdefault(base, [None] * self.types[base].count)[index] = name
-                elif old.up:
-                    converted[base] = name, old.up
-                else:
-                    direct[base] = name
-        in_order = {name: direct[name] for name in self.types if name in direct}
-        return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
-
 
 @lru_cache(256)  # all messages of a stream have the same names
 def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
-    return definition.make_plan(names)
+    direct: dict[str, str] = {name: name for name in names if name in definition.types}
+    converted: dict[str, tuple[str, Callable[[Any], Any]]] = {}
+    parts: dict[str, list[str | None]] = {}
+    for old in (definition.older[name] for name in names if name in definition.older):
+        for base, index in old.places:
+            if base in direct or base in converted:
+                continue
+            if index is not None:
+                parts.setdefault(base, [None] * definition.types[base].count)[index] = old.name
+            elif old.up:
+                converted[base] = old.name, old.up
+            else:
+                direct[base] = old.name
+    in_order = {name: direct[name] for name in definition.types if name in direct}
+    return Plan(in_order, converted, {name: tuple(olds) for name, olds in parts.items()})
+
+
+def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
+    """Return the message with these fields of any PX4 release; arrays are tuples.
+
+    Known fields are used, by their present name, and unknown names are ignored.
+    A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
+
+    Raises pydantic.ValidationError for an invalid message.
+    """
+    return definition.model(**upgrade_fields(definition, fields))
+
+
+def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a message by their names in the model, as `upgrade` does, not validated yet."""
+    plan = definition.plan(fields)
+    upgraded = {name: fields[old] for name, old in plan.names.items()}
+    if plan.converted or plan.parts:
+        upgraded |= {name: _converted(convert, fields[old]) for name, (old, convert) in plan.converted.items()}
+        for name, olds in plan.parts.items():
+            upgraded[name] = tuple(NAN if old is None else fields[old] for old in olds)
+    return upgraded
+
+
+def _converted(convert: Callable[[Any], Any], value: object) -> object:
+    """Return a converted value; anything but a number stays as it is, for the model to reject."""
+    try:
+        return convert(value)
+    except (TypeError, OverflowError):
+        return value
+
+
+def require_fields(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> None:
+    """Raise LayoutError, with the missing and the unknown names, unless these are the layout's fields."""
+    given, wanted = set(fields), set(layout.types)
+    if given == wanted:
+        return
+    problems = [
+        f"{problem} {', '.join(sorted(names)[:5])}"
+        for problem, names in (("missing", wanted - given), ("unknown", given - wanted))
+        if names
+    ]
+    fitting = definition.find_layout(fields)
+    hint = f"; these are the fields of layout {fitting.name}" if fitting else ""
+    raise LayoutError(f"not the {len(wanted)} fields of layout {layout.name}: {'; '.join(problems)}{hint}")
 
 
 def _row(definition: Definition[Any], values: Values) -> Row:
     return tuple.__new__(definition.row, values)
+
+
+_messages: Final[dict[str, Definition[Any]]] = {}
+_topics: Final[dict[str, Topic]] = {}
+_by_topic: Final[dict[str, Definition[Any]]] = {}
+
+MESSAGES: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_messages)
+"""The definitions by name of the message: those with a file in `nedbus_msgs.messages`."""
+TOPICS: Final[Mapping[str, Topic]] = MappingProxyType(_topics)
+"""The topics of all messages by name."""
+BY_TOPIC: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_by_topic)
+"""The definition of the messages on each topic."""
+
+
+def register(definition: Definition[Any]) -> None:
+    """Make a message known; raise ValueError if another one has its name or one of its topics."""
+    if taken := [name for name in (definition.name, *definition.topics) if name in _messages or name in _topics]:
+        raise ValueError(f"{definition.name}: there is a message with {', '.join(taken)} already")
+    _messages[definition.name] = definition
+    for topic in definition.topics.values():
+        _topics[topic.name], _by_topic[topic.name] = topic, definition

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from .definition import Definition
-from .px4_types import FieldType, Uint64
-from .registry import register
+from .declaration import Layout, Older, Topic
+from .definition import Definition, register
+from .px4_types import FieldType, Timestamp
+from .rules import Rule, violations
 
 _M = TypeVar("_M", bound="Message")
-_PARTS: Final = ("LAYOUTS", "RULES", "WIRE", "OLDER", "ALIASES", "ALWAYS")
 _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 
 
 class Message(BaseModel):
-    """One message of one vehicle: a subclass in a file of `nedbus_msgs.messages` says which fields it has.
+    """One message of one vehicle; a subclass in a file of `nedbus_msgs.messages` declares its fields.
 
     A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
     bit for bit as it was made; a number beyond float32 (1e39) is rejected.
@@ -29,10 +29,17 @@ class Message(BaseModel):
     """
 
     model_config = ConfigDict(
-        frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings", defer_build=True, protected_namespaces=()
-    )
+        frozen=True, strict=True, extra="forbid", ser_json_inf_nan="strings", defer_build=True, protected_namespaces=(),
+        ignored_types=(int,),  # constants
+    )  # fmt: skip
+    TOPICS: ClassVar[Sequence[Topic]] = ()
+    LAYOUTS: ClassVar[Sequence[Layout]] = ()
+    OLDER: ClassVar[Sequence[Older]] = ()
+    RULES: ClassVar[Sequence[Rule]] = ()
+    ALWAYS: ClassVar[str] = "timestamp"
     DEFINITION: ClassVar[Definition[Any]]
-    timestamp: Uint64
+
+    timestamp: Timestamp = Field(description="Time since boot [us]")
 
     if not TYPE_CHECKING:
 
@@ -50,18 +57,16 @@ class Message(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Define the message, and make it known, if this class says what its topics are."""
+        """Define and register the message, if this class names its topics."""
         super().__pydantic_init_subclass__(**kwargs)
-        said = vars(cls)
-        if "TOPICS" in said:
-            parts = {name.lower(): said[name] for name in _PARTS if name in said}
-            cls.DEFINITION = Definition(cls, topics=said["TOPICS"], **parts)
+        if "TOPICS" in vars(cls):
+            cls.DEFINITION = Definition(cls)
             register(cls.DEFINITION)
 
     @model_validator(mode="wrap")
     @classmethod
     def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Validate, and where that fails once more with what NumPy and JSON have in place of Python's values."""
+        """Validate; if that fails, validate once more with values of NumPy and JSON converted to Python's."""
         try:
             return validate(fields)
         except ValidationError:
@@ -83,7 +88,7 @@ class Message(BaseModel):
         except OverflowError:
             raise self._error(validation.overflows(values)) from None
         if not validation.passes_rules(row):
-            broken = list(validation.violations(values))
+            broken = list(violations(self.DEFINITION.rules, values))
             if broken:
                 raise self._error(broken)
         return self

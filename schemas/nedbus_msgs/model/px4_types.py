@@ -1,16 +1,16 @@
-"""PX4's field types: one table of the base types, and each type as an annotation for Pydantic."""
+"""PX4's field types: a table of the base types, and each type as an annotation for Pydantic."""
 
 from __future__ import annotations
 
 import math
 import re
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import GetCoreSchemaHandler
+from pydantic import Field
 from pydantic_core import CoreSchema, core_schema
 
 NAN: Final = math.nan
@@ -94,10 +94,30 @@ class FieldType:
     @cached_property
     def annotation(self) -> Any:
         """The annotation of a field of this type."""
-        if self.length is not None:
-            return Annotated[tuple[(FieldType(self.base).annotation,) * self.length], Px4Type(str(self))]  # type: ignore[misc] # as many as it has
         value = bool if self.base == "bool" else float if self.is_float else int
-        return Annotated[value, Px4Type(self.base)]
+        python = value if self.length is None else tuple[(value,) * self.length]  # type: ignore[misc] # one for each
+        return Annotated[python, self, Field(default=self.absent)]
+
+    def core_schema(self, *, from_json: bool) -> CoreSchema:
+        """Return Pydantic's schema: integers have limits, and with `from_json` floats may be the names of NaN, ..."""
+        if self.length is not None:
+            return core_schema.tuple_positional_schema(
+                [FieldType(self.base).core_schema(from_json=from_json)] * self.length
+            )
+        if self.base == "bool":
+            return core_schema.bool_schema()
+        if not self.is_float:
+            least, greatest = self.limits
+            return core_schema.int_schema(ge=least, le=greatest)
+        number = core_schema.float_schema()
+        if not from_json:
+            return number
+        names = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
+        from_name = core_schema.no_info_after_validator_function(float, names)
+        return core_schema.json_or_python_schema(core_schema.union_schema([number, from_name]), number)
+
+    def __get_pydantic_core_schema__(self, source: object, handler: object) -> CoreSchema:
+        return self.core_schema(from_json=True)
 
 
 @cache
@@ -109,48 +129,30 @@ def field_type(text: str) -> FieldType:
     return FieldType(ALIASES.get(found[1], found[1]), None if found[2] is None else int(found[2]))
 
 
-class Px4Type:
-    """Mark a field with PX4's name of its type: integers have its limits, floats read "NaN" and "Infinity" in JSON."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
-        schema = handler(source)
-        if schema["type"] == "int":
-            least, greatest = field_type(self.name).limits
-            return core_schema.int_schema(ge=least, le=greatest)
-        if schema["type"] != "float":
-            return schema
-        names = core_schema.literal_schema(["NaN", "Infinity", "-Infinity"])
-        from_name = core_schema.no_info_after_validator_function(float, names)
-        return core_schema.json_or_python_schema(
-            json_schema=core_schema.union_schema([schema, from_name]), python_schema=schema
-        )
+def field(meaning: str) -> Any:
+    """Declare a field with its unit, frame and meaning; while it is not provided it is NaN, false or 0."""
+    return Field(description=meaning)
 
 
-Bool = Annotated[bool, Px4Type("bool")]
-Int8 = Annotated[int, Px4Type("int8")]
-Int32 = Annotated[int, Px4Type("int32")]
-Int64 = Annotated[int, Px4Type("int64")]
-Uint8 = Annotated[int, Px4Type("uint8")]
-Uint16 = Annotated[int, Px4Type("uint16")]
-Uint32 = Annotated[int, Px4Type("uint32")]
-Uint64 = Annotated[int, Px4Type("uint64")]
-Float64 = Annotated[float, Px4Type("float64")]
-Float32 = Annotated[float, Px4Type("float32")]
-Float32x2 = Annotated[tuple[Float32, Float32], Px4Type("float32[2]")]
-Float32x3 = Annotated[tuple[Float32, Float32, Float32], Px4Type("float32[3]")]
-Float32x4 = Annotated[tuple[Float32, Float32, Float32, Float32], Px4Type("float32[4]")]
+Timestamp = Annotated[int, field_type("uint64")]
+"""The time of a message, its only field that is required."""
+Bool = Annotated[bool, field_type("bool"), Field(default=False)]
+Int8 = Annotated[int, field_type("int8"), Field(default=0)]
+Int32 = Annotated[int, field_type("int32"), Field(default=0)]
+Int64 = Annotated[int, field_type("int64"), Field(default=0)]
+Uint8 = Annotated[int, field_type("uint8"), Field(default=0)]
+Uint16 = Annotated[int, field_type("uint16"), Field(default=0)]
+Uint32 = Annotated[int, field_type("uint32"), Field(default=0)]
+Uint64 = Annotated[int, field_type("uint64"), Field(default=0)]
+Float64 = Annotated[float, field_type("float64"), Field(default=NAN)]
+Float32 = Annotated[float, field_type("float32"), Field(default=NAN)]
+Float32x2 = Annotated[tuple[float, float], field_type("float32[2]"), Field(default=(NAN,) * 2)]
+Float32x3 = Annotated[tuple[float, float, float], field_type("float32[3]"), Field(default=(NAN,) * 3)]
+Float32x4 = Annotated[tuple[float, float, float, float], field_type("float32[4]"), Field(default=(NAN,) * 4)]
 Float32x14 = Annotated[
     tuple[
-        Float32, Float32, Float32, Float32, Float32, Float32, Float32,
-        Float32, Float32, Float32, Float32, Float32, Float32, Float32,
+        float, float, float, float, float, float, float,
+        float, float, float, float, float, float, float,
     ],
-    Px4Type("float32[14]"),
+    field_type("float32[14]"), Field(default=(NAN,) * 14),
 ]  # fmt: skip
-
-
-def type_of_marks(marks: Iterable[object]) -> FieldType:
-    """Return the type that a field is marked with."""
-    return field_type(next(mark.name for mark in marks if isinstance(mark, Px4Type)))

@@ -15,10 +15,10 @@ from typing import Any, Final, cast
 from pydantic import ValidationError
 from pydantic_core import CoreConfig, SchemaValidator, core_schema
 
-from .px4_types import FieldType
-from .rules import Rule, passes_all
+from .px4_types import BASES, FieldType
+from .rules import Rule, evaluated, passes_all
 
-FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+_FLOAT32_MAX: Final = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 Values = tuple[object, ...]
 """The values of all fields of a message, in its order."""
@@ -30,33 +30,30 @@ class Validation:
     `passes_rules`: return whether the values of all fields, which have the right types, pass the rules.
     `template`: the names of all fields, for a copy that is filled: that takes less time than a dict that grows.
     `values_of`: return the values of all fields in their order from a mapping that has them.
+    `validate`: return the values of all fields; raise pydantic.ValidationError for a wrong type.
+    `flatten`: return the values of a row with those of its arrays in their place, as struct packs them; `unflatten`
+    returns them as a row.
     """
 
     def __init__(self, types: Mapping[str, FieldType], rules: Sequence[Rule]) -> None:
-        names = tuple(types)
+        names, kinds = tuple(types), types.values()
         self.passes_rules = passes_all(rules, lambda name: f"values[{names.index(name)}]")
-        self.values_of = getter(names)
-        self._types, self._rules = types, rules
-        self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
-        tuples = core_schema.tuple_positional_schema([_schema(kind) for kind in types.values()])
-        self._validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
-        self.template: dict[str, object] = dict.fromkeys(names)
-        self._singles = tuple(name for name, kind in types.items() if str(kind) == "float32")
-        self._arrays = tuple(name for name, kind in types.items() if kind.base == "float32" and kind.length)
-        self._others = tuple(name for name, kind in types.items() if kind.base != "float32")
-        self._get_singles, self._get_arrays, self._get_others = (
-            getter([names.index(name) for name in part]) for part in (self._singles, self._arrays, self._others)
+        self.values_of: Callable[[Any], Values] = (
+            itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         )
-        self._slices, end = list[tuple[str, slice]](), len(self._singles)
-        for name in self._arrays:
-            self._slices.append((name, slice(end, end + types[name].count)))
-            end += types[name].count
-        self._floats = struct.Struct(f"<{end}f")
+        self.template: dict[str, object] = dict.fromkeys(names)
+        self._types = types
+        self._defaults = {name: kind.absent for name, kind in types.items() if name != "timestamp"}
+        # Not the schema of the model: Pydantic takes 20 ms for all messages, in which it swallows a Ctrl-C.
+        tuples = core_schema.tuple_positional_schema([kind.core_schema(from_json=False) for kind in kinds])
+        self.validate = SchemaValidator(tuples, CoreConfig(strict=True)).validate_python
+        self._struct = struct.Struct("=" + "".join(f"{kind.count}{BASES[kind.base].code}" for kind in kinds))
+        self.flatten, self.unflatten = _flat_forms([kind.length for kind in kinds])
 
     def check_row(self, values: Values) -> Values | None:
         """Return the values of all fields, validated but not rounded; None if the model has to decide."""
         try:
-            row: Values = self._validate(values)
+            row: Values = self.validate(values)
         except ValidationError:
             return None
         return row if self.passes_rules(row) else None
@@ -72,16 +69,14 @@ class Validation:
             return None
         try:
             return self.check_row(self.values_of(fields))
-        except KeyError:  # no timestamp, and another name among as many
+        except KeyError:  # an unknown field in place of a missing one
             return None
 
     def validate_fields(self, fields: Mapping[str, object]) -> dict[str, object] | None:
         """Return all fields in their order, validated and rounded to float32; None if the model has to decide."""
         row = self.row_of(fields)
-        if row is None:
-            return None
         try:
-            return self.name_rounded(row)
+            return None if row is None else self.name_rounded(row)
         except OverflowError:
             return None
 
@@ -93,44 +88,27 @@ class Validation:
 
     def name_rounded(self, row: Values) -> dict[str, object]:
         """Return the values of all fields by name, float32 fields rounded; raise OverflowError beyond their range."""
-        flat = self._get_singles(row)
-        for array in self._get_arrays(row):
-            flat += cast("Values", array)
-        floats = self._floats.unpack(self._floats.pack(*flat))
-        values = self.template.copy()
-        values.update(zip(self._singles, floats, strict=False))  # those of the arrays follow
-        values.update(zip(self._others, self._get_others(row), strict=True))
-        for name, place in self._slices:
-            values[name] = floats[place]
-        return values
+        packed = self._struct.pack(*self.flatten(row))
+        return self.name(self.unflatten(self._struct.unpack(packed)))
 
     def overflows(self, values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         """Yield the field and the reason for every number that is beyond the range of its float32 field."""
-        for name in (name for name in self._types if name in (*self._singles, *self._arrays)):
-            for number in values[name] if self._types[name].length else (values[name],):
-                if math.isfinite(number) and abs(number) > FLOAT32_MAX:
-                    yield name, f"is beyond the range of float32 (+-{FLOAT32_MAX:.9g})"
-
-    def violations(self, values: Mapping[str, object]) -> Iterator[tuple[str, str]]:
-        """Yield the field and the reason for every rule that the values of all fields violate."""
-        for rule in self._rules:
-            yield from rule.violations(values)
+        for name, kind in self._types.items():
+            for number in (values[name] if kind.length else (values[name],)) if kind.base == "float32" else ():
+                if math.isfinite(number) and abs(number) > _FLOAT32_MAX:
+                    yield name, f"is beyond the range of float32 (+-{_FLOAT32_MAX:.9g})"
 
 
-def _schema(kind: FieldType) -> core_schema.CoreSchema:
-    """Return the schema of an annotation, made here: Pydantic takes 20 ms for all, in which it swallows a Ctrl-C."""
-    if kind.length is not None:
-        return core_schema.tuple_positional_schema([_schema(FieldType(kind.base))] * kind.length)
-    if kind.base == "bool":
-        return core_schema.bool_schema()
-    if kind.is_float:
-        return core_schema.float_schema()
-    least, greatest = kind.limits
-    return core_schema.int_schema(ge=least, le=greatest)
-
-
-def getter(keys: Sequence[Any]) -> Callable[[Any], Values]:
-    """Return an `itemgetter` that returns a tuple for one key, and for none, as well."""
-    if len(keys) > 1:
-        return cast("Callable[[Any], Values]", itemgetter(*keys))
-    return lambda source: tuple(source[key] for key in keys)
+def _flat_forms(lengths: Sequence[int | None]) -> tuple[Callable[[Values], Values], Callable[[Values], Values]]:
+    """Return functions from the values of a row to a flat tuple, and back, given the length of each array."""
+    flat, nested, index, place = [], [], 0, 0  # the first value, and its place in the flat tuple, behind the last array
+    for position, length in enumerate(lengths):
+        if length is not None:
+            start = place + position - index
+            flat += [f"*row[{index}:{position}]", f"*row[{position}]"]
+            nested += [f"*row[{place}:{start}]", f"row[{start}:{start + length}]"]
+            index, place = position + 1, start + length
+    if not flat:
+        return tuple, tuple
+    functions = [f"lambda row: ({', '.join(parts)}, *row[{end}:])" for parts, end in ((flat, index), (nested, place))]
+    return cast("tuple[Any, Any]", tuple(map(evaluated, functions)))

@@ -1,4 +1,4 @@
-"""PX4's .msg files: fields with their types, units, ranges and meanings, and what is wrong with a text that is none."""
+"""Parser of PX4's .msg files: fields with their types, units, ranges and meanings; errors have line and column."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MsgField:
 
 
 def read_msg(text: str) -> list[MsgField]:
-    """Return the fields of a .msg file, in order, without its constants; MsgError for what is none.
+    """Return the fields of a .msg file, in order, without its constants; raise MsgError for another text.
 
     Messages within it follow it as in ROS 2 and MCAP, behind a line of = and one of `MSG: package/Name`: their fields
     are those of the message, `current_lat`, `esc_0_esc_rpm`.
@@ -56,7 +56,7 @@ def read_msg(text: str) -> list[MsgField]:
 
 @lru_cache(256)  # its codecs are kept with it
 def define_msg(name: str, text: str) -> Definition[Message]:
-    """Return the message that a .msg file describes, range-checked as it is annotated; MsgError for what is none."""
+    """Return the message of a .msg file, range-checked by its annotations; raise MsgError for another text."""
     fields = read_msg(text)
     try:
         return define(
@@ -74,7 +74,7 @@ def hash_of_msg(name: str, text: str) -> str:
     parts = _parts(text)
     described = {part: [_describe(line, parts) for line in lines] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines} & parts.keys())
-    return type_hash(f"{PACKAGE}/{name}", described[""], [(f"{PACKAGE}/{each}", described[each]) for each in used])
+    return type_hash(*((f"{PACKAGE}/{each or name}", described[each]) for each in ["", *used]))
 
 
 def bases_of_msg(text: str) -> set[str]:

@@ -9,9 +9,8 @@ from hashlib import sha256
 from typing import Any, Final
 
 from nedbus_msgs.model.declaration import Layout
-from nedbus_msgs.model.definition import Definition
+from nedbus_msgs.model.definition import MESSAGES, Definition
 from nedbus_msgs.model.px4_types import BASES, FieldType
-from nedbus_msgs.model.registry import MESSAGES
 
 PACKAGE: Final = "px4_msgs/msg"
 ARRAY: Final = 48  # of type_description_interfaces/msg/FieldType, for an array of fixed size
@@ -38,39 +37,38 @@ def ros2_types() -> Mapping[str, Definition[Any]]:
     """Return the message of each ROS 2 type that holds a known one; PX4's translation node has types of its own."""
     types = {ros2_type(definition): definition for definition in MESSAGES.values()}
     for definition in MESSAGES.values():
-        types |= {alias: definition for names in definition.aliases.values() for alias in names}
+        types |= {alias: definition for layout in definition.layouts.values() for alias in layout.aliases}
     return types
 
 
 def hash_of(layout: Layout, ros2_type: str) -> str:
     """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016): `RIHS01_`, 64 hex digits."""
-    return type_hash(ros2_type, [described(name, kind) for name, kind in layout.types.items()])
+    return type_hash((ros2_type, [described(name, kind) for name, kind in layout.types.items()]))
 
 
-def type_hash(name: str, fields: Sequence[Described], within: Sequence[tuple[str, Sequence[Described]]] = ()) -> str:
-    """Return the RIHS01 hash of a type with these fields, and of the types within it, sorted by name."""
-    content = {
-        "type_description": _description(name, fields),
-        "referenced_type_descriptions": [_description(*each) for each in within],
-    }
+def type_hash(*types: tuple[str, Sequence[Described]]) -> str:
+    """Return the RIHS01 hash of a type, of its name and its fields, given with the types within it, sorted by name."""
+    whole, *within = [
+        {
+            "type_name": type_name,
+            "fields": [
+                {
+                    "name": name,
+                    "type": {"type_id": kind, "capacity": capacity, "string_capacity": 0, "nested_type_name": nested},
+                }
+                for name, kind, capacity, nested in fields
+            ],
+        }
+        for type_name, fields in types
+    ]
+    content = {"type_description": whole, "referenced_type_descriptions": within}
     return _RIHS01 + sha256(json.dumps(content).encode()).hexdigest()
 
 
 def described(name: str, kind: FieldType) -> Described:
-    """Return how a type description has a field."""
+    """Return a field as a type description has it."""
     capacity = kind.length or 0
     return name, BASES[kind.base].ros2 + (ARRAY if capacity else 0), capacity, ""
-
-
-def _description(name: str, fields: Sequence[Described]) -> dict[str, object]:
-    listed = [
-        {
-            "name": field,
-            "type": {"type_id": kind, "capacity": capacity, "string_capacity": 0, "nested_type_name": nested},
-        }
-        for field, kind, capacity, nested in fields
-    ]
-    return {"type_name": name, "fields": listed}
 
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:
@@ -90,5 +88,5 @@ def _by_hash() -> Mapping[str, tuple[Definition[Any], Layout]]:
         hash_of(layout, name).removeprefix(_RIHS01): (definition, layout)
         for definition in MESSAGES.values()
         for layout in definition.layouts.values()
-        for name in (ros2_type(definition), *definition.aliases.get(layout.name, ()))
+        for name in (ros2_type(definition), *layout.aliases)
     }

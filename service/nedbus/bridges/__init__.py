@@ -1,4 +1,4 @@
-"""Bridges: what is on a bus, for ROS 2 nodes and for Foxglove, while it arrives."""
+"""Bridges: live streams of a bus for ROS 2 nodes and for Foxglove."""
 
 from __future__ import annotations
 

@@ -10,14 +10,14 @@ Vehicles with different origins share the frame `map`, whose origin is that of t
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel, LocationFixChannel, PoseInFrameChannel
-from foxglove.messages import Quaternion
+from foxglove.messages import Quaternion, Vector3
 
 from nedbus.client import Bus, Sample
 from nedbus.errors import ListenError, NoDataError
@@ -38,31 +38,30 @@ from .foxglove_messages import MapFrame, has_position, orientation_of, to_locati
 
 _ATTITUDE: Final = "vehicle_attitude"
 _POLL: Final = 1.0  # s between two queries for the addresses that are published
-_HINT: Final = "choose another address with --http"
 
 
 class FoxgloveServer:
-    """Serve what is on a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
+    """Serve the streams of a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
 
     Fields are encoded only for channels with a subscriber; a client that is too slow misses the oldest messages.
 
-    Raises ListenError when the port is in use.
+    Raises ListenError when the address cannot be listened on.
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[Address, foxglove.Channel] = {}
-        self._unseen: dict[Address, tuple[Message, int]] = {}  # the last of what has no rate, until a client subscribes
-        self._poses: dict[str, PoseInFrameChannel] = {}
-        self._locations: dict[str, LocationFixChannel] = {}
+        # The last messages of streams without a rate, until a client subscribes.
+        self._unseen: dict[Address, tuple[Message, int]] = {}
+        self._vehicles: dict[str, _Vehicle] = {}
         self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
         self._map = MapFrame()
-        _require_free(host, port)
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
-        except RuntimeError as exc:
-            raise ListenError([f"ws://{host}:{port}"], "it is in use", hint=_HINT) from exc
+        except RuntimeError as exc:  # "...: Address already in use (os error 98)"
+            reason = str(exc).rpartition(": ")[2].partition(" (os error")[0].lower()
+            raise ListenError([f"ws://{host}:{port}"], reason, hint="choose another address with --http") from exc
         self._transforms = FrameTransformsChannel("/tf", context=self._context)
         self.url = f"ws://{host}:{self._server.port}"
 
@@ -119,19 +118,21 @@ class FoxgloveServer:
             self._unseen[address] = message, time_ns  # it may never come again
 
     def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
-        if vehicle not in self._poses:
-            self._poses[vehicle] = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
-            self._locations[vehicle] = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+        shown = self._vehicles.get(vehicle)
+        if shown is None:
+            pose = PoseInFrameChannel(f"/{vehicle}/pose", context=self._context)
+            location = LocationFixChannel(f"/{vehicle}/location", context=self._context)
+            shown = self._vehicles[vehicle] = _Vehicle(pose, location)
         if has_position(message):
             x, y, z, w = orientation_of(message, self._attitudes.get(vehicle))
             orientation = Quaternion(x=x, y=y, z=z, w=w)
-            self._poses[vehicle].log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
-            local_in_map = self._map.locate(vehicle, message)
-            transforms = to_transforms(vehicle, message, orientation, local_in_map=local_in_map, time_ns=time_ns)
+            shown.pose.log(to_pose(vehicle, message, orientation, time_ns=time_ns), log_time=time_ns)
+            local = shown.local_in_map = self._map.locate(message) or shown.local_in_map
+            transforms = to_transforms(vehicle, message, orientation, local_in_map=local, time_ns=time_ns)
             self._transforms.log(transforms, log_time=time_ns)
-        location = to_location(vehicle, message, time_ns=time_ns)
-        if location is not None:
-            self._locations[vehicle].log(location, log_time=time_ns)
+        fix = to_location(vehicle, message, time_ns=time_ns)
+        if fix is not None:
+            shown.location.log(fix, log_time=time_ns)
 
     def _close_unpublished(self) -> None:
         """Close the channels of addresses that are no longer published."""
@@ -144,18 +145,16 @@ class FoxgloveServer:
             if address.topic == _ATTITUDE:
                 self._attitudes.pop(address.vehicle, None)
         vehicles = {address.vehicle for address in published if address.topic == DEFAULT_TOPIC}
-        for vehicle in self._poses.keys() - vehicles:
-            self._poses.pop(vehicle).close()
-            self._locations.pop(vehicle).close()
-            self._map.forget(vehicle)
+        for name in self._vehicles.keys() - vehicles:
+            vehicle = self._vehicles.pop(name)
+            vehicle.pose.close()
+            vehicle.location.close()
 
 
-def _require_free(host: str, port: int) -> None:
-    """Raise ListenError unless the port can be listened on: the SDK does not report the reason."""
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-    except OSError as exc:
-        raise ListenError([f"ws://{host}:{port}"], (exc.strerror or str(exc)).lower(), hint=_HINT) from exc
+@dataclass(slots=True)
+class _Vehicle:
+    """The channels of a vehicle, and the last known translation of its local frame in the map."""
+
+    pose: PoseInFrameChannel
+    location: LocationFixChannel
+    local_in_map: Vector3 = field(default_factory=lambda: Vector3(x=0.0, y=0.0, z=0.0))

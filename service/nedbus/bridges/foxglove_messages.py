@@ -29,28 +29,18 @@ class MapFrame:
     def __init__(self) -> None:
         self._projection: MapProjection | None = None
         self._altitude = math.nan
-        self._located: dict[str, tuple[tuple[float, float, float], Vector3]] = {}  # by vehicle: origin, translation
 
-    def locate(self, vehicle: str, message: VehicleLocalPosition) -> Vector3:
-        """Return the translation of a vehicle's local frame in the map, ENU in metres; zero without a global origin."""
-        origin = (message.ref_lat, message.ref_lon, message.ref_alt)
-        if vehicle in self._located and self._located[vehicle][0] == origin:
-            return self._located[vehicle][1]
+    def locate(self, message: VehicleLocalPosition) -> Vector3 | None:
+        """Return the translation of a vehicle's local frame, ENU in metres; None without a global origin."""
         if not message.xy_global:
-            return Vector3(x=0.0, y=0.0, z=0.0)
+            return None
         if self._projection is None:
             self._projection = MapProjection(message.ref_lat, message.ref_lon)
         if math.isnan(self._altitude) and message.z_global:
             self._altitude = message.ref_alt
         north, east = self._projection.project(message.ref_lat, message.ref_lon)
         up = message.ref_alt - self._altitude
-        translation = Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
-        self._located[vehicle] = origin, translation
-        return translation
-
-    def forget(self, vehicle: str) -> None:
-        """Drop what is known of a vehicle that is no longer published."""
-        self._located.pop(vehicle, None)
+        return Vector3(x=east, y=north, z=up if math.isfinite(up) else 0.0)
 
 
 def has_position(message: VehicleLocalPosition) -> bool:

@@ -1,4 +1,4 @@
-"""Publish what is on a bus to ROS 2: CDR over rmw_zenoh, in the layout of the workspace."""
+"""Publish the streams of a bus to ROS 2: CDR over rmw_zenoh, in the layout of the workspace."""
 
 from __future__ import annotations
 
@@ -63,15 +63,14 @@ _VISIBLE_TIMEOUT: Final = 5.0  # s after which a token is visible to other sessi
 class Ros2Bridge:
     """Publish addresses of a bus to ROS 2, for nodes that use rmw_zenoh on the router of `session`.
 
-    `ros2 topic list` shows each topic for as long as its vehicle is published, as `/fmu/out/<topic>`, with a namespace
-    before it for every vehicle but `plain`: that of `namespaces`, else the vehicle's name, or `px4_<name>` where ROS 2
-    requires a leading letter.
-    Instances are `estimator_local_position_0`, `_1` and so on; `battery_status` and others of PX4's default have none
-    for the first.
+    `ros2 topic list` shows each topic for as long as its vehicle is published, as `/fmu/out/<topic>` with a namespace
+    before it (`Ros2Arbiter`). Instances are `estimator_local_position_0`, `_1` and so on; `battery_status` and others
+    of PX4's default have none for the first.
     A topic that another node publishes is left to that node: a PX4 that speaks Zenoh itself is not published twice.
-    `selection` is what to publish, all addresses without it.
+
+    `selection`: the addresses to publish, all without it; `layout`: a release of PX4, or a layout.
     `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
-    `observer` is another session at the same router, to see what others see: access control denies in silence.
+    `observer`: another session at the same router, to notice access control, which denies silently.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -86,7 +85,6 @@ class Ros2Bridge:
         layout: str = RELEASES[-1],
         domain: int = 0,
         hashed: bool = True,
-        plain: str = "1",
         namespaces: Mapping[str, str] | None = None,
     ) -> None:
         known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
@@ -104,13 +102,13 @@ class Ros2Bridge:
             if (found := definition.layout_of_release(layout))
         }  # that the workspace has
         self._node = f"nedbus_{os.getpid()}"
-        self._arbiter = Ros2Arbiter(plain=plain, namespaces=namespaces or {})
+        self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
-        self._withdrawn: dict[Address, float] = {}  # since when; what is late of them is still known
+        self._withdrawn: dict[Address, float] = {}  # since when [s]; the late filter still knows their clocks
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
         self._left_out: set[Address] = set()
-        self._held: dict[Address, Sample[Any]] = {}  # the last of what has no rate, until its topic is published
+        self._held: dict[Address, Sample[Any]] = {}  # the last of streams without a rate, until published
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
@@ -124,14 +122,13 @@ class Ros2Bridge:
         try:
             if self._observer is not None:
                 self._require_visible(self._observer, key, stop)
-            # What was published before must not reach ROS 2 as the current estimate.
+            # Messages from before must not reach ROS 2 as the current estimate.
             self._late_filter = LateFilter(self._bus.latest(ANY))
             with self._bus.subscribe_to(self._selection, mode="every") as subscription:
                 self._forward(subscription, stop)
         finally:
-            for publisher in self._publishers.values():
-                publisher.close()
-            self._publishers.clear()
+            for address in list(self._publishers):
+                self._close(address)
             token.undeclare()
 
     def _require_visible(self, observer: Session, token: str, stop: threading.Event) -> None:
@@ -157,7 +154,7 @@ class Ros2Bridge:
                 sample = subscription.receive(0.1)
             except NoDataError:
                 continue
-            # What has no rate holds until the next one comes, however old it is.
+            # A message of a stream without a rate holds until the next one comes, however old it is.
             has_rate = get_topic(sample.topic).rate > 0
             if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
                 continue
@@ -167,15 +164,14 @@ class Ros2Bridge:
                 self._held[sample.address] = sample
 
     def _poll(self) -> None:
-        """Say what was held back, query what is on the bus and in ROS 2, and do what the arbiter decides."""
+        """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
         held_back = self._late_filter.report()
         if held_back:
             _log.warning("%s: ROS 2 would use them as the current estimate", held_back, extra=about("held-back"))
-        for address, since in list(self._withdrawn.items()):
-            if time.monotonic() - since > _MAX_ABSENCE:
-                del self._withdrawn[address]
-                self._held.pop(address, None)
-                self._late_filter.forget(address)
+        for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
+            del self._withdrawn[address]
+            self._held.pop(address, None)
+            self._late_filter.forget(address)
         published = [address for addresses in self._bus.vehicles().values() for address in addresses]
         addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
@@ -187,7 +183,6 @@ class Ros2Bridge:
 
     def _apply(self, decision: Decision) -> None:
         address, topic, other = decision.address, decision.topic, decision.other
-        conflict = about("conflict", address)
         if decision.action == "publish":
             self._open(address)
             self._withdrawn.pop(address, None)
@@ -196,17 +191,15 @@ class Ros2Bridge:
             _log.info("%s -> /%s, %s of layout %s", address, topic, name, layout.name, extra=about("bridged", address))
             if address in self._held:
                 self._put(self._held.pop(address))
-            return
-        if decision.action == "conflict":
+        elif decision.action == "conflict":
             text = "%s is not published: %s has the topic /%s already: set --namespace"
-            _log.warning(text, address, other, topic, extra=conflict)
-            return
-        if address in self._publishers:
-            self._publishers.pop(address).close()
-        if decision.action == "defer":
+            _log.warning(text, address, other, topic, extra=about("conflict", address))
+        elif decision.action == "defer":
+            self._close(address)
             text = "%s: node %s publishes /%s already: left to that node"
-            _log.warning(text, address, other, topic, extra=conflict)
+            _log.warning(text, address, other, topic, extra=about("conflict", address))
         else:
+            self._close(address)
             # After a router's restart it is back in a moment, and with it come the messages of the outage.
             self._withdrawn[address] = time.monotonic()
             text = "%s is no longer published: /%s is withdrawn"
@@ -231,6 +224,11 @@ class Ros2Bridge:
             declared = self._session.liveliness().declare_token(token)
         self._publishers[address] = _Ros2Publisher(gid_of_token(token), publisher, declared)
 
+    def _close(self, address: Address) -> None:
+        if publisher := self._publishers.pop(address, None):
+            publisher.token.undeclare()
+            publisher.publisher.undeclare()
+
     def _put(self, sample: Sample[Message]) -> None:
         publisher = self._publishers[sample.address]
         definition, layout, _ = self._types[sample.topic]
@@ -245,7 +243,7 @@ class Ros2Bridge:
         return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(ros2_type(definition)), type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether an address is wanted, and ROS 2 can have it: the workspace has its message."""
+        """Return whether an address is selected, and the workspace has its message."""
         if not self._selection.matches(address):
             return False
         if address.topic in self._types:
@@ -253,7 +251,7 @@ class Ros2Bridge:
         if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
             self._left_out.add(address)
             known = address.topic in BY_TOPIC
-            reason = f"PX4 {self._layout} has no such message" if known else "nothing says what it is in px4_msgs"
+            reason = f"PX4 {self._layout} has no such message" if known else "its message in px4_msgs is not known"
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
         return False
 
@@ -270,7 +268,3 @@ class _Ros2Publisher:
     publisher: zenoh.Publisher
     token: zenoh.LivelinessToken
     sequence: int = 0
-
-    def close(self) -> None:
-        self.token.undeclare()
-        self.publisher.undeclare()

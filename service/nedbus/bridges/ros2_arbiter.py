@@ -18,7 +18,7 @@ _NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*|")
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One change of what is published to ROS 2; `topic` has no leading slash.
+    """One change of the topics of ROS 2; `topic` has no leading slash.
 
     `publish`: publish the address.
     `withdraw`: the address is no longer on the bus; stop publishing it.
@@ -33,19 +33,19 @@ class Decision:
 
 
 class Ros2Arbiter:
-    """Follow what is on the bus and in ROS 2, and decide what changes.
+    """Follow the addresses of the bus and the nodes of ROS 2, and decide the changes.
 
-    A namespace stands before the topics of every vehicle but `plain`: that of `namespaces`, else the vehicle's name, or
+    A namespace stands before the topics of every vehicle but "1": that of `namespaces`, else the vehicle's name, or
     `px4_<name>` where ROS 2 requires a leading letter.
 
     Raises AddressError for a namespace that is invalid in ROS 2.
     """
 
-    def __init__(self, *, plain: str, namespaces: Mapping[str, str]) -> None:
+    def __init__(self, namespaces: Mapping[str, str]) -> None:
         for namespace in namespaces.values():
             if not _NAMESPACE.fullmatch(namespace.strip("/")):
                 raise AddressError("namespace", namespace, "a letter, then letters, digits and _, with / between names")
-        self._namespaces = {plain: "", **namespaces}
+        self._namespaces = {"1": "", **namespaces}
         self._published: dict[Address, str] = {}
         self._deferred: dict[Address, float] = {}  # when another node's publisher was seen last
         self._conflicts: set[Address] = set()
@@ -61,7 +61,7 @@ class Ros2Arbiter:
     def update(
         self, addresses: Collection[Address], other_nodes: Mapping[Address, str], *, now: float
     ) -> list[Decision]:
-        """Return what changes, with these addresses on the bus, and the nodes that publish the topics of some of them.
+        """Return the changes, with these addresses on the bus, and the nodes that publish the topics of some of them.
 
         `now` is in seconds, of any monotonic clock.
         """

@@ -3,16 +3,12 @@
 import atexit
 import gc
 import os
-import resource
 import signal
 import sys
-from typing import Final
 
 from nedbus import __version__
 
 __all__ = ["main"]
-
-_FILES: Final = 64  # that a process needs to open at once, and some more
 
 
 def main() -> None:
@@ -23,12 +19,8 @@ def main() -> None:
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
         sys.stdout.write(f"nedbus {__version__}\n")  # at once: the imports below take longer
         return
-    allowed, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if allowed != resource.RLIM_INFINITY and allowed < _FILES:  # Zenoh would abort the process
-        sys.stderr.write(f"nedbus: only {allowed} open files are allowed: set 'ulimit -n {_FILES}' or more\n")
-        sys.exit(1)
     atexit.register(_give_up_stderr)
-    gc.disable()  # to look for garbage while everything is imported takes a sixth of the time, and finds none
+    gc.disable()  # collections take a sixth of the time of the imports, and find nothing
     from .app import app
 
     gc.enable()
@@ -36,7 +28,7 @@ def main() -> None:
 
 
 def _fill_closed_streams() -> None:
-    """Open the null device where a standard stream is closed: a socket in its place would get what is written there."""
+    """Open the null device in place of closed standard streams: a socket with their number would get their output."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -45,7 +37,7 @@ def _fill_closed_streams() -> None:
 
 
 def _give_up_stderr() -> None:
-    """Let go what a terminal that is gone did not take: Python would try once more, and exit with 120."""
+    """Discard stderr if its terminal is gone: Python would flush it again at exit, and exit with 120."""
     try:
         sys.stderr.flush()
     except OSError:

@@ -9,8 +9,7 @@ import typer
 from nedbus import __version__
 
 from .commands.bridges import export, foxglove, ros2, web
-from .commands.check import check
-from .commands.doctor import doctor
+from .commands.doctor import check, doctor
 from .commands.echo import echo
 from .commands.events import events, why
 from .commands.files import convert, plot, record

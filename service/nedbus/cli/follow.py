@@ -16,9 +16,7 @@ from .output.streams import write_stderr
 _log = logging.getLogger("nedbus")
 
 SILENCE_TIMEOUT: Final = 2.0
-"""Time without a first sample after which stderr says so [s]."""
-
-_LINK_INTERVAL: Final = 0.5  # s between two checks of the link
+"""Time without a first sample after which stderr reports it [s]."""
 
 
 def follow(
@@ -32,28 +30,26 @@ def follow(
 ) -> None:
     """Handle samples until there were `count`, or for `duration` [s]; raise NoDataError if there were none.
 
-    `handle` returns whether a sample counts.
+    `handle` returns whether a sample counts. The link is checked once a second, before `each_second` is called.
     """
     start = time.monotonic()
     end = float("inf") if duration is None else start + duration
-    next_second, next_check = start + 1.0, start
+    next_second = start + 1.0
     connected, noticed, seen = True, False, 0
     while (now := time.monotonic()) < end and (count is None or seen < count):
-        if now >= next_check:
-            next_check = now + _LINK_INTERVAL
-            was, connected = connected, bus.connected
-            if was != connected:
+        if now >= next_second:
+            next_second = max(next_second + 1.0, now)
+            if connected != bus.connected:
+                connected = not connected
                 text = "the link to %s is back" if connected else "the link to %s is broken: waiting for it"
                 event = "link-back" if connected else "link-broken"
                 _log.warning(text, " or ".join(bus.routers), extra=about(event))
-        if now >= next_second:
             each_second()
-            next_second = max(next_second + 1.0, now)
         if not seen and not noticed and now > start + SILENCE_TIMEOUT:
             noticed = True
             write_notice(subscription)
         try:
-            sample = subscription.receive(max(0.0, min(end, next_second, next_check) - now))
+            sample = subscription.receive(max(0.0, min(end, next_second) - now))
         except NoDataError:
             continue
         seen += handle(sample)
@@ -63,5 +59,5 @@ def follow(
 
 
 def write_notice(subscription: Subscription) -> None:
-    """Tell a person that nothing has arrived on a subscription so far."""
+    """Report on stderr that nothing has arrived on a subscription so far."""
     write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")

@@ -7,8 +7,8 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from types import FrameType
 from typing import Final
 
@@ -22,10 +22,7 @@ _END_TIMEOUT: Final = 1.6  # s after a signal by which the process has ended
 
 
 def _ignore_hangup() -> None:
-    _log.info(
-        "SIGHUP is ignored: settings are read at the start, and SIGTERM or Ctrl-C ends this process",
-        extra=about("reload"),
-    )
+    _log.info("SIGHUP is ignored: SIGTERM or Ctrl-C ends this process", extra=about("reload"))
 
 
 def run_until_stopped(
@@ -44,15 +41,15 @@ def run_until_stopped(
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
     stop = threading.Event()
-    outcome: list[object] = []
+    outcome: Future[object] = Future()
     signals: list[int] = []
     hangups: list[int] = []
 
     def run() -> None:
         try:
-            outcome.append(body(stop))
+            outcome.set_result(body(stop))
         except BaseException as exc:  # noqa: BLE001 - raised again below, in the main thread
-            outcome.append(exc)
+            outcome.set_exception(exc)
 
     def on_signal(number: int, _: FrameType | None) -> None:
         if signals:
@@ -74,19 +71,14 @@ def run_until_stopped(
         thread.join(0.1)
     if signals:
         _log.info("ending: %s", signal.Signals(signals[0]).name, extra=about("ending"))
-    deadline = time.monotonic() + _END_TIMEOUT
-    while thread.is_alive() and time.monotonic() < deadline:
-        thread.join(0.05)
+    thread.join(_END_TIMEOUT)
     if thread.is_alive():
-        _log.error(
-            "not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost",
-            extra=about("ending"),
-        )
+        text = "not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost"
+        _log.error(text, extra=about("ending"))
         sys.stderr.flush()
         os._exit(1)
-    if isinstance(outcome[0], BaseException):
-        raise outcome[0]
+    succeeded = outcome.result() is not False
     if signals[:1] == [signal.SIGINT]:
         raise typer.Exit(130)
-    if outcome[0] is False:
+    if not succeeded:
         raise typer.Exit(1)

@@ -12,16 +12,15 @@ from contextlib import contextmanager
 from typing import Final, Self
 
 from nedbus.daemon import Daemon
-from nedbus.log_event import about
 from nedbus.monitoring import why_not_ready
 
-from .output.streams import MAX_TEXT, to_text
+from .output.streams import MAX_TEXT, counted, to_text
 
 _log = logging.getLogger("nedbus")
 
 _ROUTER_TIMEOUT: Final = 30.0  # s after which a client counts as started without its router, so that the boot goes on
 _STATUS_INTERVAL: Final = 1.0  # s between two texts of the status
-_START_INTERVAL: Final = 0.1  # s between two looks whether the service is ready
+_START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 
 
 class NotifySocket:
@@ -34,9 +33,6 @@ class NotifySocket:
     def __init__(self, address: str) -> None:
         self.active = address.startswith(("/", "@"))
         self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: an abstract address
-        if address and not self.active:
-            text = "NOTIFY_SOCKET is %s, which is neither a path nor @NAME: systemd is told nothing"
-            _log.warning(text, address, extra=about("setting"))
 
     def send(self, **fields: object) -> bool:
         """Send these fields as one datagram; return whether it was taken."""
@@ -45,21 +41,21 @@ class NotifySocket:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             try:
                 sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), self._address)
-            except OSError as exc:  # no reader, or too many datagrams wait: what matters is sent again
-                _log.debug("systemd cannot be told: %s", exc)
+            except OSError as exc:  # no reader, or its queue is full: READY and STATUS are sent again
+                _log.debug("systemd cannot be notified: %s", exc)
                 return False
         return True
 
 
 class Notifier:
-    """Tell systemd of a daemon while this is entered; does nothing where systemd does not ask for it.
+    """Notify systemd of the states of a daemon while this is entered; without NOTIFY_SOCKET do nothing.
 
     READY is sent when `daemon.ready` is set: the router listens, or the session is open, and all sources have begun.
-    Sources that do not speak yet do not delay it; the text of the status names them.
+    Silent sources do not delay it; the text of the status names them.
     A client whose router does not answer counts as started after `patience` [s].
 
-    WATCHDOG proves that all of it works: Zenoh answers how many sessions there are, the main thread has called `tick`
-    since the last time, and the loop of no source has been at one message for half of what systemd waits.
+    WATCHDOG proves that all of it works: Zenoh answers the number of sessions, the main thread has called `tick` since
+    the last ping, and no source has worked on one message for half of systemd's limit.
     It is sent from a thread of its own, so that the main thread reacts to signals while Zenoh blocks.
     """
 
@@ -70,10 +66,9 @@ class Notifier:
         self._socket = NotifySocket(environment.get("NOTIFY_SOCKET", ""))
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + patience
-        self._counted = time.monotonic(), 0  # when, and the number of messages published by then
+        self._counted = time.monotonic(), 0  # a time, and the number of messages published by then
         self._is_ready = self._ticked = False  # READY was taken; the main thread works
         self._rejected = ""
-        self._lock = threading.Lock()  # a reload right after READY must find `_is_ready`; not for signal handlers
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
 
@@ -88,25 +83,20 @@ class Notifier:
             self._thread.join(1.0)  # a thread inside Zenoh at the end of the interpreter would abort it
 
     def tick(self) -> None:
-        """Note that the main thread works, and the thread that it waits for; to be called ten times a second."""
+        """Note that the main thread works; to be called ten times a second."""
         self._ticked = True
 
     def stopping(self) -> None:
-        """Say that it ends; callable from a signal handler, and again."""
+        """Report STOPPING, once; callable from a signal handler."""
         if not self._stop.is_set():
             self._stop.set()
             self._socket.send(STOPPING=1, STATUS="ends")
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
-        """Say that the configuration is read again, and afterwards that all is ready; an error is said and passed on.
-
-        The error stays in the text of the status until the next time.
-        """
-        with self._lock:
-            if self._is_ready:
-                now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-                self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reads the configuration again")
+        """Report RELOADING, and afterwards READY; an error stays in the text of the status until the next reload."""
+        now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
+        self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reads the configuration again")
         self._rejected = ""
         try:
             yield
@@ -114,9 +104,7 @@ class Notifier:
             self._rejected = f"the new configuration is rejected, the old one works on: {exc}"
             raise
         finally:
-            with self._lock:
-                if self._is_ready:  # if it is not taken, the thread sends it again: systemd waits for it
-                    self._is_ready = self._socket.send(READY=1, STATUS=to_text(self._rejected or "ready", MAX_TEXT))
+            self._is_ready = False  # the thread sends READY
 
     def _run(self) -> None:
         next_status = next_ping = 0.0
@@ -124,10 +112,9 @@ class Notifier:
             now = time.monotonic()
             has_waited = self._daemon.role == "client" and now >= self._router_deadline
             if not self._is_ready and (self._daemon.ready.is_set() or has_waited):
-                status = self._status()
-                with self._lock:
-                    self._is_ready = self._socket.send(READY=1, STATUS=status)
-                next_status = now + _STATUS_INTERVAL
+                self._is_ready = True  # before it is sent: a reload may unset it at any moment
+                if not self._socket.send(READY=1, STATUS=self._status()):
+                    self._is_ready = False
             elif now >= next_status:
                 self._socket.send(STATUS=self._status())
                 next_status = now + _STATUS_INTERVAL
@@ -140,7 +127,7 @@ class Notifier:
                 return
 
     def _status(self) -> str:
-        """Return what `systemctl status` shows: what is published, then what does not work, in one line."""
+        """Return the line of `systemctl status`: published streams, then faults."""
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)
@@ -150,20 +137,17 @@ class Notifier:
         since, before = self._counted
         self._counted = now, published
         rate = max(0, published - before) / (now - since)
+        streams = sum(len(source.addresses) for source in sources)
         counts = (
-            f"{_count(len(sources), 'source')}, {_count(sum(len(source.addresses) for source in sources), 'stream')}, "
-            f"{float(f'{rate:.2g}'):g} messages/s, {_count(daemon.sessions, 'session')}"
+            f"{counted(len(sources), 'source')}, {counted(streams, 'stream')}, "
+            f"{float(f'{rate:.2g}'):g} messages/s, {counted(daemon.sessions, 'session')}"
         )
         return to_text("; ".join(filter(None, [counts, self._rejected, *why_not_ready(daemon)])), MAX_TEXT)
 
 
 def watchdog_interval(environment: Mapping[str, str]) -> float | None:
-    """Return the interval of pings for the watchdog [s], half of what systemd waits; None if it wants none."""
+    """Return the interval of watchdog pings [s], half of systemd's limit; None if it wants none."""
     limit = environment.get("WATCHDOG_USEC", "")
     if not limit.isdecimal() or int(limit) == 0 or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}:
         return None
     return int(limit) / 2e6
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

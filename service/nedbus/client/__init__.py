@@ -7,8 +7,15 @@ from nedbus.extras import lazy_exports
 
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
-from .discovery.service_status import ServiceStatus, SourceStatus, StreamStatus
-from .discovery.services import RejectionReport, Rejections, find_accounts, find_services
+from .discovery import (
+    RejectionReport,
+    Rejections,
+    ServiceStatus,
+    SourceStatus,
+    StreamStatus,
+    find_accounts,
+    find_services,
+)
 from .health.stream_health import Health, Histogram, Monitor, StreamHealth
 from .health.stream_state import StreamState, describe_stream, health_of_last, stream_state
 from .housekeeping import Housekeeping
@@ -27,38 +34,9 @@ else:
     __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})
 
 __all__ = [
-    "HEARTBEAT",
-    "AsyncBus",
-    "AsyncPublisher",
-    "AsyncSubscription",
-    "Batch",
-    "Bus",
-    "Counts",
-    "Health",
-    "Histogram",
-    "Housekeeping",
-    "Mode",
-    "Monitor",
-    "Publisher",
-    "PublisherRegistry",
-    "QueryServer",
-    "RejectionReport",
-    "Rejections",
-    "Sample",
-    "ServiceStatus",
-    "SourceStatus",
-    "StreamHealth",
-    "StreamState",
-    "StreamStatus",
-    "Subscription",
-    "check_max_rate",
-    "connect",
-    "connect_async",
-    "connect_with",
-    "describe_stream",
-    "find_accounts",
-    "find_services",
-    "health_of_last",
-    "stream_state",
-    "to_age",
-]
+    "HEARTBEAT", "AsyncBus", "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "Counts", "Health", "Histogram",
+    "Housekeeping", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer", "RejectionReport", "Rejections",
+    "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState", "StreamStatus", "Subscription",
+    "check_max_rate", "connect", "connect_async", "connect_with", "describe_stream", "find_accounts", "find_services",
+    "health_of_last", "stream_state", "to_age",
+]  # fmt: skip

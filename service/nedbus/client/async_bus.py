@@ -4,29 +4,41 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Coroutine, Sequence
+from functools import partial, wraps
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
 
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Message, Selection, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection, vehicle_name
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
-from .discovery.service_status import ServiceStatus
-from .discovery.services import Rejections
-from .publishing.publisher import FLUSH_TIMEOUT, Publisher
-from .sample import Mode, Sample
+from .publishing.publisher import Publisher
+from .sample import Mode
 from .subscription import AsyncSubscription
 
-if TYPE_CHECKING:
-    from nedbus_msgs.arrays import MessageArray
+_WAKE_INTERVAL: Final = 1.0  # s between two looks for a Ctrl-C while connecting
 
-_WAKE: Final = 1.0
-"""Seconds after which a wait for a router looks for a Ctrl-C."""
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def _awaited(
+    method: Callable[Concatenate[Any, _P], _T], *, waits: Callable[[Any], bool] = lambda _: True
+) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _T]]:
+    """Return a method of the blocking twin for asyncio; it runs in a thread if it may wait."""
+
+    @wraps(method)
+    async def call(twin: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        if waits(twin):
+            return await asyncio.to_thread(method, twin._blocking, *args, **kwargs)
+        return method(twin._blocking, *args, **kwargs)
+
+    return call
 
 
 class AsyncBus:
@@ -40,19 +52,25 @@ class AsyncBus:
         self._bus: Bus | None = None
 
     @property
+    def _blocking(self) -> Bus:
+        if self._bus is None:
+            raise ClosedError
+        return self._bus
+
+    @property
     def connected(self) -> bool:
         """True while there is a link to a router."""
-        return self._opened().connected
+        return self._blocking.connected
 
     @property
     def prefix(self) -> str:
         """The first chunks of every key."""
-        return self._opened().prefix
+        return self._blocking.prefix
 
     @property
     def routers(self) -> tuple[str, ...]:
         """The endpoints that it joins."""
-        return self._opened().routers
+        return self._blocking.routers
 
     @by_topic_async
     def subscribe(
@@ -65,37 +83,22 @@ class AsyncBus:
         max_rate: float | None = None,
     ) -> AsyncSubscription[Any]:
         """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
-        self._opened()
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
     ) -> AsyncSubscription[Any]:
         """Subscribe to a selection of addresses, as `subscribe` does."""
-        bus = self._opened()
+        bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
         name = selection.key_expr(prefix=bus.prefix)
         return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue, name=name)
 
-    @last_async
-    async def latest(
-        self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
-    ) -> list[Sample[Any]]:
-        """Return the last sample of each key as `Bus.latest` does."""
-        bus = self._opened()
-        return await asyncio.to_thread(bus.latest, topic, vehicle=vehicle, instance=instance, timeout=timeout)
-
-    async def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
-        """Return the vehicles that are published now as `Bus.vehicles` does."""
-        return await asyncio.to_thread(self._opened().vehicles, timeout=timeout)
-
-    async def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
-        """Return the status of every nedbus service as `Bus.services` does."""
-        return await asyncio.to_thread(self._opened().services, timeout=timeout)
-
-    async def rejections(self) -> Rejections:
-        """Follow the reports of messages that services on this network reject from now on; `take` does not wait."""
-        return await asyncio.to_thread(self._opened().rejections)
+    latest = last_async(_awaited(Bus.latest))
+    vehicles = _awaited(Bus.vehicles)
+    services = _awaited(Bus.services)
+    accounts = _awaited(Bus.accounts)
+    rejections = _awaited(Bus.rejections)
 
     async def publisher(
         self,
@@ -107,10 +110,8 @@ class AsyncBus:
         source: str | None = None,
     ) -> AsyncPublisher:
         """Return a publisher as `Bus.publisher` does, whose methods are awaited."""
-        publisher = await asyncio.to_thread(
-            self._opened().publisher, topic, vehicle=vehicle, instance=instance, lossless=lossless, source=source
-        )
-        return AsyncPublisher(publisher)
+        call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance)
+        return AsyncPublisher(await asyncio.to_thread(call, lossless=lossless, source=source))
 
     async def close(self) -> None:
         """Close the bus as `Bus.close` does."""
@@ -122,10 +123,10 @@ class AsyncBus:
         opening = asyncio.create_task(asyncio.to_thread(self._open_bus, cancelled))
         try:
             while not opening.done():  # asyncio may sleep through a Ctrl-C that comes as it falls asleep: wake it
-                await asyncio.wait({opening}, timeout=_WAKE)
+                await asyncio.wait({opening}, timeout=_WAKE_INTERVAL)
             self._bus = opening.result()
         except asyncio.CancelledError:
-            cancelled.set()  # the thread would try on, and Python waits for it
+            cancelled.set()  # the thread would keep trying, and Python waits for it
             opening.cancel()  # its result is not needed
             raise
         return self
@@ -133,11 +134,6 @@ class AsyncBus:
     async def __aexit__(self, *exc: object) -> None:
         if self._bus is not None:
             await asyncio.to_thread(self._bus.__exit__, *exc)
-
-    def _opened(self) -> Bus:
-        if self._bus is None:
-            raise ClosedError
-        return self._bus
 
 
 def connect_async(
@@ -164,38 +160,18 @@ class AsyncPublisher:
     def __init__(self, publisher: Publisher) -> None:
         self.address, self.key = publisher.address, publisher.key
         self.source, self.lossless = publisher.source, publisher.lossless
-        self._publisher = publisher
+        self._blocking = publisher
 
     @property
     def published(self) -> int:
         """Messages published so far."""
-        return self._publisher.published
+        return self._blocking.published
 
-    async def publish(self, message: Message | Mapping[str, object]) -> None:
-        """Validate a message, or the fields of one by name, and publish it, as `Publisher.publish` does."""
-        if self.lossless:
-            await asyncio.to_thread(self._publisher.publish, message)
-        else:
-            self._publisher.publish(message)
-
-    async def publish_row(self, values: Sequence[object] | Message) -> None:
-        """Validate the values of all fields in PX4's order, and publish them, as `Publisher.publish_row` does."""
-        if self.lossless:
-            await asyncio.to_thread(self._publisher.publish_row, values)
-        else:
-            self._publisher.publish_row(values)
-
-    async def publish_many(self, messages: MessageArray) -> None:
-        """Validate the messages in a structured array, and publish them, as `Publisher.publish_many` does."""
-        await asyncio.to_thread(self._publisher.publish_many, messages)
-
-    async def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
-        """Wait until all readers of mode "every" have what was published, as `Publisher.flush` does."""
-        return await asyncio.to_thread(self._publisher.flush, timeout)
-
-    async def close(self) -> None:
-        """Stop publishing this address, as `Publisher.close` does."""
-        await asyncio.to_thread(self._publisher.close)
+    publish = _awaited(Publisher.publish, waits=attrgetter("lossless"))
+    publish_row = _awaited(Publisher.publish_row, waits=attrgetter("lossless"))
+    publish_many = _awaited(Publisher.publish_many)
+    flush = _awaited(Publisher.flush)
+    close = _awaited(Publisher.close)
 
     async def __aenter__(self) -> Self:
         return self

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,7 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
-from .discovery.service_status import ServiceStatus
-from .discovery.services import Rejections, find_accounts, find_schemas, find_services
-from .discovery.vehicle_directory import VehicleDirectory
+from .discovery import Rejections, ServiceStatus, VehicleDirectory, find_accounts, find_schemas, find_services
 from .housekeeping import Housekeeping
 from .protocol import LIVE
 from .publishing.publisher import Publisher
@@ -43,21 +41,22 @@ class Bus:
         self.prefix = prefix
         self.routers = tuple(routers)
         self._tls = tls
-        self._session = session
+        self._zenoh = session
         self._housekeeping = Housekeeping()
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(session, prefix=prefix)
+        self._directory = VehicleDirectory(prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
-        # In the reverse order: an open question for layouts ends with the session.
-        closes = self._layouts.close, session.close, self._housekeeping.close, self._queries.close
-        self._finalizer = Finalizer(self, partial(_close, self._receivers, closes))
+        closing = ExitStack()  # the last one first; an open query for layouts ends with the session
+        for close in (self._layouts.close, session.close, self._housekeeping.close, self._queries.close):
+            closing.callback(close)
+        closing.callback(_close_all, self._receivers)
+        self._finalizer = Finalizer(self, closing.close)
 
     @property
     def connected(self) -> bool:
         """True while there is a link to a router."""
-        self._require_open()
         return bool(self._session.info.routers_zid())
 
     @by_topic
@@ -77,13 +76,12 @@ class Bus:
         `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
         65,536 samples wait for a slow reader, which loses the oldest beyond.
         Either way `counts` has what was lost, dropped or invalid, and no other reader has to wait.
-        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for links that carry no
-        more. It sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest that is not above; below 1 the rest is left
-        out here. What is left out is neither lost nor dropped.
+        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for slow links.
+        The publisher sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest not above; below 1 this reader thins them
+        further. Messages left out are neither lost nor dropped.
 
         Raises ConfigError for a `max_rate` that is no finite number above 0.
         """
-        self._require_open()
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
@@ -100,10 +98,9 @@ class Bus:
     ) -> list[Sample[Any]]:
         """Return the last sample of each key, sorted by address; `latency` is then its age.
 
-        It waits for the answers of all publishers, at most `timeout` seconds; what is invalid is left out and logged.
+        It waits for the answers of all publishers, at most `timeout` seconds; invalid messages are left out and logged.
         The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
         """
-        self._require_open()
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
         samples: list[Sample[Any]] = []
@@ -124,22 +121,18 @@ class Bus:
 
         The first call asks, and waits at most `timeout` seconds; from then on the bus follows their liveliness tokens.
         """
-        self._require_open()
-        return self._directory.vehicles(timeout=timeout)
+        return self._directory.vehicles(self._session, timeout=timeout)
 
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Return the status of every nedbus service on this network, as it reports it."""
-        self._require_open()
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
-        """Return what each nedbus service remembers of the last seconds: events, and the states of its vehicles."""
-        self._require_open()
+        """Return the account of each nedbus service: events of the last `within` seconds, states of vehicles."""
         return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
         """Follow the reports of messages that services on this network reject from now on."""
-        self._require_open()
         return Rejections(self._session, prefix=self.prefix, owner=self)
 
     def publisher(
@@ -161,7 +154,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # the router that answers knows what was declared before
+        self._publishers.is_alive(address)  # a router that answers knows all earlier declarations
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
@@ -187,6 +180,11 @@ class Bus:
         else:
             self._finalizer.close_now()
 
+    @property
+    def _session(self) -> Session:
+        self._require_open()
+        return self._zenoh
+
     def _require_open(self) -> None:
         require_unforked()
         if not self._finalizer.alive:
@@ -202,7 +200,6 @@ class Bus:
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
         """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
-        self._require_open()
         session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
         receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
@@ -248,10 +245,7 @@ def connect_with(
     return Bus(session, routers=settings.routers, prefix=settings.prefix, tls=tls)
 
 
-def _close(receivers: Iterable[Receiver], closes: Iterable[Callable[[], object]]) -> None:
-    """Close the receivers, then the rest, the last first; if one fails, the others are closed as well."""
-    with ExitStack() as closing:
-        for close in closes:
-            closing.callback(close)
+def _close_all(receivers: Iterable[Receiver]) -> None:
+    with ExitStack() as closing:  # if one fails, the others are closed as well
         for receiver in list(receivers):
             closing.callback(receiver.close)

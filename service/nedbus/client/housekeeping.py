@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from typing import Final
 
 from nedbus.log_event import about
@@ -34,7 +35,8 @@ class Housekeeping:
         self._jobs: list[Job] = []
         self._starting = threading.Lock()
         self._turn = threading.RLock()  # held while jobs are called
-        self._woken = Wakeup()
+        # One item, or none. The methods of an Event are Python: a Ctrl-C amid one leaves its lock taken for good.
+        self._woken: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
 
     def add(self, job: Job) -> Callable[[], None]:
@@ -44,17 +46,18 @@ class Housekeeping:
             if self._thread is None and not self.closed:
                 self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
                 self._thread.start()
-        self._woken.set()
-        return lambda: self._remove(job)
+        self.wake()
+        return partial(self._remove, job)
 
     def wake(self) -> None:
         """Call all jobs now."""
-        self._woken.set()
+        if self._woken.empty():
+            self._woken.put(None)
 
     def close(self) -> None:
         """Call no job any more; one that is inside Zenoh when the interpreter ends would abort the process."""
         self.closed = True
-        self._woken.set()
+        self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_TIMEOUT)
 
@@ -67,7 +70,8 @@ class Housekeeping:
         while not self.closed:
             with self._turn:
                 pauses = [self._call(job, failed) for job in tuple(self._jobs)]
-            self._woken.wait(max(_SHORTEST, min(pauses, default=_FAILED)))
+            with suppress(queue.Empty):
+                self._woken.get(timeout=max(_SHORTEST, min(pauses, default=_FAILED)))
 
     @staticmethod
     def _call(job: Job, failed: set[int]) -> float:
@@ -78,27 +82,3 @@ class Housekeeping:
                 failed.add(id(job))
                 _log.exception("an unexpected error, which is logged once", extra=about("bug"))
             return _FAILED
-
-
-class Wakeup:
-    """Wake one thread that waits, as an Event does that each wait clears.
-
-    The methods of an Event are Python: KeyboardInterrupt amid one leaves its lock taken, and the next user waits
-    for ever. A SimpleQueue is C; it has one item, or none.
-    """
-
-    def __init__(self) -> None:
-        self._items: queue.SimpleQueue[None] = queue.SimpleQueue()
-
-    def set(self) -> None:
-        """Wake a thread that waits, or the next that does."""
-        if self._items.empty():
-            self._items.put(None)
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is set, and clear it; return False after `timeout` seconds."""
-        try:
-            self._items.get(timeout=timeout)
-        except queue.Empty:
-            return False
-        return True

@@ -32,7 +32,6 @@ class _SubscriptionBase(Generic[M_co]):
     def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
         self.name = name
         self._queue = pending_queue
-        self._pop = partial(pending_queue.pop, rows=False)
         self._pop_row = partial(pending_queue.pop, rows=True)
 
     @property
@@ -64,7 +63,7 @@ class Subscription(_SubscriptionBase[M_co]):
 
         Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
         """
-        return self._next(self._pop, timeout)
+        return self._next(self._queue.pop, timeout)
 
     def receive_batch(self, timeout: float | None = None) -> Batch:
         """Wait for at least one message, and return all that have arrived, as one array; errors as of `receive`."""
@@ -87,7 +86,7 @@ class Subscription(_SubscriptionBase[M_co]):
 
     def __next__(self) -> Sample[M_co]:
         try:
-            return self._next(self._pop)
+            return self._next(self._queue.pop)
         except ClosedError:
             raise StopIteration from None
 
@@ -134,7 +133,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     async def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it; `timeout` and errors are those of `Subscription.receive`."""
-        return await self._next(self._pop, timeout)
+        return await self._next(self._queue.pop, timeout)
 
     async def receive_batch(self, timeout: float | None = None) -> Batch:
         """Wait for at least one message, and return all, as `Subscription.receive_batch` does."""
@@ -161,7 +160,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
     async def __anext__(self) -> Sample[M_co]:
         try:
-            return await self._next(self._pop)
+            return await self._next(self._queue.pop)
         except ClosedError:
             raise StopAsyncIteration from None
 

@@ -2,7 +2,7 @@
 
 from .daemon import Daemon
 from .plan import Planned, plan_sources
-from .status import STATES, SourceMeasures
+from .worker import STATES, SourceMeasures
 
 __all__ = [
     "STATES",

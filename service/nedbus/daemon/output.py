@@ -1,4 +1,4 @@
-"""The output of one source: its messages validated, then published or rejected, with the state of each stream."""
+"""The output of one source: validate its messages, publish or reject them, and keep the health of each stream."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2,
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """One address: its publisher while it is published, its health, and when a live source heard it last, and what."""
+    """One address: its health, its publisher while it is published, and its last message from a live source."""
 
     health: StreamHealth
     publisher: Publisher | None = None
@@ -40,7 +40,7 @@ class _Stream:
 
 
 class SourceOutput:
-    """Publish what a source delivers.
+    """Publish the messages of a source.
 
     `name`: of the source in the log; `text`: as the user wrote it; `now`: a monotonic clock [s].
     """
@@ -50,11 +50,11 @@ class SourceOutput:
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
-        """How many messages each rule rejected."""
+        """Number of messages that each rule rejected."""
         self.absence = Absence()
-        """What vehicles publish and a live source does not deliver, now."""
+        """Messages that vehicles publish and a live source does not deliver now."""
         self.durations = Histogram(_DURATIONS)
-        """How long it took to validate, encode and send a message [s]."""
+        """Time to validate, encode and send a message [s]."""
         self._name = name
         self._text = text
         self._kind = text.partition(":")[0]
@@ -73,7 +73,7 @@ class SourceOutput:
 
     @property
     def stale(self) -> list[Address]:
-        """Addresses that a live source published, until nothing arrived any more."""
+        """Addresses of a live source that fell silent."""
         streams = list(self._streams.items())
         return [address for address, stream in streams if stream.publisher is None and stream.heard is not None]
 
@@ -84,11 +84,11 @@ class SourceOutput:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why something was rejected, once for each place that it came from."""
+        """The first reason for a rejection of each origin."""
         return tuple(self._warnings.values())
 
     def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
-        """Make sure that all of these have a publisher, or none: two sources must not keep each other from starting.
+        """Claim all addresses of a run, or none: two sources must not keep each other from starting.
 
         Raises AddressInUseError if another source of ours has one of them.
         """
@@ -96,11 +96,11 @@ class SourceOutput:
         for address in run.addresses:
             if address not in own and self._registry.is_published(address):
                 raise AddressInUseError(address)
-        for address in run.addresses:
-            self.claim(address, run.definitions.get(address.topic), lossless=lossless)
+        for address, definition in run.addresses.items():
+            self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Make sure that an address has a publisher; raise AddressInUseError if another source of ours has it."""
+        """Open a publisher for an address, if need be; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
@@ -163,9 +163,9 @@ class SourceOutput:
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses from which nothing arrived for 3 s; return whether any is left.
+        """Stop publishing live addresses that were silent for 3 s; return whether any is left.
 
-        What has no rate is published for as long as anything else of its vehicle arrives.
+        Topics without a rate are published for as long as any other message of their vehicle arrives.
         """
         now = self._now()
         fresh = {
@@ -183,7 +183,7 @@ class SourceOutput:
         return bool(fresh)
 
     def reject(self, rejection: Rejection) -> None:
-        """Count something that is not a message, log it once for each place, and report it if it has an address."""
+        """Count input that is no message, log it once for each origin, and report it if it has an address."""
         self._count_rejected(_NO_MESSAGE, rejection.count)
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
@@ -196,7 +196,7 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, absence: Absence) -> None:
-        """Take note of what is not delivered now, and log what is silent, each address once."""
+        """Keep the absences of a live source, and log each silent address once."""
         self.absence = absence
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
@@ -204,7 +204,10 @@ class SourceOutput:
             _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
-        """Publish again what has no rate of a vehicle that is back: it would not send it; not after a reboot."""
+        """Publish the topics without a rate of a vehicle that is back again, as it would not repeat them.
+
+        After a reboot they no longer hold.
+        """
         vehicle = message.address.vehicle
         known = [
             (address, stream, stream.last)
@@ -216,7 +219,7 @@ class SourceOutput:
             if stream.publisher is not None or get_topic(address.topic).rate:
                 continue
             if rebooted:
-                stream.last = None  # it no longer holds
+                stream.last = None
                 continue
             with suppress(AddressInUseError):
                 self.claim(address, last.definition)
@@ -248,6 +251,6 @@ def _time_of(message: SourceMessage) -> int:
 
 
 def _rule_of(error: InvalidMessageError) -> str:
-    """Return which rule a message violates, the first of several: its field, and the rule without any value."""
+    """Return the first rule that a message violates: its field, and the rule without any value."""
     field, rule = error.violations[0]
     return f"{field}: {rule.partition(' (')[0]}"

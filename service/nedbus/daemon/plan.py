@@ -1,14 +1,14 @@
-"""Plan of a service: the sources of its settings, opened, or all mistakes in them."""
+"""Plan of a service: the sources of its settings, opened, or the mistakes in them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 from nedbus.errors import ConfigError
 from nedbus.settings import Settings, locate_setting, locate_source
-from nedbus.sources import LiveSource, Source, SourceSpec, parse_source
+from nedbus.sources import LiveSource, Source, parse_source
 from nedbus.transport import dial_endpoint
 
 _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
@@ -18,18 +18,14 @@ _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 class Planned:
     """A source as it is configured, `index` among others: after a reload one with this text and vehicle goes on."""
 
-    index: int
+    index: int = field(compare=False)
     text: str
     vehicle: str
-    source: Source
-
-    def is_same(self, other: Planned) -> bool:
-        """Return whether two plans ask for the same."""
-        return (self.text, self.vehicle) == (other.text, other.vehicle)
+    source: Source = field(compare=False)
 
 
 def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
-    """Return the sources of these settings, for a service with these endpoints, and all mistakes in them."""
+    """Return the sources of these settings, for a service with these endpoints, and the first mistake in each."""
     plan: list[Planned] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:
@@ -45,44 +41,17 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
             )
     routers = tuple(map(dial_endpoint, endpoints))
     for index, given in enumerate(settings.source):
-        spec, wrong = _parse_source(given)
-        if spec is not None:
-            try:
-                source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls)
-            except ConfigError as exc:
-                wrong.append(exc)
-            else:
-                plan.append(Planned(index, spec.text, settings.vehicle, source))
-        mistakes += [locate_source(settings, index, exc) for exc in wrong]
+        try:
+            spec = parse_source(given)
+            source = spec.open_source(vehicle=settings.vehicle, routers=routers, tls=tls)
+        except ConfigError as exc:
+            mistakes.append(locate_source(settings, index, exc))
+        else:
+            plan.append(Planned(index, spec.text, settings.vehicle, source))
     if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
         reason = "no source ever ends: give sim: a duration, or take loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
-
-
-def _parse_source(given: str | Mapping[str, object]) -> tuple[SourceSpec | None, list[ConfigError]]:
-    """Return a source without the options that are wrong, None if nothing is left of it, and all mistakes in it."""
-    mistakes: list[ConfigError] = []
-    while True:
-        try:
-            return parse_source(given), mistakes
-        except ConfigError as exc:
-            where = mistakes[0].where if mistakes else exc.where
-            mistakes.append(ConfigError(where, exc.reason, key=exc.key))
-            rest = _without_option(given, exc.key)
-            if rest == given:
-                return None, mistakes
-            given = rest
-
-
-def _without_option(source: str | Mapping[str, object], name: str) -> str | Mapping[str, object]:
-    if not name:
-        return source
-    if isinstance(source, str):
-        target, _, query = source.rpartition("?")
-        rest = "&".join(pair for pair in query.split("&") if pair.partition("=")[0] != name)
-        return f"{target}?{rest}" if rest else target
-    return {key: value for key, value in source.items() if key != name or key == "kind"}
 
 
 def is_finite(source: Source) -> bool:

@@ -1,23 +1,24 @@
-"""A worker runs one source: replays messages when they are due, or listens to a vehicle, and retries after failures."""
+"""Workers run the sources of a service: each replays messages when they are due, or listens to vehicles."""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
-from typing import Final
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Final, Literal, cast, get_args
 
-from nedbus.client import PublisherRegistry, SourceStatus, StreamStatus
+from nedbus.client import Histogram, PublisherRegistry, SourceStatus, StreamStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
-from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source
+from nedbus.sources import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, SourceMessage
 from nedbus.transport import Session
 
 from .output import SourceOutput
-from .status import SourceMeasures, State
+from .plan import Planned
 
 _log = logging.getLogger(__name__)
 
@@ -26,7 +27,29 @@ _MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must 
 _MAX_DELAY: Final = 1.0  # s: a replay that is later than this goes on from where it is, and does not hurry
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
 _READER_POLL: Final = 0.05  # s between two checks for a reader
+_RETIRE_TIMEOUT: Final = 5.0  # s that a source which is gone from the configuration has to end
 _MAX_STREAMS: Final = 100  # in a status: it must fit a message
+
+_Item = SourceMessage | Rejection | Absence | None
+State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
+STATES: Final[tuple[State, ...]] = get_args(State)
+
+
+@dataclass(frozen=True, slots=True)
+class SourceMeasures:
+    """Measurements of one source, for metrics: its status, all its streams, and the time that publishing takes [s]."""
+
+    status: SourceStatus
+    streams: tuple[StreamStatus, ...]
+    durations: Histogram
+
+    @property
+    def states(self) -> dict[str, str]:
+        """The state of each stream by address; silence after the end of the source is no fault."""
+        if self.status.ended:
+            return {stream.address: "ok" for stream in self.streams}
+        published = frozenset(self.status.addresses)
+        return {each.address: stream_state(each.health, alive=each.address in published).name for each in self.streams}
 
 
 class Clock:
@@ -40,47 +63,48 @@ class Clock:
 
     @property
     def stopped(self) -> bool:
-        """True once the worker is to end."""
+        """True once the worker has to end."""
         return self._event.is_set()
 
 
 class Worker:
-    """Run one source until it ends or its clock is stopped; `run` is meant for a thread of its own.
+    """Run one source in a thread of its own, until it ends or is stopped; its publishers stay open until then.
 
     With `retry` a replay that fails is started again, with growing pauses, as a live source always is.
-    `router` is what the service's router lends to its live sources; `on_end` is called when `run` returns.
+    `router`: the service's router, for its live sources; `on_end` is called when the source has ended.
     """
 
     def __init__(
         self,
-        text: str,
-        source: Source,
+        planned: Planned,
         registry: PublisherRegistry,
         *,
         router: Session | None = None,
-        clock: Clock,
+        clock: Clock | None = None,
         account: Account,
         retry: bool,
         on_end: Callable[[], object],
     ) -> None:
-        self.text = text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
-        self.source = source
-        self._name = self.text.rstrip(":")  # as the log calls it
+        self.planned, self.source = planned, planned.source
+        self.text = planned.text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
+        self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
+        self._name = self.text.rstrip(":")  # in the log
         self._registry = registry
         self._router = router
-        self._clock = clock
-        self._retry = retry or isinstance(source, LiveSource)
+        self._clock = clock or Clock()
+        self._retry = retry or isinstance(self.source, LiveSource)
         self._on_end = on_end
-        self._output = SourceOutput(self._name, self.text, registry, clock.now, account)
+        self._output = SourceOutput(self._name, self.text, registry, self._clock.now, account)
         self._run: ReplayRun | None = None
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._turn: float | None = None  # since when the loop is at one message; None while it may take any time
+        self._turn: float | None = None  # begin of the current turn; None while a turn may take any time
+        self._release = False
 
     @property
     def busy(self) -> float:
-        """For how long its loop has not gone round [s]; 0 while it opens a source, or waits for what is due."""
+        """Age of the current turn of its loop [s]; 0 while it opens a source, or waits for a due message."""
         since = self._turn
         return 0.0 if since is None else self._clock.now() - since
 
@@ -122,27 +146,35 @@ class Worker:
         """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""
         try:
             self._run_until_done()
-        except BaseException as exc:  # noqa: BLE001 - a thread that ends must not look as if it ran
+        except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
             _log.exception("%s: an unexpected error ended it", self._name, extra=about("failed", source=self._name))
-            self._error = _describe(exc)
-            self._state = "failed"
+            self._state, self._error = "failed", _describe(exc)
         finally:
             self._on_end()
 
-    def withdraw(self) -> None:
-        """Publish nothing any more, once `run` has returned: its addresses are free for others."""
-        self._output.release()
+    def stop(self, *, release: bool) -> None:
+        """Stop the source; with `release` its thread then closes its publishers, which may wait for slow readers."""
+        self._release = release
+        self._clock.stop()
+
+    def _run_and_release(self) -> None:
+        self.run()
+        self._clock.wait(None)
+        if self._release:
+            self._output.release()
+            _log.info("%s: ended, as it is not configured any more", self.text, extra=about("reload"))
 
     def _run_until_done(self) -> None:
         failures = 0
         while not self._clock.stopped:
             start = self._clock.now()
             try:
-                self._run_once()
+                if isinstance(self.source, LiveSource):
+                    self._listen(self.source)
+                else:
+                    self._run_replay(self.source)
             except ClosedError as exc:
-                if not self._clock.stopped:
-                    self._error = str(exc)
-                    self._end("failed")
+                self._end("failed", str(exc))
                 return
             except NedbusError as exc:
                 self._fail(str(exc))
@@ -151,38 +183,33 @@ class Worker:
                 self._fail(_describe(exc))
             else:
                 if isinstance(self.source, LiveSource) or not self.source.loop:
-                    self._end("failed" if self._error else "done")
+                    self._end("failed" if self._error else "done", self._error)
                     return
                 failures = 0
                 self._clock.wait(max(0.0, start + _MIN_RUN - self._clock.now()))
                 continue
+            finally:
+                self._turn = None
             if not self._retry:
-                self._end("failed")
+                self._end("failed", self._error)
                 return
             if self._clock.now() - start > _BACKOFF[-1]:
                 failures = 0  # it worked for a while
             self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
             failures += 1
 
-    def _run_once(self) -> None:
-        try:
-            if isinstance(self.source, LiveSource):
-                self._listen(self.source)
-            else:
-                self._run_replay(self.source)
-        finally:
-            self._turn = None
-
     def _run_replay(self, source: ReplaySource) -> None:
-        run = source.open()
-        first = self._run is None
-        if self._run is None or self._run.summary != run.summary:
+        run, last = source.open(), self._run
+        if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
             for warning in run.warnings:
                 _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
         self._run, self._done = run, 0
-        if source.wait and first:
-            self._wait_for_reader(run)
+        if source.wait and last is None:
+            self._state = "waiting"
+            _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
+            while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
+                pass
         self._output.release(keep=run.addresses)
         self._output.claim_all(run, lossless=source.speed is None)
         self._set_state("running")
@@ -198,7 +225,9 @@ class Worker:
                     self._clock.wait(early)
             if self._clock.stopped:
                 return
-            self._turn = None if source.speed is None else self._clock.now()  # else it waits for its readers
+            self._turn = (
+                None if source.speed is None else self._clock.now()
+            )  # a lossless publisher waits for its readers
             self._output.publish(message)
             self._turn = None
             self._done += 1
@@ -206,14 +235,10 @@ class Worker:
 
     def _listen(self, source: LiveSource) -> None:
         """Publish what a live source delivers; it yields None several times a second while nothing arrives."""
-        with ExitStack() as closing:
-            items = source.listen(self._router)
-            closing.callback(getattr(items, "close", lambda: None))
-            next_poll = float("-inf")
-            for number, item in enumerate(items):
-                self._turn = self._clock.now()
-                if not number:
-                    self._set_state("waiting")
+        with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # each is a generator
+            next_poll = 0.0
+            for item in items:
+                now = self._turn = self._clock.now()
                 if self._clock.stopped:
                     return
                 if isinstance(item, Rejection):
@@ -223,34 +248,26 @@ class Worker:
                 elif item is not None:
                     self._output.publish_live(item)
                     self._set_state("running")
-                now = self._clock.now()
                 if now >= next_poll:
                     next_poll = now + _STALE_POLL
                     if not self._output.expire_stale():
                         self._set_state("waiting")
 
-    def _wait_for_reader(self, run: ReplayRun) -> None:
-        self._state = "waiting"
-        _log.info("%s: waiting for a subscriber", self._name, extra=about("waiting", source=self._name))
-        while not self._registry.is_read(run.addresses) and not self._clock.wait(_READER_POLL):
-            pass
-
     def _set_state(self, state: State) -> None:
-        if state == "waiting" and self._state in {"starting", "retrying"}:
+        if isinstance(self.source, LiveSource) and self._state in {"starting", "retrying"}:
             _log.info("%s: listening", self._name, extra=about("listening", source=self._name))
         self._state, self._error = state, None
 
-    def _end(self, state: State) -> None:
+    def _end(self, state: Literal["done", "failed"], reason: str | None) -> None:
         if not self._clock.stopped:
-            self._state = state
+            self._state, self._error = state, reason
             text = f"{state}, {self._output.published} published, {self._output.rejected} rejected"
             event = "failed" if state == "failed" else "done"
-            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=self._error))
+            _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, reason: str) -> None:
-        """Note why it failed, and release all addresses: another source may need them meanwhile."""
-        self._error = reason
-        self._state = "retrying"
+        """Note the reason, and release all addresses: another source may need them meanwhile."""
+        self._state, self._error = "retrying", reason
         self._retries += 1
         event = "retrying" if self._retry else "failed"
         _log.error("%s", reason, extra=about(event, source=self._name, reason=reason))
@@ -259,3 +276,33 @@ class Worker:
 
 def _describe(error: BaseException) -> str:
     return f"an unexpected {type(error).__name__}: {error}"
+
+
+def apply_plan(
+    plan: Iterable[Planned], workers: Sequence[Worker], make_worker: Callable[[Planned], Worker]
+) -> list[Worker]:
+    """Start new sources, stop removed ones, and return the workers of the plan in its order."""
+    left, ordered = list(workers), []
+    for planned in plan:
+        same = next((worker for worker in left if worker.planned == planned), None)
+        if same is not None:
+            left.remove(same)
+        ordered.append(same or make_worker(planned))
+    stop_workers(left, _RETIRE_TIMEOUT, release=True)
+    for worker in left:
+        if worker.thread.is_alive():  # giving an address back may take as long as its slowest reader
+            text = "%s: does not end, perhaps because of a slow reader; it goes on until then"
+            _log.warning(text, worker.text, extra=about("reload"))
+    for worker in ordered:  # new sources may need the addresses of those that are gone
+        if worker not in workers:
+            worker.thread.start()
+    return ordered
+
+
+def stop_workers(workers: Sequence[Worker], grace: float, *, release: bool = False) -> None:
+    """Stop these workers and wait up to `grace` seconds; `release` as in `Worker.stop`."""
+    for worker in workers:
+        worker.stop(release=release)
+    deadline = time.monotonic() + grace
+    for worker in workers:
+        worker.thread.join(max(0.0, deadline - time.monotonic()))

@@ -1,7 +1,7 @@
-"""Write permission at the router: access rules drop what they do not allow, and tell its sender nothing.
+"""Write permission at the router: access rules drop messages without telling the sender.
 
-Only a service that shows a certificate is checked, as access rules go by it: with a second session for a moment, a few
-seconds after a link is up or a vehicle appears, and then seldom. Rules change when a router starts again.
+Only services with a certificate are checked, as access rules go by it: with a second session for a moment, soon after a
+link is up or a vehicle appears, and then rarely. Rules change when a router restarts.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import logging
 import random
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
@@ -23,10 +22,11 @@ from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, w
 _log = logging.getLogger(__name__)
 
 _FIRST: Final = (1.0, 5.0)  # s, drawn: the vehicles of a fleet come back together when their router does
-_CONFIRM: Final = 1.0  # s until a refusal is looked at again
-_BELIEVED: Final = 3  # refusals one after the other: a router that is slow, or starts again, is none
-_PAUSES: Final = (30.0, 60.0, 120.0, 300.0, 600.0)  # s until what is refused, or cannot be told, is looked at again
-_POLL: Final = 1.0  # s between two looks at the link
+_CONFIRM: Final = 1.0  # s until a denial is checked again
+_BELIEVED: Final = 3  # denials in a row that are a refusal: a slow or restarting router is none
+_UNSURE_PAUSE: Final = 60.0  # s until the next check while a vehicle is refused or unknown
+_PAUSE: Final = 600.0  # s until the next check when all are allowed
+_POLL: Final = 1.0  # s between two polls of the link
 _OPEN: Final = 5.0  # s for a session
 _ARRIVED: Final = 3.0  # s for a message that is allowed
 _GRACE: Final = 5.0  # s to end
@@ -34,7 +34,7 @@ _MAX_NAMED: Final = 20  # vehicles in a line of the log
 
 
 def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
-    """Start to check what the router lets through, if that may depend on a certificate of ours."""
+    """Start the checks, if the service has a certificate that access rules may go by."""
     endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
     if settings.tls is None or settings.tls.certificate is None or not endpoints:
         return None
@@ -48,7 +48,7 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
 
 
 class WritePermission:
-    """Follow which of the vehicles that `vehicles` returns the router refuses, in a thread of its own.
+    """Check in a thread of its own whether the router refuses any of the vehicles that `vehicles` returns.
 
     `session` publishes them, as a client of one of the endpoints or as a router that joins them.
     """
@@ -62,18 +62,17 @@ class WritePermission:
         self._prefix = prefix
         self._vehicles = vehicles
         self._stop = threading.Event()
-        self._denials: Counter[str] = Counter()  # of each vehicle, one after the other
-        self._refused: dict[str, bool] = {}
-        self._tries = 0
+        self._denials: dict[str, int] = {}  # in a row, of each vehicle of which anything is known
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
 
     @property
-    def refused(self) -> Mapping[str, bool]:
-        """Answer of the router for each vehicle where it is known: true if access rules refuse it."""
-        return dict(self._refused)
+    def refused(self) -> dict[str, bool]:
+        """The router's verdict on each vehicle, where it is known: true if access rules refuse it."""
+        known = self._denials.copy().items()
+        return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
 
     def start(self) -> None:
-        """Check from now on: when the link is another one, when a vehicle is new, and now and then."""
+        """Check when the link changes, when a vehicle is new, and rarely in between."""
         self._thread.start()
 
     def close(self) -> None:
@@ -87,8 +86,8 @@ class WritePermission:
             now = time.monotonic()
             routers, vehicles = _routers_of(self._session), self._vehicles()
             if routers != known[0]:
-                self._denials.clear()
-                self._tries, due = 0, now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
+                self._denials = {vehicle: _BELIEVED * refused for vehicle, refused in self.refused.items()}
+                due = now + random.uniform(*_FIRST)  # noqa: S311 - spreads load, no secret
             elif vehicles - known[1]:
                 due = min(due, now + _FIRST[0])
             known = routers, vehicles
@@ -96,26 +95,31 @@ class WritePermission:
                 due = now + self.check()
 
     def check(self) -> float:
-        """Look once, and return after how many seconds to look again."""
+        """Check once, and return the seconds until the next check."""
         vehicles = self._vehicles()
         try:
             verdicts = self._probe(vehicles)
         except NedbusError as exc:  # the link or the session has gone, or a file is being replaced
-            _log.debug("whether the router takes what is published cannot be told: %s", exc)
+            _log.debug("the write permission is unknown: %s", exc)
             verdicts = {}
-        for gone in [*(self._refused.keys() | self._denials.keys()) - vehicles]:
-            self._refused.pop(gone, None)
-            del self._denials[gone]
-        self._note(verdicts)
+        before = self.refused
+        self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
+        for vehicle, verdict in verdicts.items():
+            number = self._denials.get(vehicle, 0)
+            if verdict == "allowed":
+                self._denials[vehicle] = 0
+            elif verdict == "denied":
+                self._denials[vehicle] = number + 1
+            elif not number:  # else the router was slow: rules do not change under a link
+                self._denials.pop(vehicle, None)
+        self._log_changes(before)
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
             return _CONFIRM
         is_well = bool(verdicts) and set(verdicts.values()) == {"allowed"}
-        pause = _PAUSES[-1 if is_well else min(self._tries, len(_PAUSES) - 1)]
-        self._tries += 1
-        return pause
+        return _PAUSE if is_well else _UNSURE_PAUSE
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
-        """Return what is known of each vehicle; nothing without a router to which both sessions have a link."""
+        """Return the verdict on each vehicle; none without a router to which both sessions have a link."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
@@ -126,33 +130,21 @@ class WritePermission:
                 if not (there := _routers_of(reader)) or not there <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=_ARRIVED)
-                # What did not arrive counts only where no link was broken meanwhile.
+                # A probe that did not arrive counts only if no link was broken meanwhile.
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
-    def _note(self, verdicts: Mapping[str, Verdict]) -> None:
-        """Take the verdicts of one look, and log what is new."""
-        before = {vehicle for vehicle, refused in self._refused.items() if refused}
-        for vehicle, verdict in verdicts.items():
-            if verdict == "allowed":
-                self._denials[vehicle] = 0
-                self._refused[vehicle] = False
-            elif verdict == "denied":
-                self._denials[vehicle] += 1
-                if self._denials[vehicle] >= _BELIEVED:
-                    self._refused[vehicle] = True
-            elif not self._denials[vehicle]:  # else the router was slow: rules do not change under a link
-                self._refused.pop(vehicle, None)
-        now = {vehicle for vehicle, refused in self._refused.items() if refused}
-        if new := now - before:
+    def _log_changes(self, before: Mapping[str, bool]) -> None:
+        now = self.refused
+        if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
-                "the router refuses %s: nothing of it reaches anybody; do its access rules name it, with the"
+                "the router refuses %s: its messages reach no reader; do its access rules name it, with the"
                 " certificate %s? ('nedbus pki rules', docs/security.md); still trying",
                 _name(new),
                 self._tls.certificate,
                 extra=about("refused"),
             )
-        if mended := {vehicle for vehicle in before - now if self._refused.get(vehicle) is False}:
+        if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
             _log.info("the router takes %s now: all is well again", _name(mended), extra=about("accepted"))
 
 
@@ -165,7 +157,6 @@ def _routers_of(session: Session) -> set[str]:
         return set()
 
 
-def _name(vehicles: set[str]) -> str:
-    names = sorted(vehicles)
-    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-    return f"vehicle {', '.join(names[:_MAX_NAMED])}{more}"
+def _name(vehicles: Sequence[str]) -> str:
+    more = f" and {len(vehicles) - _MAX_NAMED} more" if len(vehicles) > _MAX_NAMED else ""
+    return f"vehicle {', '.join(sorted(vehicles)[:_MAX_NAMED])}{more}"

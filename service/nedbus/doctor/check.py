@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 def check_service(
     file: str | Path | None = None, given: Mapping[str, object] | None = None, *, offline: bool = False
 ) -> list[ConfigError]:
-    """Return all mistakes in the settings of a service, as `load_settings` would read them with what is given.
+    """Return all mistakes in the settings of a service, as `load_settings` would read them with `given`.
 
     `offline`: check the text only, without the files, certificates and endpoints of this host.
     """
@@ -81,7 +81,7 @@ def check_router_file(
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
-    """Yield each source that cannot be opened by a service with these endpoints, or publishes what another one does."""
+    """Yield each source that cannot be opened by a service with these endpoints, or publishes an address twice."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
     publishers: dict[Address, Planned] = {}

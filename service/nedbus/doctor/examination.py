@@ -1,4 +1,4 @@
-"""The examination: all checks, in an order in which each has what it needs, with a time limit for each."""
+"""The examination: all checks in order, each with a time limit."""
 
 from __future__ import annotations
 
@@ -12,27 +12,16 @@ from typing import Final
 from nedbus.errors import NedbusError
 from nedbus.extras import needs
 from nedbus.settings import Settings
-from nedbus.sources import check_link
+from nedbus.sources import parse_link
 from nedbus.transport import Tls, open_client, probe_writes
 
 from .check import check_sources
 from .finding import Finding, limit_findings, sort_findings
-from .network import check_clocks, check_other_keys, check_permissions, check_routers, check_vehicles
+from .network import NETWORK_CHECKS
 from .observation import Observation
 from .prober import check_endpoint, check_tls_files
-from .services import check_services
 
 Check = Callable[[], Iterable[Finding]]
-NETWORK_CHECKS: Final[tuple[Callable[[Observation], Iterable[Finding]], ...]] = (
-    check_routers,
-    check_permissions,
-    check_services,
-    check_vehicles,
-    check_clocks,
-    check_other_keys,
-)
-"""The checks of what is seen behind a router; those before it are called in `examine`."""
-
 _LISTEN: Final = 3.0  # s
 _ENDPOINTS_TIMEOUT: Final = 9.0  # s for all checks before a router is joined, side by side
 _NETWORK_TIMEOUT: Final = 12.0  # s
@@ -54,7 +43,7 @@ def examine(
     findings = [*_describe_settings(settings), *(finding for _, finding in tls_findings)]
     checks: dict[tuple[str, str], Check] = {("settings", ""): partial(_check_sources, settings)}
     if mavlink is not None:
-        check_link(mavlink)
+        parse_link(mavlink)
         checks["mavlink", mavlink] = lambda: needs("mavlink", "nedbus.doctor.mavlink").check_mavlink(mavlink, listen)
     for endpoint in settings.routers[:_MAX_ROUTERS]:
         checks["endpoint", endpoint] = partial(check_endpoint, endpoint, tls)
@@ -64,7 +53,7 @@ def examine(
         for index, each in enumerate(findings):  # one router is joined: no other one is a reason for silence
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
-        seen = Observation(settings.prefix, version, vehicle, has_tls=tls is not None)
+        seen = Observation(settings.prefix, version, vehicle)
         checks = {("network", ""): partial(check_network, seen, answering[0], tls, listen)}
         findings += _run_together(checks, _NETWORK_TIMEOUT)
     return sort_findings(findings)
@@ -72,8 +61,8 @@ def examine(
 
 def _describe_settings(settings: Settings) -> Iterator[Finding]:
     """Yield the routers to join and the other settings, with the flag, variable or file that sets each."""
-    set_by = {name: settings.set_by(name) for name in Settings.model_fields if settings.set_by(name)}
-    setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in set_by.items()}
+    setters = {name: setter for name in Settings.model_fields if (setter := settings.set_by(name))}
+    setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in setters.items()}
     setter = next((setters[name] for name in ("connect", "listen", "router_config") if name in setters), "")
     text = f"set by {setter}" if setter else "the default: nothing sets connect"
     advice = "" if setter else "a router on another host is named with --connect, NEDBUS_CONNECT or in nedbus.toml"

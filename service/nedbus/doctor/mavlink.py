@@ -14,10 +14,9 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.errors import SourceError
 from nedbus.sources import Link, open_link
 
-from .finding import Finding, State, list_names
+from .finding import Finding, limit_findings, list_names
 
 _READ_TIMEOUT: Final = 0.25  # s
-_MAX_SYSTEMS: Final = 20
 _MAX_SENDERS: Final = 5
 _POSITION: Final = "LOCAL_POSITION_NED"
 _BAUD: Final = 57600
@@ -30,16 +29,11 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         with closing(open_link(link, baud=_BAUD)) as opened:
             senders, systems = _listen(opened, listen)
     except SourceError as exc:
-        state: State = "wrong"
+        is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check the link: address, port or device, and permissions"
-        if isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE:
-            state = "warning"
+        if is_taken:
             advice = "if 'nedbus serve' has the port all is well, else stop what 'ss -ulpn' names, or take another port"
-        yield Finding("mavlink", link, state, exc.reason, advice)
-        return
-    except OSError as exc:
-        reason = (exc.strerror or str(exc)).lower()
-        yield Finding("mavlink", link, "wrong", f"the link broke: {reason}", "is the other side still on?")
+        yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
     if not senders:
         advice = "does the vehicle send to this host and port ('mavlink status' in PX4's shell)? a firewall, a router?"
@@ -48,8 +42,9 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         seen = f"{senders.total()} packets from {list_names(sorted(senders))} that are not MAVLink"
         advice = "does another program send there? take another port, or the baud rate of the vehicle"
         yield Finding("mavlink", link, "wrong", seen, advice)
-    for system, counts in sorted(systems.items()):
-        yield _judge_system(f"{link} system {system}", link, counts, listen)
+    yield from limit_findings(
+        _judge_system(f"{link} system {system}", link, counts, listen) for system, counts in sorted(systems.items())
+    )
 
 
 def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter[str]]]:
@@ -73,15 +68,8 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
             if not link.stream:
                 parser = _new_parser()
             for message in parser.parse_buffer(data) or []:
-                if message.get_type() == "BAD_DATA":
-                    continue
-                # Of a message that is not in the dialect only the header can be parsed.
-                raw = bytes(message.get_msgbuf())
-                system = raw[5] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[3]
-                if system in systems or len(systems) < _MAX_SYSTEMS:
-                    systems.setdefault(system, Counter())[message.get_type()] += 1
-            if time.monotonic() >= end:
-                break
+                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # which have no header
+                    systems.setdefault(message.get_srcSystem(), Counter())[message.get_type()] += 1  # 255 at most
     return senders, systems
 
 

@@ -1,16 +1,16 @@
-"""Checks of the network behind a router: its sessions, permissions, vehicles, clocks, messages under other keys."""
+"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks, keys of others."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.events import merge_vehicles, to_age
+from nedbus.client import SourceStatus
+from nedbus.events import merge_vehicles, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
 from .finding import Finding, State, brief, list_names
 from .observation import Observation
-from .services import has_source, reported
 
 _NEARLY_FULL: Final = 0.8  # of the sessions that a router accepts
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
@@ -22,7 +22,7 @@ _SYNCHRONISE: Final = "run NTP or PTP on both hosts: 'timedatectl' says whether 
 
 
 def check_routers(seen: Observation) -> Iterator[Finding]:
-    """Yield the number of sessions of each router, and whether it is nearly full."""
+    """Yield the number of sessions of each router; a warning if it is nearly full."""
     if not seen.routers:
         yield Finding("router", "", "ok", "joined; its other sessions are not shown to this client")
     for router in seen.routers:
@@ -36,7 +36,7 @@ def check_routers(seen: Observation) -> Iterator[Finding]:
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
-    """Yield whether this client may read, by the messages that arrive, and may write a vehicle, by a probe."""
+    """Yield the permission to read, by the messages that arrive, and to write a vehicle, by a probe."""
     reading = _check_reading(seen)
     yield reading
     vehicle = seen.vehicle
@@ -57,9 +57,9 @@ def check_permissions(seen: Observation) -> Iterator[Finding]:
 
 
 def _check_reading(seen: Observation) -> Finding:
-    if any(stream.address is not None for stream in seen.streams.values()) or seen.ages:
+    if seen.flowing or seen.ages:
         return Finding("read", "", "ok", "this client may read: messages arrive")
-    published = sorted({address for service in seen.services for address in reported(service.status)})
+    published = _published(seen)
     if not published:
         return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
     text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"
@@ -70,36 +70,80 @@ def _check_reading(seen: Observation) -> Finding:
     return Finding("read", "", "wrong", text, advice)
 
 
+def check_services(seen: Observation) -> Iterator[Finding]:
+    """Yield the findings on the version and the sources of each service."""
+    for service in (each.status for each in seen.services):
+        name = f"service {brief(service.service)}"
+        theirs = brief(service.version or "unknown")
+        if theirs.split(".")[:2] != seen.version.split(".")[:2]:
+            advice = "install the same version on both sides; docs and CHANGELOG say what changed on the wire"
+            yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {seen.version}", advice)
+        findings = [finding for source in service.sources for finding in _check_source(source)]
+        yield from findings
+        if all(finding.state == "ok" for finding in findings):
+            host = brief(service.host or "an unknown host")
+            text = f"nedbus {theirs} on {host}, its sources have no fault: {len(service.sources)}"
+            yield Finding("service", name, "ok", text)
+    if not seen.services:
+        advice = "'nedbus serve' is one; a script that publishes by itself is none"
+        yield Finding("service", "", "unknown", "no nedbus service answers", advice)
+
+
+def _published(seen: Observation) -> list[str]:
+    """Return the addresses that services say they publish."""
+    return sorted({brief(address) for source in seen.sources for address in source.addresses})
+
+
+def _check_source(source: SourceStatus) -> Iterator[Finding]:
+    name, state = brief(source.source), source.state
+    error = (source.error or "it does not say why")[:_MAX_TEXT]
+    if state in {"failed", "retrying"}:
+        ends = "it has ended" if state == "failed" else "it is tried again"
+        yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; the log of its service says more")
+    elif state in {"waiting", "starting"}:
+        advice = "is its vehicle on, does it send here? for MAVLink see 'nedbus doctor --mavlink LINK' on its host"
+        yield Finding("source", name, "warning", f"{state}: nothing has arrived yet", advice)
+    if source.silent:
+        advice = "if the vehicle has them, its PX4 loses them: no line of its zenoh/pub.csv may have rel=: docs/live.md"
+        seen = f"announced, and nothing arrives while other topics do: {list_names(source.silent, 20)}"
+        yield Finding("source", name, "warning", seen, advice)
+    if source.not_carried:
+        advice = "to carry them, give PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
+        seen = f"vehicles publish messages that it does not carry: {list_names(source.not_carried, 20)}"
+        yield Finding("source", name, "ok", seen, advice)
+    if stale := [address for address in source.stale if address not in source.silent]:
+        advice = "is the vehicle on, is its link up? they come back by themselves"
+        seen = f"nothing arrives any more of {list_names(stale)}"
+        yield Finding("source", name, "warning", seen, advice)
+    if source.rejected > 0:
+        why = f": {list_names(source.rejections)}" if source.rejections else ""
+        advice = "'nedbus echo' shows nothing of these; reasons are in the log of the service and on @rejected keys"
+        yield Finding("source", name, "warning", f"{source.rejected} messages were rejected{why}", advice)
+
+
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the addresses of all vehicles, or of one."""
     vehicle = seen.vehicle
-    arrived = {stream.address for stream in seen.streams.values() if stream.address is not None}
+    arrived = seen.flowing
     known = sorted(each for each in {*seen.alive, *arrived} if vehicle in (None, each.vehicle))
     for address in known:
         yield from _check_address(seen, address, flows=address in arrived)
     yield from _check_states(seen)
-    hidden = sorted({each for service in seen.services for each in reported(service.status)} - set(map(str, known)))
-    hidden = [each for each in hidden if vehicle in (None, each.partition("/")[0])]
-    for each in hidden if seen.streams or seen.ages else ():  # else nothing at all may be read
+    shown = set(map(str, known))
+    hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
+    for each in hidden if arrived or seen.ages else ():  # else nothing at all may be read
         advice = "may that service write this vehicle? a router drops what its rules do not allow: docs/security.md"
         yield Finding("vehicle", each, "wrong", "a service says that it publishes it, and nothing arrives", advice)
     if flowing := [address for address in known if address in arrived]:
         vehicles = {address.vehicle for address in flowing}
         yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
     if not known and not hidden:
-        yield _explain_absence(seen)
-
-
-def _explain_absence(seen: Observation) -> Finding:
-    if seen.has_tls and seen.verdict == "allowed" and not (seen.alive or seen.streams or seen.ages):
-        advice = "a vehicle's certificate is for writing: look with that of a reader"
-        return Finding("vehicle", seen.vehicle or "", "unknown", "this client sees no vehicle at all", advice)
-    advice = "start its source: 'nedbus serve --source ...'"
-    if seen.services:
-        advice = "a service answers: what is said of its sources is the reason, or they publish other vehicles"
-    if seen.vehicle is None:
-        return Finding("vehicle", "", "warning", f"no vehicle is seen under {seen.prefix}/", advice)
-    return Finding("vehicle", seen.vehicle, "wrong", f"it is not seen under {seen.prefix}/", advice)
+        advice = "start its source: 'nedbus serve --source ...'"
+        if seen.services:
+            advice = "a service answers: what is said of its sources is the reason, or they publish other vehicles"
+        text = f"{'no vehicle is' if vehicle is None else 'it is not'} seen under {seen.prefix}/"
+        state: State = "warning" if vehicle is None else "wrong"
+        yield Finding("vehicle", vehicle or "", state, text, advice)
 
 
 def _check_states(seen: Observation) -> Iterator[Finding]:
@@ -109,7 +153,7 @@ def _check_states(seen: Observation) -> Iterator[Finding]:
             continue
         state: State = "wrong" if told.severity == "bad" else "warning"
         advice = f"'nedbus why --vehicle {name}' says what preceded it"
-        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{told.since_text(now)}", advice)
+        yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}", advice)
 
 
 def _check_address(seen: Observation, address: Address, *, flows: bool) -> Iterator[Finding]:
@@ -126,11 +170,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
     if stream is not None and stream.error:
         advice = "is the publisher of this key nedbus? a newer layout needs a newer nedbus here"
         yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:_MAX_TEXT]}", advice)
-    beating = len(seen.publishers.get(key, ()))
-    sending = max(len(stream.publishers), len(stream.clocks)) if stream is not None else 0
-    if max(beating, sending) > 1:
+    if stream is not None and len(stream.publishers) > 1:
         advice = "their messages alternate for every reader: give one of the two another --vehicle, or stop it"
-        yield Finding("vehicle", name, "wrong", f"{max(beating, sending)} publishers of this address", advice)
+        yield Finding("vehicle", name, "wrong", f"{len(stream.publishers)} publishers of this address", advice)
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
@@ -172,7 +214,7 @@ def check_other_keys(seen: Observation) -> Iterator[Finding]:
         advice = f"to read them: --prefix {prefix}, or NEDBUS_PREFIX={prefix}; else give their publisher our prefix"
         text = f"messages are published under {prefix}/, and this looks under {seen.prefix}/"
         yield Finding("prefix", prefix, "warning", text, advice)
-    if seen.ros2 and not has_source(seen, "px4-zenoh"):
+    if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
         advice = "'nedbus serve --source px4-zenoh:' bridges them"
         yield Finding("ros2", "", "warning", f"ROS 2 or a PX4 publishes {topics}, and no service bridges it", advice)
@@ -184,3 +226,9 @@ def _prefix_of(key: str) -> str:
     before = vehicle.split("/")[: -1 if alive else -2]
     # `<domain>/fmu/out/vehicle_local_position` and the like belong to ROS 2.
     return "" if not before or before[0].isdecimal() else "/".join(before)
+
+
+NETWORK_CHECKS: Final = (
+    check_routers, check_permissions, check_services, check_vehicles, check_clocks, check_other_keys,
+)  # fmt: skip
+"""The checks of the network behind a router; those before it are called in `examine`."""

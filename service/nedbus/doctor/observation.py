@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus.client import ServiceStatus, find_accounts, find_services
+from nedbus.client import ServiceStatus, SourceStatus, find_accounts, find_services
 from nedbus.events import AccountReport
 from nedbus.transport import (
     PublisherToken,
@@ -27,7 +27,7 @@ from nedbus.transport import (
     query,
     while_open,
 )
-from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, address_of_alive_key, alive_key_expr, codec_of
+from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection, address_of_alive_key, codec_of
 
 T = TypeVar("T")
 
@@ -36,8 +36,7 @@ _POLL: Final = 0.02  # s; it makes a message look that much older
 _QUERY_TIMEOUT: Final = 1.0  # s
 _MAX_TIME: Final = 1e11  # s since the epoch that a service may report
 _MAX_SERVICES: Final = 20  # any peer may claim to be a service
-_MAX_PUBLISHER_KEYS: Final = 10_000
-_MAX_STREAMS: Final = 2000
+_MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
 _MAX_PUBLISHERS: Final = 8  # of each key
 _RING: Final = 16_384  # samples of a subscription that wait
@@ -54,28 +53,27 @@ class Service:
 
 @dataclass(slots=True)
 class Stream:
-    """The messages on one key.
+    """The messages and heartbeats on one key; `address` is None for a key that is not one of nedbus.
 
+    `flows`: True once a message has arrived.
     `delay`: the least time from sent to received, by the clocks of both hosts [s], None without timestamps.
-    `clocks`: the clocks that stamped them; `publishers`: their publishers, where they say so.
-    `error`: why the last one that cannot be decoded cannot.
+    `publishers`: those that say so. `error`: why the last message that cannot be decoded cannot.
     """
 
     address: Address | None
+    flows: bool = False
     delay: float | None = None
-    clocks: set[str] = field(default_factory=set)
     publishers: set[str] = field(default_factory=set)
     error: str = ""
 
     def add(self, sample: RawSample) -> None:
         """Add a message that has just arrived."""
-        age, stamp, info = _age_of(sample), sample.timestamp, sample.source_info
+        self.flows = True
+        age, info = _age_of(sample), sample.source_info
         if age is not None:
             self.delay = age if self.delay is None else min(age, self.delay)
-        if stamp is not None and len(self.clocks) < _MAX_PUBLISHERS:
-            self.clocks.add(str(stamp.get_id()))
-        if info is not None and len(self.publishers) < _MAX_PUBLISHERS:
-            self.publishers.add(entity_name(info.source_id))
+        if info is not None:
+            self.add_publisher(entity_name(info.source_id))
         definition = BY_TOPIC.get(self.address.topic) if self.address is not None else None
         if definition is not None and sample.kind == zenoh.SampleKind.PUT:
             try:
@@ -83,14 +81,19 @@ class Stream:
             except DecodeError as exc:
                 self.error = str(exc)
 
+    def add_publisher(self, name: str) -> None:
+        """Add a publisher, by its message or its heartbeat."""
+        if len(self.publishers) < _MAX_PUBLISHERS:
+            self.publishers.add(name)
+
 
 @dataclass(slots=True)
 class Observation:
-    """A network as this client sees it, and what the doctor was asked for.
+    """A network as this client sees it, and the question to the doctor.
 
     `version`: of this nedbus; `vehicle`: the one to look at, None for all; `verdict`: whether it may be written.
     `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
-    `streams`: messages by key; `publishers`: those whose heartbeats came, by key; `listened`: for how long [s].
+    `streams`: messages and heartbeats by key; `listened`: for how long [s].
     `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
     `routers`: those that tell this client of their sessions; `accounts`: vehicles as services remember them.
     """
@@ -98,18 +101,26 @@ class Observation:
     prefix: str
     version: str
     vehicle: str | None
-    has_tls: bool
     verdict: Verdict | None = None
     services: list[Service] = field(default_factory=list)
     accounts: list[AccountReport] = field(default_factory=list)
     alive: list[Address] = field(default_factory=list)
     ages: dict[Address, float | None] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
-    publishers: dict[str, set[str]] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
     ros2: list[PublisherToken] = field(default_factory=list)
     routers: list[RouterState] = field(default_factory=list)
     listened: float = 0.0
+
+    @property
+    def sources(self) -> list[SourceStatus]:
+        """The sources of all services."""
+        return [source for service in self.services for source in service.status.sources]
+
+    @property
+    def flowing(self) -> set[Address]:
+        """The addresses of which messages have arrived."""
+        return {each.address for each in self.streams.values() if each.flows and each.address is not None}
 
     def observe(self, session: Session, *, listen: float) -> None:
         """Listen and ask, for little more than `listen` seconds."""
@@ -120,13 +131,14 @@ class Observation:
         self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
         self.services = _ask_services(session, prefix)
         self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
-        tokens = alive_keys(session, alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
+        tokens = alive_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
         self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
         tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
-        kept = query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT)
-        self.ages = {each: _age_of(sample) for sample in kept if (each := _address_of(str(sample.key_expr), prefix))}
+        for sample in query(session, f"{prefix}/*/**", timeout=_QUERY_TIMEOUT):
+            for address in _parse_each(self._address_of, [str(sample.key_expr)]):
+                self.ages[address] = _age_of(sample)
         tokens = alive_keys(session, "**/@alive/**", timeout=_QUERY_TIMEOUT)
         others = {key for key in tokens if not key.startswith("@")}
         self._add_messages(take_messages())
@@ -136,24 +148,27 @@ class Observation:
         while time.monotonic() < end:
             time.sleep(_POLL)
             self._add_messages(take_messages())
-            for sample in take_others():
-                key = str(sample.key_expr)
-                if len(others) < _MAX_STREAMS and len(key) < _MAX_KEY_LENGTH and key.endswith(f"/{DEFAULT_TOPIC}"):
-                    others.add(key)
+            keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
+            others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
             for key, publisher in take_heartbeats():
-                if key in self.publishers or len(self.publishers) < _MAX_PUBLISHER_KEYS:
-                    self.publishers.setdefault(key, set()).add(publisher)
+                if (beating := self._stream(key)) is not None:
+                    beating.add_publisher(publisher)
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 
     def _add_messages(self, samples: Iterable[RawSample]) -> None:
         for sample in samples:
-            key = str(sample.key_expr)
-            if key not in self.streams:
-                if len(self.streams) >= _MAX_STREAMS or len(key) > _MAX_KEY_LENGTH:
-                    continue
-                self.streams[key] = Stream(_address_of(key, self.prefix))
-            self.streams[key].add(sample)
+            if (stream := self._stream(str(sample.key_expr))) is not None:
+                stream.add(sample)
+
+    def _stream(self, key: str) -> Stream | None:
+        """Return the stream on a key, None for one too many."""
+        if key not in self.streams and len(self.streams) < _MAX_KEYS and len(key) <= _MAX_KEY_LENGTH:
+            self.streams[key] = Stream(next(iter(_parse_each(self._address_of, [key])), None))
+        return self.streams.get(key)
+
+    def _address_of(self, key: str) -> Address:
+        return Address.from_key(key, prefix=self.prefix)
 
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
@@ -182,13 +197,8 @@ def _age_of(sample: RawSample) -> float | None:
     return None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
 
-def _address_of(key: str, prefix: str) -> Address | None:
-    found = _parse_each(lambda key: Address.from_key(key, prefix=prefix), [key])
-    return found[0] if found else None
-
-
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Return what these keys are, without those that cannot be parsed."""
+    """Parse keys, without those that cannot be parsed."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

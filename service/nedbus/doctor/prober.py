@@ -35,7 +35,7 @@ _OTHER_HOST: Final = (62, 64)
 
 
 def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
-    """Yield the findings on the way to one router, up to the first thing that is wrong."""
+    """Yield the findings on one router, up to the first that is wrong."""
     if unreachable := reach_endpoint(endpoint):
         yield unreachable
         return
@@ -59,7 +59,7 @@ def check_endpoint(endpoint: str, tls: Tls | None) -> Iterator[Finding]:
 
 
 def reach_endpoint(endpoint: str) -> Finding | None:
-    """Return why an endpoint cannot be reached, None if it can, or cannot be told; of UDP and QUIC only by name."""
+    """Return a finding if an endpoint cannot be reached, else None; of UDP and QUIC only names are looked up."""
     parts = split_endpoint(endpoint)
     if parts is None:  # a socket in the file system
         return None
@@ -85,7 +85,7 @@ def reach_endpoint(endpoint: str) -> Finding | None:
 
 
 def _check_router_certificate(endpoint: str, host: str, port: int, tls: Tls | None) -> Iterator[Finding]:
-    """Yield the validity of the router's certificate, whether it is trusted, and why the router rejects ours."""
+    """Yield the validity of the router's certificate, and a finding if one side rejects the other."""
     pem = _read_certificate(host, port)
     if not pem:
         seen, advice = "it does not speak TLS", "write tcp/, or name the endpoint of a Zenoh router with TLS"
@@ -143,27 +143,26 @@ def _shake_hands(host: str, port: int, tls: Tls) -> None:
 def check_tls_files(settings: Settings) -> tuple[list[tuple[str, Finding]], Tls | None]:
     """Return the findings on the TLS files of these settings, each with its setting, and the files if they work."""
     given = {name: path for name in _PEM_FILES if (path := getattr(settings, name)) is not None}
-    found = ((name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items())
+    found = [(name, check_pem_file(name, path, _PEM_FILES[name])) for name, path in given.items()]
     findings = [(name, finding) for name, finding in found if finding is not None]
     wrong = {finding.seen for _, finding in findings if finding.state == "wrong"}
+    tls, advice = None, ""
     try:
+        if settings.tls is not None:
+            settings.tls.zenoh_settings()
         tls = settings.tls
-        if tls is not None:
-            tls.zenoh_settings()
-    except ConfigError as exc:
-        if exc.reason not in wrong and not settings.left_out & _PEM_FILES.keys():
-            name, path = list(given.items())[-1]
-            findings.append((name, Finding("certificate", str(path), "wrong", exc.reason)))
-        return findings, None
-    if tls is not None and not wrong and not settings.left_out & _PEM_FILES.keys() and (reason := tls.explain()):
-        name = "tls_certificate" if tls.certificate else "tls_ca"
+        reason = tls.explain() if tls is not None and not wrong else None
         advice = "give a certificate that the same authority has signed as the router's"
+    except ConfigError as exc:
+        reason = exc.reason
+    if reason and reason not in wrong and not settings.left_out & _PEM_FILES.keys():
+        name = "tls_certificate" if "tls_certificate" in given else list(given)[-1]
         findings.append((name, Finding("certificate", str(given[name]), "wrong", reason, advice)))
     return findings, tls
 
 
 def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
-    """Return whether the certificate of a setting is valid, and until when; None for a private key without a fault."""
+    """Return the validity of a setting's certificate; None for a private key without a fault."""
     kind = "PRIVATE KEY" if name.endswith("_key") else "CERTIFICATE"
     try:
         check_pem(path, kind)
@@ -173,7 +172,7 @@ def check_pem_file(name: str, path: Path, whose: str) -> Finding | None:
 
 
 def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[Finding, Certificate | None]:
-    """Return whether a certificate is valid now, and for how long; and the certificate if it can be read."""
+    """Return the validity of a certificate, and the certificate if it can be read."""
     try:
         certificate = Certificate.decode(pem, pem=True)
     except ConfigError as exc:  # the package that reads it is missing

@@ -5,12 +5,12 @@ in `detectors.py` or `position.py`.
 """
 
 from .account import KEPT, Account
-from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State, to_age
+from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State
 from .faults import VALID, Expectation, faults_of, merge_vehicles
 from .report import FORGOTTEN, QUESTION, AccountReport, VehicleReport, by_vehicle, from_json, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, about, spans_of, state_at, tell
-from .times import Times, to_clock
+from .times import Times, since_text, to_age, to_clock
 from .vehicle import Vehicle
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "from_json",
     "merge_vehicles",
     "report_of",
+    "since_text",
     "spans_of",
     "state_at",
     "tell",

@@ -1,4 +1,4 @@
-"""The account of what happened: all vehicles, in the order of events, within bounds; no I/O."""
+"""The account of all vehicles: their events in order, within bounds; no I/O."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NONE: Final[frozenset[str]] = frozenset()
 class Account:
     """Follow vehicles; samples may come from another thread than looks and questions.
 
-    `events`: the last ones, in the order in which they were told; `told`: the number of all; `counts`: of all, by
+    `events`: the last ones, in the order of their reports; `told`: the number of all; `counts`: of all, by
     vehicle and severity.
     """
 
@@ -48,15 +48,13 @@ class Account:
     ) -> None:
         """Add a message: a model, a row, or fields by name; `missing` fields were not provided."""
         with self._lock:
-            vehicle = self._vehicle(address.vehicle)
-            if vehicle is not None:
+            if vehicle := self._vehicle(address.vehicle):
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
     def reject(self, address: Address, reason: str, time: float) -> None:
-        """Note a message that was rejected."""
+        """Add a message that was rejected."""
         with self._lock:
-            vehicle = self._vehicle(address.vehicle)
-            if vehicle is not None:
+            if vehicle := self._vehicle(address.vehicle):
                 vehicle.reject(address.stream, reason, time)
 
     def look(
@@ -68,7 +66,7 @@ class Account:
         dropped: int = 0,
         is_behind: bool = False,
     ) -> None:
-        """Note how streams arrive now.
+        """Update from the states of streams, the link and this reader.
 
         `states`: by address, "stale", "gone" or another; None where that is not known. `link`: "" or what is wrong with
         it. `dropped`: the messages that this reader has not read in time since it began; `is_behind`: many wait for it.
@@ -88,7 +86,7 @@ class Account:
                 vehicle.look(time, state, is_connected=not link)
 
     def settle(self, time: float) -> None:
-        """Tell what is over by this time, at the end of a file."""
+        """Report all that is over by this time; called at the end of a file."""
         with self._lock:
             for vehicle in (self._common, *self.vehicles.values()):
                 vehicle.settle(time)

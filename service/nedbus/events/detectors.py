@@ -20,7 +20,6 @@ _UNKNOWN_SATELLITES: Final = 255
 class Finding:
     """The meaning of a change of one message; the vehicle makes an event of it.
 
-    `flags`: those that begin or end; a condition holds for each.
     `on_ground`: its severity while the vehicle is disarmed, where that is another.
     `first`: the text of an end where the condition has held since the first message.
     `initial`: it held at the first message: a condition, and no event.
@@ -32,7 +31,6 @@ class Finding:
     text: str
     names: tuple[str, ...] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
-    flags: tuple[str, ...] = ("",)
     on_ground: Severity | None = None
     first: str = ""
     initial: bool = False
@@ -75,7 +73,7 @@ class ChangeDetector:
         self._read_all = FieldReader(("timestamp", *compared, *told))
         self._detect = detect
         self._last: object = None
-        self._state: tuple[Any, ...] | None = None
+        self._state: tuple[Any, ...] = ()
         self._missing = _NONE
         self.stamp = self.earlier = 0
 
@@ -86,19 +84,14 @@ class ChangeDetector:
         last, self._last = self._last, message
         if state == self._state and (missing is self._missing or missing == self._missing):
             return None
-        return self._change(last, message, state, missing)
-
-    def forget(self) -> None:
-        """Begin anew: the vehicle has rebooted."""
-        self._last = self._state = None
-        self.stamp = self.earlier = 0
-
-    def _change(
-        self, last: object, message: object, state: tuple[Any, ...], missing: frozenset[str]
-    ) -> Iterator[Finding]:
         before = {} if last is None else self._by_name(last, self._missing)
         self._state, self._missing = state, missing
         return self._detect(before, self._by_name(message, missing))
+
+    def forget(self) -> None:
+        """Begin anew: the vehicle has rebooted."""
+        self._last, self._state = None, ()
+        self.stamp = self.earlier = 0
 
     def _by_name(self, message: object, missing: frozenset[str]) -> Fields:
         values = zip(self._read_all.names, self._read_all(message), strict=True)
@@ -142,12 +135,9 @@ class GpsDetector(ChangeDetector):
             text = f"{'only ' * is_few}{satellites} satellites"
             yield from self._detect_level("few_satellites", is_few, is_enough, text, {"satellites": satellites})
         indicator, state = after["jamming_indicator"] or 0, after["jamming_state"] or 0
+        begins, ends = indicator >= rules.JAMMING_BEGIN or state > 1, indicator < rules.JAMMING_END and state <= 1
         text = f"GNSS jamming: indicator {indicator}" + (f", state {state}" if state > 1 else "")
-        is_jammed, is_clear = (
-            state > 1 or indicator >= rules.JAMMING_BEGIN,
-            state <= 1 and indicator < rules.JAMMING_END,
-        )
-        yield from self._detect_level("jamming", is_jammed, is_clear, text, {"indicator": indicator, "state": state})
+        yield from self._detect_level("jamming", begins, ends, text, {"indicator": indicator, "state": state})
         spoofed = after["spoofing_state"] or 0
         text = f"GNSS spoofing: state {spoofed}"
         yield from self._detect_level("spoofing", spoofed > 1, spoofed <= 1, text, {"state": spoofed})
@@ -185,21 +175,21 @@ def make_detector(message: str) -> ChangeDetector | None:
 def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
     """Yield the flags that begin and end; one that was not known, or is not known any more, is no event."""
     for rule in flag_rules:
-        found: dict[tuple[Change, bool], list[str]] = {}
+        found: dict[tuple[bool, Change], list[str]] = {}  # by whether it is an event: initial conditions are none
         for name in rule.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == rule.bad and rule.initial:
-                found.setdefault(("begin", True), []).append(name)
+                found.setdefault((False, "begin"), []).append(name)
             elif now is None and was == rule.bad:
-                found.setdefault(("end", True), []).append(name)
+                found.setdefault((False, "end"), []).append(name)
             elif was is not None and now is not None and was != now:
-                found.setdefault(("begin" if now == rule.bad else "end", False), []).append(name)
-        for (change, initial), flags in sorted(found.items(), key=lambda item: (not item[0][1], item[0][0])):
+                found.setdefault((True, "begin" if now == rule.bad else "end"), []).append(name)
+        for (is_event, change), flags in sorted(found.items()):
             is_info = change == "end" or rule.minor.issuperset(flags)
             text = (rule.begin if change == "begin" else rule.end).format(", ".join(rule.flags[name] for name in flags))
             yield Finding(
-                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), flags=tuple(flags),
-                on_ground=rule.on_ground, first=rule.first, initial=initial,
+                rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), on_ground=rule.on_ground,
+                first=rule.first, initial=not is_event,
             )  # fmt: skip
 
 

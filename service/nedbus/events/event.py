@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, Literal, get_args
+from typing import Annotated, Final, Literal, get_args
+
+from pydantic import Field
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
-"""The worst first: bad keeps a vehicle from its task, watch may become bad, info is what happens in any flight."""
+"""The worst first: bad keeps a vehicle from its task, watch may become bad, info occurs in any flight."""
 
 WINDOW: Final = 10.0
 """Seconds before an event in which others count as evidence; of conditions that go on, the begin counts at any time."""
 
 ALL: Final = "*"
 """The vehicle of events of the link, and of the reader itself, which concern all."""
+
+Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
+"""A time by the account's clock; the bounds apply to reports of peers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +39,7 @@ class Event:
     change: Literal["begin", "end", "once"]
     severity: Literal["bad", "watch", "info"]
     text: str
-    time: float
+    time: Seconds
     boot: float | None = None
     topic: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
@@ -42,10 +47,20 @@ class Event:
     lasted: float | None = None
     evidence: tuple[Event, ...] = ()
 
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """The same for one event of a vehicle in the reports of two services."""
+        return self.kind, self.time, self.names
+
+    @property
+    def is_notable(self) -> bool:
+        """True for a begin that is bad or to be watched, and for a change of mode: both belong to a story."""
+        return self.change != "end" and (self.severity != "info" or self.kind == "mode")
+
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A condition of a vehicle: since when it holds, by the account's clock, and the event that began it.
+    """A condition of a vehicle, its begin by the account's clock, and the event that began it.
 
     `initial`: it held at the first message already: it began at an unknown time before.
     `on_ground`: its severity while the vehicle is disarmed, where that is another.
@@ -54,7 +69,7 @@ class Condition:
     kind: str
     severity: Literal["bad", "watch", "info"]
     text: str
-    since: float
+    since: Seconds
     begin: Event
     initial: bool = False
     on_ground: Literal["bad", "watch", "info"] | None = None
@@ -62,7 +77,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of a vehicle now: its severity ("info" is well), in words, since when, and all that holds."""
+    """The state of a vehicle now: severity ("info" is well), text, begin, and all conditions."""
 
     severity: Severity
     text: str
@@ -149,12 +164,3 @@ def explain(event: Event, before: Iterable[Event], conditions: Iterable[Conditio
         if condition.kind in kinds and condition.severity != "info" and event.change != "end" and is_before:
             latest.setdefault(condition.kind, condition.begin)
     return sorted(latest.values(), key=lambda each: each.time)
-
-
-def to_age(seconds: float) -> str:
-    """Return a duration in a suitable unit, as text."""
-    if seconds < 1:
-        return f"{max(0.0, seconds) * 1e3:.0f} ms"
-    if seconds < 120:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"

@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from .event import to_age
-from .report import AccountReport, VehicleReport, by_vehicle, since_text
-from .times import to_clock
+from .event import ALL
+from .report import AccountReport, VehicleReport, by_vehicle
+from .times import since_text, to_age, to_clock
 
 VALID: Final[Mapping[str, str]] = {
     "xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid",
@@ -36,59 +36,53 @@ class Expectation:
 def faults_of(
     reports: Sequence[AccountReport], expected: Expectation, *, heard: Collection[str] = (), only: str | None = None
 ) -> list[str]:
-    """Return what is wrong, a line each.
+    """Return the faults, a line each.
 
     `heard`: vehicles that are heard, though no service knows of them. `only`: judge the services of this host alone.
     """
     judged = [report for report in reports if only is None or report.host == only]
     vehicles = merge_vehicles(judged)
-    faults = [*_missing(expected, vehicles, heard)]
+    missing = [name for name in expected.expect if name not in vehicles and name not in heard]
+    faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
+    flying = sorted({name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard))
+    if len(flying) < (expected.vehicles or 0):
+        names = f": {', '.join(flying[:20])}" if flying else ""
+        faults.append(f"{len(flying)} of {expected.vehicles} vehicles are heard{names}")
     for name, (now, vehicle) in sorted(vehicles.items()):
-        if expected.expect and name not in expected.expect:
-            continue
-        if vehicle.is_silent:
-            if name in expected.expect or not vehicle.is_forgotten(now):
-                faults.append(f"vehicle {name}: {vehicle.text}{vehicle.since_text(now)}")
-            continue
-        invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
-        if invalid:
-            since = min(vehicle.flags[VALID[each]] for each in invalid)
-            faults.append(f"vehicle {name}: {', '.join(invalid)} not valid{since_text(since, now)}")
-        elif expected.well and vehicle.severity == "bad":
-            faults.append(f"vehicle {name}: {vehicle.text}{vehicle.since_text(now)}")
-        elif expected.valid and not vehicle.has_position:
-            faults.append(f"vehicle {name}: it sends no position")
-    if expected.within is not None:
-        faults += _lately(judged, expected, expected.within)
-    return list(dict.fromkeys(faults))
+        if not expected.expect or name in expected.expect:
+            faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
+    return list(dict.fromkeys([*faults, *_lately(judged, expected)]))
 
 
 def merge_vehicles(reports: Iterable[AccountReport]) -> dict[str, tuple[float, VehicleReport]]:
-    """Return what is known of each vehicle, and when: by a service that hears it, if one does."""
+    """Return the report on each vehicle and its time, by a service that hears it if there is one."""
     return {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(reports).items()}
 
 
-def _missing(
-    expected: Expectation, vehicles: Mapping[str, tuple[float, VehicleReport]], heard: Collection[str]
-) -> Iterator[str]:
-    for name in expected.expect:
-        if name not in vehicles and name not in heard:
-            yield f"vehicle {name} is missing: it has no publisher"
-    flying = {name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard)
-    if expected.vehicles is not None and len(flying) < expected.vehicles:
-        names = f": {', '.join(sorted(flying)[:20])}" if flying else ""
-        yield f"{len(flying)} of {expected.vehicles} vehicles are heard{names}"
+def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: Expectation) -> Iterator[str]:
+    invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
+    if vehicle.is_silent:
+        if name in expected.expect or not vehicle.is_forgotten(now):
+            yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+    elif invalid:
+        since = min(vehicle.flags[VALID[each]] for each in invalid)
+        yield f"{', '.join(invalid)} not valid{since_text(since, now)}"
+    elif expected.well and vehicle.severity == "bad":
+        yield f"{vehicle.text}{since_text(vehicle.since, now)}"
+    elif expected.valid and not vehicle.has_position:
+        yield "it sends no position"
 
 
-def _lately(reports: Sequence[AccountReport], expected: Expectation, within: float) -> Iterator[str]:
-    lines = [
-        f"{'vehicle ' * (event.vehicle != '*')}{event.vehicle.replace('*', report.host)}: {event.text}, at "
-        f"{to_clock(event.time)} UTC, {to_age(max(0.0, report.now - event.time))} ago"
-        for report in reports
-        for event in report.events
-        if event.severity != "info" and event.time > report.now - within
-        and (not expected.expect or event.vehicle in (*expected.expect, "*"))
-    ]  # fmt: skip
+def _lately(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
+    lines = []
+    for report in reports:
+        for event in report.events:
+            is_late = expected.within is not None and event.time > report.now - expected.within
+            is_asked = not expected.expect or event.vehicle in (*expected.expect, ALL)
+            if is_late and is_asked and event.severity != "info":
+                name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
+                at = f"{to_clock(event.time)} UTC, {to_age(report.now - event.time)} ago"
+                lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_LINES]
     if len(lines) > _MAX_LINES:
-        yield f"{len(lines) - _MAX_LINES} events more in the last {within:g} s"
+        yield f"{len(lines) - _MAX_LINES} events more in the last {expected.within:g} s"

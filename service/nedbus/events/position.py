@@ -18,13 +18,16 @@ _COMPARED: Final = (
     "xy_valid", *(name for rule in _RULES for name in rule.flags if name != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
-# The fields that are told when one of these changes, with PX4's values for those that are not given.
+# The fields that are read when one of these changes, with the values for those that are not given.
 _TOLD: Final[Mapping[str, object]] = {
-    **dict.fromkeys(("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom"), math.nan),
-    **dict.fromkeys(("delta_z", "delta_vz", "delta_heading", "delta_dist_bottom"), math.nan),
-    **dict.fromkeys(("ref_lat", "ref_lon", "ref_alt"), math.nan),
+    **dict.fromkeys(
+        (
+            "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom", "delta_z", "delta_vz",
+            "delta_heading", "delta_dist_bottom", "ref_lat", "ref_lon", "ref_alt",
+        ), math.nan,
+    ),
     **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
-}
+}  # fmt: skip
 _MIN_STEP: Final = JUMP_DISTANCE / 2  # m to one side; a smaller step is no jump, whatever the velocity
 _MAX_INTERVAL: Final = 0.5  # s between two messages that a jump is looked for in
 
@@ -36,8 +39,7 @@ class PositionDetector(ChangeDetector):
 
     def __init__(self) -> None:
         super().__init__(_COMPARED, self._detect_position, told=tuple(_TOLD))
-        self._read_motion = FieldReader(("timestamp", "x", "y", "vx", "vy"), math.nan)
-        self._read_state = FieldReader(_COMPARED)
+        self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
         self._jump: Step | None = None  # by now
@@ -46,12 +48,10 @@ class PositionDetector(ChangeDetector):
         """Add a message; return None while nothing changes."""
         before, motion = self._motion, self._read_motion(message)
         self._motion_before, self._motion = before, motion
-        self.earlier, self.stamp, state = self.stamp, motion[0], self._read_state(message)
-        last, self._last = self._last, message
-        if state != self._state or not (missing is self._missing or missing == self._missing):
-            return self._change(last, message, state, missing)
-        has_moved = abs(motion[1] - before[1]) > _MIN_STEP or abs(motion[2] - before[2]) > _MIN_STEP
-        step = self._unexplained_step() if has_moved and state[0] else None
+        if (found := super().add(message, missing)) is not None:
+            return found
+        has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
+        step = self._unexplained_step() if has_moved and self._state[0] else None
         return None if step is None and self._jump is None else self._follow_jump(step)
 
     def forget(self) -> None:
@@ -76,11 +76,11 @@ class PositionDetector(ChangeDetector):
         yield from detect_flags(_RULES, before, after)
 
     def _unexplained_step(self) -> Step | None:
-        """Return the last step beyond what the velocity explains; None if it explains all of it."""
+        """Return the part of the last step that the velocity does not explain; None if it is small."""
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
-        (_, x_before, y_before, vx_before, vy_before), (_, x, y, vx, vy) = self._motion_before, self._motion
+        (x_before, y_before, vx_before, vy_before), (x, y, vx, vy) = self._motion_before, self._motion
         north, east = x - x_before - (vx + vx_before) / 2 * seconds, y - y_before - (vy + vy_before) / 2 * seconds
         limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
         return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
@@ -98,7 +98,7 @@ class PositionDetector(ChangeDetector):
 
 
 def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
-    """Return a reset, with its size as far as the message tells it: deltas of what was not reset are old."""
+    """Return a reset, with the size of each quantity whose delta is of this reset."""
     numbers: dict[str, float] = {}
     words = []
     explained = {name for name in quantities if name not in track.discontinued}

@@ -15,9 +15,9 @@ class FlagRule:
 
     `flags`: by field, with the word for each; flags that change with one message are one event.
     `severity`: of the begin, and `on_ground` while the vehicle is known to be disarmed; an end is always info.
-    `begin`, `end`: what is said, with `{}` for the words. `first`: said when it never held before.
+    `begin`, `end`: the texts, with `{}` for the words. `first`: that of the end of an initial condition.
     `minor`: flags of which the begin is info too.
-    `initial`: what holds at the first message already is a condition too.
+    `initial`: a flag that is set in the first message is a condition too.
     """
 
     kind: str
@@ -49,12 +49,11 @@ _HEIGHTS: Final = {
 }  # fmt: skip
 _FAULTS: Final = {
     "cs_mag_field_disturbed": "magnetic field disturbed", "cs_mag_fault": "magnetometer",
-    "cs_rng_fault": "range finder",
-    "cs_gnss_yaw_fault": "GNSS yaw", "cs_ev_yaw_fault": "vision yaw", "cs_baro_fault": "barometer",
-    "cs_gnss_fault": "GNSS", "cs_gnss_hgt_fault": "GNSS height", "fs_bad_mag_x": "magnetometer x",
-    "fs_bad_mag_y": "magnetometer y", "fs_bad_mag_z": "magnetometer z", "fs_bad_hdg": "heading",
-    "fs_bad_mag_decl": "declination", "fs_bad_airspeed": "airspeed", "fs_bad_sideslip": "sideslip",
-    "fs_bad_optflow_x": "optical flow x", "fs_bad_optflow_y": "optical flow y",
+    "cs_rng_fault": "range finder", "cs_gnss_yaw_fault": "GNSS yaw", "cs_ev_yaw_fault": "vision yaw",
+    "cs_baro_fault": "barometer", "cs_gnss_fault": "GNSS", "cs_gnss_hgt_fault": "GNSS height",
+    "fs_bad_mag_x": "magnetometer x", "fs_bad_mag_y": "magnetometer y", "fs_bad_mag_z": "magnetometer z",
+    "fs_bad_hdg": "heading", "fs_bad_mag_decl": "declination", "fs_bad_airspeed": "airspeed",
+    "fs_bad_sideslip": "sideslip", "fs_bad_optflow_x": "optical flow x", "fs_bad_optflow_y": "optical flow y",
     "fs_bad_acc_vertical": "accelerometer, vertical", "fs_bad_acc_clipping": "accelerometer clips",
     "fs_bad_acc_bias": "accelerometer bias", "fs_bad_vel_n": "velocity north", "fs_bad_vel_e": "velocity east",
     "fs_bad_vel_d": "velocity down", "fs_bad_pos_n": "position north", "fs_bad_pos_e": "position east",
@@ -126,47 +125,31 @@ RULES: Final[Mapping[str, tuple[FlagRule, ...]]] = {
     ),
 }  # fmt: skip
 
+_FLAGGED: Final = frozenset(rule.kind for rules in RULES.values() for rule in rules)
+
+
+def flags_of(kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the flags for each of which a condition holds: the names of its event, or "" where it has no flags."""
+    return names if kind in _FLAGGED else ("",)
+
+
 RECENT: Final = 60.0
-"""Seconds for which something that happened once is a reason to watch a vehicle."""
+"""Seconds for which a single event is a reason to watch a vehicle."""
 
-MAX_SILENCE: Final = 3.0
-"""Seconds without a position after which a vehicle is silent, where nothing better is known of its stream."""
-
-MIN_FIX_TYPE: Final = 3
-"""The fix_type of SensorGps from which on a position is a fix in three dimensions."""
-
-FEW_SATELLITES: Final = 6
-"""Fewer satellites are few (PX4's EKF2_REQ_NSATS), until there are ENOUGH_SATELLITES."""
-
+MAX_SILENCE: Final = 3.0  # s without a position until a vehicle is silent, where its stream has no state
+MIN_FIX_TYPE: Final = 3  # of SensorGps: a fix in three dimensions
+FEW_SATELLITES: Final = 6  # fewer are few (PX4's EKF2_REQ_NSATS), until there are enough
 ENOUGH_SATELLITES: Final = 7
-
-JAMMING_BEGIN: Final = 80
-"""The jamming_indicator that PX4's guide to logs calls too high, until it is below JAMMING_END."""
-
+JAMMING_BEGIN: Final = 80  # jamming_indicator that PX4's guide to logs calls too high
 JAMMING_END: Final = 60
-
-JUMP_DISTANCE: Final = 1.0
-"""Metres: a jump is more than this, and JUMP_SHARE of the distance flown, beyond what the velocity explains."""
-
+JUMP_DISTANCE: Final = 1.0  # m beyond what the velocity explains, beside a share of the distance flown
 JUMP_SHARE: Final = 0.2
-
-SMALL_RESET: Final = 0.5
-"""Metres, and metres a second, below which a reset is nothing to watch."""
-
-FLAPPING_CHANGES: Final = 4
-"""Changes of a condition within WINDOW after which further ones are told when they end."""
-
-PAUSE: Final = 5.0
-"""Seconds without another one after which flapping, losses, rejections or an overload of the reader are over."""
-
-MAX_BURST: Final = 20.0
-"""Seconds after which losses are told, though more may follow."""
-
-OUTLIVING: Final = ("silent", "gone", "rejected")
-"""Conditions that a reboot does not end."""
-
-ARMED: Final = 2
-"""The arming_state of a vehicle that is armed."""
+SMALL_RESET: Final = 0.5  # m, or m/s: a smaller reset is nothing to watch
+FLAPPING_CHANGES: Final = 4  # of a condition within WINDOW; of further ones only the last is reported
+PAUSE: Final = 5.0  # s without another one until flapping, losses, rejections or an overload are over
+MAX_BURST: Final = 20.0  # s after which losses are reported, though more may follow
+OUTLIVING: Final = ("silent", "gone", "rejected")  # conditions that a reboot does not end
+ARMED: Final = 2  # arming_state
 
 MODES: Final[Mapping[int, str]] = {
     0: "Manual", 1: "Altitude", 2: "Position", 3: "Mission", 4: "Hold", 5: "Return", 6: "Position Slow",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import logging
 import socket
 import threading
@@ -10,7 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple
 
 from nedbus.errors import ConfigError, ListenError
 from nedbus.log_event import about
@@ -36,13 +37,18 @@ class Page(NamedTuple):
         return cls(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
     @classmethod
+    def json(cls, content: Mapping[str, Any]) -> Page:
+        """Return a page of JSON."""
+        return cls(200, "application/json", json.dumps(content, indent=2).encode())
+
+    @classmethod
     def verdict(cls, faults: list[str], good: str) -> Page:
         """Return the faults, a line each, with status 503; `good` if there are none."""
         return cls.text("\n".join(faults), status=503) if faults else cls.text(good)
 
 
-class HttpServer:
-    """Serve pages by path on HOST:PORT, in threads of its own, until it is closed.
+class HttpServer(ThreadingHTTPServer):
+    """Serve pages by path on HOST:PORT, 16 clients at a time, in threads of its own, until it is closed.
 
     DNS rebinding: a foreign page in a browser on this network may point its own name at this host and read what is
     answered under that name. So a page is answered under names that only lead here: addresses, localhost, the names of
@@ -52,70 +58,52 @@ class HttpServer:
     Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
     """
 
+    daemon_threads = True
+    request_queue_size = 2 * _MAX_REQUESTS  # with Python's five the sixth that connects at once waits for a second
+
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
         try:
             host, port = split_http(where)
         except ValueError as exc:
             raise ConfigError("--http", str(exc)) from exc
-        try:
-            self._server = _Server(host, port, pages)
-        except OSError as exc:
-            reason = (exc.strerror or str(exc)).lower()
-            raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
-        self.port: int = self._server.server_address[1]
-        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.2,), name="nedbus-http", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop listening, at once also while a client waits for a free thread."""
-        self._server.stop_waiting()
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Server(ThreadingHTTPServer):
-    """Answer a limited number of clients at a time; beyond it, disconnect the one that has been silent for longest."""
-
-    daemon_threads = True
-    request_queue_size = 2 * _MAX_REQUESTS  # with Python's five the sixth that connects at once waits for a second
-
-    def __init__(self, host: str, port: int, pages: Mapping[str, Callable[[], Page]]) -> None:
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self.pages, self.is_local = pages, is_loopback(host)
         self._free = threading.Semaphore(_MAX_REQUESTS)
-        self._is_closing = False
-        self.silent: dict[socket.socket, None] = {}  # clients without a request yet, the oldest first
-        super().__init__((host, port), _Handler)
+        try:
+            super().__init__((host, port), _Handler)
+        except OSError as exc:
+            reason = (exc.strerror or str(exc)).lower()
+            raise ListenError([f"http://{where}"], reason, hint="choose another address with --http") from exc
+        self.port: int = self.server_address[1]
+        threading.Thread(target=self.serve_forever, args=(0.2,), name="nedbus-http", daemon=True).start()
 
-    def process_request(self, request: Any, client_address: object) -> None:
-        if not self._free.acquire(blocking=False):
-            for oldest in list(self.silent)[:1]:
-                with suppress(OSError):  # it has disconnected
-                    oldest.shutdown(socket.SHUT_RDWR)
-                self.silent.pop(oldest, None)
-            if self._is_closing or not self._free.acquire(timeout=_CLIENT_TIMEOUT):
-                self.shutdown_request(request)
-                return
-        self.silent[request] = None
-        super().process_request(request, client_address)
+    def close(self) -> None:
+        """Stop listening, at once also while a client waits for a free thread."""
+        self._free.release(_MAX_REQUESTS)
+        self.shutdown()
+        self.server_close()
 
-    def stop_waiting(self) -> None:
-        """Accept no further client, and wait no longer for a free thread."""
-        self._is_closing = True
-        self._free.release()
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a client in a thread of its own; while all are busy, let it wait a few seconds for one."""
+        if self._free.acquire(timeout=_CLIENT_TIMEOUT):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
 
-    def process_request_thread(self, request: Any, client_address: object) -> None:
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer a client, and give the thread back."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.silent.pop(request, None)
             self._free.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
+        """Log a client that went away."""
         _log.debug("an HTTP client went away", exc_info=True)
 
 
 class _Handler(BaseHTTPRequestHandler):
+    server: HttpServer
     timeout = _CLIENT_TIMEOUT  # of each receive, and of the whole answer
     server_version = "nedbus"
     sys_version = ""
@@ -129,21 +117,8 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             deadline.cancel()
 
-    def parse_request(self) -> bool:
-        """Parse the request; from now on its client is answered, however many others connect."""
-        is_valid = super().parse_request()
-        cast("_Server", self.server).silent.pop(self.connection, None)
-        return is_valid
-
     def do_GET(self) -> None:
-        server = cast("_Server", self.server)
-        path = self.path.partition("?")[0]
-        host = self.headers.get("Host") or "localhost"  # every browser names it
-        is_refused = (server.is_local or path not in _ANY_NAME) and not _leads_here(host, local=server.is_local)
-        if path in server.pages and is_refused:
-            page = Page.text(f"{path} is answered under an address or a name of this host only", status=403)
-        else:
-            page = _make_page(server.pages, path)
+        page = self._make_page(self.path.partition("?")[0])
         self.send_response(page.status)
         self.send_header("Content-Type", page.content_type)
         self.send_header("Content-Length", str(len(page.content)))
@@ -158,12 +133,25 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         _log.debug(format, *args)
 
+    def _make_page(self, path: str) -> Page:
+        pages, is_local = self.server.pages, self.server.is_local
+        if path not in pages:
+            return Page.text(f"there is {', '.join(pages)}", status=200 if path == "/" else 404)
+        host = self.headers.get("Host") or "localhost"  # every browser names it
+        if (is_local or path not in _ANY_NAME) and not leads_here(host, local=is_local):
+            return Page.text(f"{path} is answered under an address or a name of this host only", status=403)
+        try:
+            return pages[path]()
+        except Exception:  # noqa: BLE001 - of one page, not of the server
+            _log.exception("%s failed", path, extra=about("bug"))
+            return Page.text("an unexpected error: the log has it", status=500)
+
     def _stop_receiving(self) -> None:
         with suppress(OSError):  # the client has disconnected
             self.connection.shutdown(socket.SHUT_RD)
 
 
-def _leads_here(host: str, *, local: bool) -> bool:
+def leads_here(host: str, *, local: bool) -> bool:
     """Return whether a Host header is a name that no foreign page can point at this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")
@@ -175,14 +163,3 @@ def _leads_here(host: str, *, local: bool) -> bool:
 @cache
 def _names() -> set[str]:
     return {socket.gethostname().lower(), socket.getfqdn().lower()}
-
-
-def _make_page(pages: Mapping[str, Callable[[], Page]], path: str) -> Page:
-    make = pages.get(path)
-    if make is None:
-        return Page.text(f"there is {', '.join(pages)}", status=200 if path == "/" else 404)
-    try:
-        return make()
-    except Exception:  # noqa: BLE001 - of one page, not of the server
-        _log.exception("%s failed", path, extra=about("bug"))
-        return Page.text("an unexpected error: the log has it", status=500)

@@ -10,7 +10,7 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version as version_of
 from itertools import accumulate
 from typing import Any, Final
@@ -34,7 +34,6 @@ SWITCHED_OFF: Final = 3600.0
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
-_OTHER: Final = ("other", "other")
 
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # of a service
@@ -94,22 +93,15 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """The measurements of one stream.
+    """The measurements of one stream; `labels`: vehicle, topic and source.
 
     `active` unless its source has ended, or its vehicle was switched off: then it has counts, and no age or rate.
     """
 
-    vehicle: str
-    topic: str
-    source: str
+    labels: tuple[str, str, str]
     health: Health
     active: bool = True
     latencies: Histogram | None = None
-
-    @property
-    def labels(self) -> tuple[str, str, str]:
-        """The values of its labels."""
-        return self.vehicle, self.topic, self.source
 
 
 def metrics_page(metrics: Iterable[core.Metric]) -> Page:
@@ -147,15 +139,15 @@ def is_switched_off(health: Health) -> bool:
 def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core.Metric]:
     """Yield the metrics of streams; `messages` is the name of the counter of messages."""
     streams = sorted(streams, key=lambda stream: not stream.health.resets)  # which only positions have
-    named, rest = streams[:MAX_STREAMS], streams[MAX_STREAMS:]
+    named = streams[:MAX_STREAMS]
+    rest = [replace(stream, labels=("other", "other", stream.labels[2])) for stream in streams[MAX_STREAMS:]]
     active = [stream for stream in named if stream.active]
 
-    def count(attribute: str) -> Iterator[tuple[tuple[str, ...], int]]:
-        others: Counter[str] = Counter()
-        for stream in rest:
-            others[stream.source] += getattr(stream.health, attribute)
-        yield from ((stream.labels, getattr(stream.health, attribute)) for stream in named)
-        yield from (((*_OTHER, source), total) for source, total in others.items())
+    def count(attribute: str) -> Iterable[tuple[tuple[str, ...], int]]:
+        totals: Counter[tuple[str, ...]] = Counter()
+        for stream in (*named, *rest):
+            totals[stream.labels] += getattr(stream.health, attribute)
+        return totals.items()
 
     def measure(attribute: str, of: Iterable[Stream] = active) -> Iterator[tuple[tuple[str, ...], float]]:
         values = ((stream.labels, getattr(stream.health, attribute)) for stream in of)
@@ -188,7 +180,7 @@ def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core
 def vehicle_metrics(account: Account, streams: Iterable[Stream]) -> Iterator[core.Metric]:
     """Yield the metrics of vehicles; one without an active stream has counts, and no state."""
     now, vehicles = time.time(), list(account.vehicles)
-    active = {stream.vehicle for stream in streams if stream.active}
+    active = {stream.labels[0] for stream in streams if stream.active}
     states = {name: account.state(name, now) for name in vehicles if name in active}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
     yield from make_metrics({
@@ -249,7 +241,7 @@ def _streams(source: str, measures: SourceMeasures) -> Iterator[Stream]:
     for stream in measures.streams:
         vehicle, _, topic = stream.address.partition("/")
         is_off = stream.address in measures.status.stale and is_switched_off(stream.health)
-        yield Stream(vehicle, topic, source, stream.health, active=not (measures.status.ended or is_off))
+        yield Stream((vehicle, topic, source), stream.health, active=not (measures.status.ended or is_off))
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:

@@ -1,13 +1,14 @@
-"""An observer: keep an account of the vehicles on a bus, from the samples of a reader."""
+"""An observer: a reader of a selection, the health of its streams, and the account of its vehicles."""
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from nedbus.client import Bus, Health, RejectionReport, Sample, stream_state
+from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
 from nedbus.events import Account
 from nedbus_msgs import Address, Selection
 
@@ -16,14 +17,13 @@ _MAX_LAG: Final = 1.0  # s of messages that may wait to be read
 _MAX_PAUSE: Final = 2.5  # s between two looks; after a longer one this process was held up itself
 _SETTLING_TIME: Final = 3.0  # s after a link is back, in which what was held up arrives
 _MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one is of a stream that has ended
-_MAX_STREAMS: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """All that was seen at one moment [s since the epoch]: published addresses, rejections, and the link.
+    """Streams, new rejections and the link at one moment [s since the epoch].
 
-    `link`: "" or what is wrong with it. `healths`: of all streams. `behind`: what is wrong with this reader itself.
+    `alive`: published addresses; `link`, `behind`: the fault of the link, and of this reader itself, "" without one.
     """
 
     time: float
@@ -35,39 +35,50 @@ class Sight:
 
 
 class Observer:
-    """Add samples as they are read, and look twice a second; `account` is what happened, by this host's clock."""
+    """Read a selection, and look at it twice a second; `account` is what happened, by this host's clock.
+
+    The samples of `subscription` are given to `add` by the thread that reads them; any thread may look.
+    """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
         self.account = Account()
+        self.subscription = bus.subscribe_to(selection, mode="every")
         self._bus, self._selection = bus, selection
+        self._monitor = Monitor()
         self._rejections = bus.rejections()
         self._looked: float | None = None
-        self._seen: set[Address] = set()
         self._disconnected = 0.0  # when there was no link, last
+        self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
 
     def add(self, sample: Sample[Any]) -> None:
         """Add a sample that was read just now; the last one of a stream that ended long ago says nothing of now."""
-        if sample.address not in self._seen:
-            if len(self._seen) < _MAX_STREAMS:
-                self._seen.add(sample.address)
-            if sample.latency is not None and sample.latency > _MAX_AGE:
-                return
-        received, missing = sample.received / 1e9, sample.provenance.missing
-        self.account.add(sample.address, sample.message, received, missing=missing, lost=sample.lost)
+        with self._lock:
+            is_known = self._monitor.add(sample)
+        if is_known or sample.latency is None or sample.latency <= _MAX_AGE:
+            received, missing = sample.received / 1e9, sample.provenance.missing
+            self.account.add(sample.address, sample.message, received, missing=missing, lost=sample.lost)
 
-    def look(self, healths: Mapping[Address, Health], *, dropped: int, waiting: int = 0) -> Sight:
-        """Note how streams arrive now, rejections, and the messages that this reader dropped, or has not read yet."""
+    def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
+        """Return the health of each stream now, and its latencies."""
+        with self._lock:
+            healths = self._monitor.snapshot()
+            return {address: (health, self._monitor.latencies(address)) for address, health in healths.items()}
+
+    def look(self) -> Sight:
+        """Look at streams, rejections and the link, and note in the account what changed."""
         now, connected = time.time(), self._bus.connected
+        dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
+        with self._lock:
+            healths = self._monitor.snapshot()
         rejected = [report for report in self._rejections.take() if self._selection.matches(report.address)]
         for report in rejected:
             self.account.reject(report.address, report.reason, report.received / 1e9)
         alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
         self._disconnected = min(self._disconnected, now) if connected else now
         settled = now - self._disconnected > _SETTLING_TIME
-        mains = [vehicle.main for vehicle in list(self.account.vehicles.values())]
         states = {
-            main: stream_state(healths[main], alive=main in alive).name if settled and main in healths else "unknown"
-            for main in mains
+            main: stream_state(healths[main], alive=main in alive).name if settled else "unknown"
+            for main in [vehicle.main for vehicle in list(self.account.vehicles.values())]
             if main is not None and (main in healths or not settled)
         }
         link = "" if connected else f"no link to {' or '.join(self._bus.routers)}"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
 from nedbus.daemon import Daemon
 from nedbus.errors import ConfigError
-from nedbus.events import AccountReport, Expectation, faults_of
+from nedbus.events import AccountReport, Expectation, faults_of, since_text
 from nedbus.extras import needs
 
 from .http_server import Page
@@ -24,7 +23,7 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
         "/healthz": lambda: _health(daemon),
         "/readyz": lambda: Page.verdict(why_not_ready(daemon), "ready"),
         "/vehicles": lambda: vehicles_page(daemon.report()),
-        "/status": lambda: Page(200, "application/json", json.dumps(asdict(daemon.status), indent=2).encode()),
+        "/status": lambda: Page.json(asdict(daemon.status)),
     }
 
 
@@ -32,14 +31,15 @@ def vehicles_page(report: AccountReport) -> Page:
     """Return the states of all vehicles; only the faults, with 503, if there are any."""
     faults = faults_of([report], Expectation(well=True))
     lines = [
-        f"{name} {vehicle.text}{vehicle.since_text(report.now)}" for name, vehicle in sorted(report.vehicles.items())
+        f"{name} {vehicle.text}{since_text(vehicle.since, report.now)}"
+        for name, vehicle in sorted(report.vehicles.items())
     ]
     good = "\n".join(map(_one_line, lines)) or "no vehicle is known"
     return Page.verdict(list(map(_one_line, faults)), good)
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return what keeps a service from being ready: no router, one that refuses it, or a source that is silent."""
+    """Return the reasons why a service is not ready: no router, one that refuses it, or a source that is silent."""
     if not daemon.ready.is_set():
         return [f"the service starts: {' or '.join(daemon.endpoints)}"]
     reasons = []

@@ -8,15 +8,18 @@ from .access_rules import read_access_rules, write_access_rules
 from .certificate import CERTIFICATE_PREFIX, DAYS, RENEW_WITHIN, Certificate, certificate_name
 
 if TYPE_CHECKING:
-    from .authority import make_authority, make_certificate
+    from .authority import (
+        CertificateEntry,
+        list_certificates,
+        make_authority,
+        make_certificate,
+        renew_certificate,
+    )
     from .bundle import make_bundle
-    from .renewal import CertificateEntry, list_certificates, renew_certificate
 else:
+    _AUTHORITY = ("CertificateEntry", "list_certificates", "make_authority", "make_certificate", "renew_certificate")
     __getattr__ = lazy_exports(
-        __name__,
-        dict.fromkeys(("make_authority", "make_certificate"), ("pki", "authority"))
-        | dict.fromkeys(("CertificateEntry", "list_certificates", "renew_certificate"), ("pki", "renewal"))
-        | {"make_bundle": ("pki", "bundle")},
+        __name__, dict.fromkeys(_AUTHORITY, ("pki", "authority")) | {"make_bundle": ("pki", "bundle")}
     )
 
 __all__ = [

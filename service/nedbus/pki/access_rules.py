@@ -46,35 +46,27 @@ def read_access_rules(file: Path) -> list[str]:
     return _SUBJECT.findall(_find_blocks(file)[1]["content"])
 
 
-def write_access_rules(
-    file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX
-) -> tuple[list[str], list[str]]:
+def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> None:
     """Write rules for exactly these vehicles into a router's file, whole or not at all; nothing else in it changes.
-
-    The names are sorted as people do, 2 before 10, and each is written once. Returns those that the file did not name
-    before, and those that it names no more.
 
     Raises AddressError for an invalid vehicle; ConfigError for no vehicle at all, and for a file that cannot be read or
     written or has no marks, which are those of `config/router-secure.json5`.
     """
     check_prefix(prefix)
-    names = sorted(set(vehicles), key=_natural)
+    names = sorted(set(vehicles))
     if not names:  # Zenoh takes no subject without names: the router would not start
         raise ConfigError.in_file(file, "name at least one vehicle")
-    blocks = _find_blocks(file)
-    before = set(_SUBJECT.findall(blocks[1]["content"]))
-    sections = iter(_sections(names, prefix))
+    text, sections = _find_blocks(file)[0].string, iter(_sections(names, prefix))
 
     def fill(block: re.Match[str]) -> str:
         return "".join([block["begin"], *(f"{block['indent']}{line}\n" for line in next(sections)), block["end"]])
 
     try:
         with whole_file(file, replace=True) as part:
-            part.write_text(_BLOCK.sub(fill, blocks[0].string), encoding="utf-8")
+            part.write_text(_BLOCK.sub(fill, text), encoding="utf-8")
             part.chmod(file.stat().st_mode)
     except OSError as exc:
         raise ConfigError.in_file(file, f"cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
-    return [name for name in names if name not in before], sorted(before - set(names), key=_natural)
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
@@ -111,8 +103,3 @@ def _sections(vehicles: Sequence[str], prefix: str) -> tuple[list[str], list[str
         subjects.append(f'{{ id: "{name}", cert_common_names: ["{name}"] }},')
         policies.append(f'{{ rules: ["{name}-in"], subjects: ["{name}"] }},')
     return rules, subjects, policies
-
-
-def _natural(vehicle: str) -> list[tuple[int, int, str]]:
-    """Return a sort key that compares numbers inside names by their value."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D+", vehicle)]

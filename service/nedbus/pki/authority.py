@@ -1,4 +1,4 @@
-"""Certificates for a fleet: a CA, and a key and certificate for each router, vehicle, reader and operator.
+"""The authority of a fleet, and the keys and certificates that it signs, lists and renews.
 
 The access control of `config/router-secure.json5` matches the common name of a certificate.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
@@ -23,9 +24,15 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from nedbus.errors import PkiError
 from nedbus.whole_file import whole_file
 
-from .certificate import DAYS, MAX_NAME
+from .certificate import DAYS, MAX_NAME, Certificate
 
 _CA_DAYS: Final = 3650
+_FOREIGN: Final = "signed by another authority"
+_UNFIT: Final = "not of the key beside it"
+_USAGES: Final = (
+    "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
+    "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
+)  # fmt: skip
 
 
 def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
@@ -55,6 +62,53 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
 
 
 @dataclass(frozen=True, slots=True)
+class CertificateEntry:
+    """A certificate of a folder.
+
+    `name`: its common name, for an authority that of its file.
+    `use`: "authority", "router" or "client".
+    `problem`: the reason that it is of no use before its end, "" if there is none.
+    """
+
+    path: Path
+    name: str
+    use: str
+    certificate: Certificate
+    problem: str
+
+
+def list_certificates(folder: Path) -> list[CertificateEntry]:
+    """Return the certificates of an authority's folder, the authority first, then those that end first.
+
+    Raises PkiError when the folder has no authority, or a certificate cannot be read.
+    """
+    authority = load_certificate(folder / "ca.crt")
+    found = [_describe(path, authority) for path in folder.glob("*.crt")]
+    return sorted(found, key=lambda entry: (entry.use != "authority", entry.certificate.ends, entry.name))
+
+
+def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
+    """Replace a certificate by one of the same name and hosts that ends later, and return the files that are new.
+
+    The old one stays valid until it ends, wherever it is in use; so it does with `replace_key`, with its old key.
+    An authority keeps its key, or all that it signed would be void.
+
+    Raises PkiError for one that this folder's authority did not sign, and when a file cannot be read or written.
+    """
+    folder = entry.path.parent
+    authority = Authority.read(folder)
+    if entry.use == "authority":
+        return write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
+    if entry.problem == _FOREIGN:
+        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it where that authority is")
+    # The private key may be on its vehicle only: the old certificate has all that is needed of it.
+    key = new_key() if replace_key else None
+    public_key = key.public_key() if key else load_certificate(entry.path).public_key()
+    signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
+    return write_files(entry.path.with_suffix(""), signed, key, replace=True)
+
+
+@dataclass(frozen=True, slots=True)
 class Authority:
     """The CA of a folder: its certificate, and the key that signs."""
 
@@ -66,9 +120,7 @@ class Authority:
         """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
         certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
         try:
-            key = serialization.load_pem_private_key(path.read_bytes(), password=None)
-        except OSError as exc:
-            raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: may this user read it?") from exc
+            key = serialization.load_pem_private_key(_read(path), password=None)
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
@@ -81,16 +133,15 @@ class Authority:
         """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
         # A router is a client of other routers too.
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
-        builder = _builder(name, key, self.key, DAYS if days is None else days, issuer=self.certificate)
-        builder = builder.add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        extensions: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(purposes)]
         if hosts:
-            builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_host, hosts))), critical=False)
-        return builder.sign(self.key, hashes.SHA256())
+            extensions.append(x509.SubjectAlternativeName(list(map(_host, hosts))))
+        return _sign(name, key, self.key, DAYS if days is None else days, extensions, issuer=self.certificate)
 
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
     """Return the certificate of a CA for its key; certificates that the key signed before stay valid."""
-    return _builder("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days).sign(key, hashes.SHA256())
+    return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days, [])
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -105,7 +156,7 @@ def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
 
 
 def write_certificate(path: Path, certificate: x509.Certificate) -> None:
-    """Write a certificate into a new file that everybody can read."""
+    """Write a certificate into a new file that all users can read."""
     _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
@@ -135,12 +186,17 @@ def write_files(
 def load_certificate(path: Path) -> x509.Certificate:
     """Read the certificate in a PEM file; raise PkiError when it is missing or damaged."""
     try:
-        return x509.load_pem_x509_certificate(path.read_bytes())
+        return x509.load_pem_x509_certificate(_read(path))
+    except ValueError as exc:
+        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
     except OSError as exc:
         hint = "make the CA first, 'nedbus pki ca'" if path.name == "ca.crt" else "may this user read it?"
         raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
-    except ValueError as exc:
-        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
 
 
 def _write_new(path: Path, content: bytes, mode: int) -> None:
@@ -148,31 +204,23 @@ def _write_new(path: Path, content: bytes, mode: int) -> None:
         file.write(content)
 
 
-def _builder(
+def _sign(
     name: str,
     key: CertificatePublicKeyTypes,
     signer: ec.EllipticCurvePrivateKey,
     days: int,
+    extensions: Sequence[x509.ExtensionType],
     *,
     issuer: x509.Certificate | None = None,
-) -> x509.CertificateBuilder:
-    """Begin the certificate of a key; without an issuer it is that of an authority, signed by itself."""
+) -> x509.Certificate:
+    """Return the certificate of a key; without an issuer it is that of an authority, signed by itself."""
     is_authority = issuer is None
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = dt.datetime.now(dt.UTC)
     until = now + dt.timedelta(days=days)
-    usage = x509.KeyUsage(
-        digital_signature=not is_authority,
-        key_cert_sign=is_authority,
-        crl_sign=is_authority,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
-    return (
+    allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
+    usage = x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES})
+    builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(subject if issuer is None else issuer.subject)
@@ -187,6 +235,9 @@ def _builder(
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
         .add_extension(usage, critical=True)
     )
+    for extension in extensions:
+        builder = builder.add_extension(extension, critical=False)
+    return builder.sign(signer, hashes.SHA256())
 
 
 def _host(host: str) -> x509.GeneralName:
@@ -194,3 +245,24 @@ def _host(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         return x509.DNSName(host)
+
+
+def _describe(path: Path, authority: x509.Certificate) -> CertificateEntry:
+    problem, certificate = _find_problem(path, authority), Certificate.read(path)
+    if path.name == "ca.crt":
+        return CertificateEntry(path, path.stem, "authority", certificate, problem)
+    use = "router" if certificate.hosts else "client"
+    return CertificateEntry(path, certificate.subject, use, certificate, problem)
+
+
+def _find_problem(path: Path, authority: x509.Certificate) -> str:
+    certificate = load_certificate(path)
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature):
+        return _FOREIGN
+    try:
+        key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
+    except (OSError, ValueError, TypeError):
+        return ""  # the key is where it is used, or is not ours to read
+    return "" if key.public_key() == certificate.public_key() else _UNFIT

@@ -1,4 +1,4 @@
-"""X.509 certificates as people read them: subject, issuer, hosts, validity; and the names of vehicles in them."""
+"""The readable part of X.509 certificates: subject, issuer, hosts, validity; and the names of vehicles in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DAYS: Final = 825
 """Days for which a certificate is valid."""
 
 RENEW_WITHIN: Final = 30
-"""Days before the end of a certificate in which it is to be renewed."""
+"""Days before its end from which a certificate is due for renewal."""
 
 CERTIFICATE_PREFIX: Final = "vehicle-"
 """The common name of a vehicle's certificate is this and its id, so that no vehicle can be named like a reader."""
@@ -70,7 +70,7 @@ class Certificate:
         return (self.ends - now) / dt.timedelta(days=1)
 
     def is_due(self, now: dt.datetime, within: float = RENEW_WITHIN) -> bool:
-        """Return whether it is to be renewed: it ends within these days, or has ended."""
+        """Return whether it is due for renewal: it ends within these days, or has ended."""
         return self.days_left(now) <= within
 
     def __str__(self) -> str:

@@ -11,22 +11,22 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .alignment import align
-    from .arrays import Flight, addresses_of, missing_of, read, utc_of
+    from .arrays import Flight, addresses_of, missing_of, read
     from .flight_files import SUFFIXES, check_recording, format_of, matching
     from .plot import MAX_STREAMS, draw
     from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
     from .ulog import UlogColumns, UlogTopic, UlogTopics, read_ulog
-    from .utc import UtcOffset
+    from .utc import UtcOffset, utc_of
     from .writer import RecordingWriter
 else:
     # No submodule has the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "alignment"): "align",
-        ("", "arrays"): "Flight addresses_of missing_of read utc_of",
+        ("", "arrays"): "Flight addresses_of missing_of read",
         ("", "flight_files"): "SUFFIXES check_recording format_of matching",
         ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
-        ("", "utc"): "UtcOffset",
+        ("", "utc"): "UtcOffset utc_of",
         ("mcap", "reader"): "RecordedMessage RecordedStream RecordingReader",
         ("mcap", "recorder"): "Recorder",
         ("mcap", "writer"): "RecordingWriter",

@@ -1,4 +1,4 @@
-"""Several messages at one time: one table of the values that each stream has at the times of another one."""
+"""Align streams: one table of the values of several streams at the times of one of them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import Library, Pandas, Polars, Streams, missing_of, read_streams, to_dataframe
-from .utc import tell_utc
+from .utc import utc_of
 
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-_EXPECTED: Final = "expected a file, or arrays as nedbus.read(file, [...]) returns them"
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # by the unit of an angle
 _MAX_ROWS: Final = 10_000_000  # of a table at a rate: a damaged timestamp must not fill the memory
@@ -68,13 +67,13 @@ def align(
     `on` gives the rows: a stream, whose messages they are, a rate [Hz], or times as PX4's `timestamp` has them [us].
     Columns are `timestamp` [us], and of each stream `<stream>.<field>` and `<stream>.age` [s]: the time since the
     message that the values are from, NaN where there is none yet; then floats are NaN, others 0 or false.
-    With `dataframe` it is a data frame as `read` returns it; what is not there is null.
+    With `dataframe` it is a data frame as `read` returns it; a missing value is null.
 
     `method`: "last" takes the last message that is not later: no value is from the future.
     "nearest" takes that nearest in time, so that an age can be negative. "linear" interpolates floats between the
     messages before and after: unit quaternions by slerp, angles the shorter way around. Everything else is the last
     value, as floats are where a reset counter changes, and after the last message.
-    With `utc`, a column `utc` is the UTC that `utc_of` tells, NaT where it tells none.
+    With `utc`, a column `utc` is the UTC of `utc_of`, NaT without one.
 
     Raises ConfigError for several boots of a vehicle in one stream: they have no common time; errors of `read`.
     """
@@ -83,52 +82,44 @@ def align(
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
-    if isinstance(flight, Mapping):
-        _require_arrays(flight, topics or ())
-        everything = not topics or ANY in topics
-        streams: Streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
-        offset = tell_utc(flight)
-    elif not isinstance(flight, str | Path):
-        raise ConfigError("flight", _EXPECTED)
+    streams: Streams
+    if not isinstance(flight, Mapping):
+        streams = read_streams(flight, names if topics else None, vehicle=vehicle)
+    elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
+        raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}")
     else:
-        wants_utc = utc or dataframe == "pandas"
-        streams, offset = read_streams(flight, names if topics else None, vehicle=vehicle, utc=wants_utc)
+        everything = not topics or ANY in topics
+        streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
     if isinstance(on, str) and on not in streams:
         raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps.values())
-    types: list[tuple[str, Any]] = [("timestamp", "u8"), *[("utc", "M8[us]")] * utc]
-    for name, (messages, _) in streams.items():
-        types += [(f"{name}.age", "f8"), *((f"{name}.{field}", kind) for field, kind in _fields(messages))]
-    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
-    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
-    table["timestamp"] = times
+    columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
-        table["utc"] = (times + offset.offset_us).astype("M8[us]") if offset else np.datetime64("NaT", "us")
+        offset = utc_of(flight, vehicle=vehicle)
+        columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
+        if offset:
+            columns["utc"] = (times + offset.offset_us).astype("M8[us]")
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)
-        padded = np.append(messages, np.zeros(1, messages.dtype))  # with what row -1 is
+        padded = np.append(messages, np.zeros(1, messages.dtype))  # row -1: no message
         for field, kind in _fields(messages):
             padded[field][-1] = np.nan if kind.base.kind == "f" else 0
         values = padded[rows]
         if method == "linear":
             _interpolate(name, values, padded[following], weight)
-        table[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
+        columns[f"{name}.age"] = np.where(rows < 0, np.nan, times - np.append(stamps[name], 0)[rows]) / 1e6
         for field, _ in _fields(messages):
-            table[f"{name}.{field}"] = values[field]
+            columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
-    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe, offset)
-
-
-def _require_arrays(flight: Mapping[str, object], topics: Iterable[str]) -> None:
-    """Raise ConfigError unless these are streams as `read` returns them, AddressError unless they have the topics."""
-    if not flight or not all(isinstance(each, np.ndarray) and each.dtype.names for each in flight.values()):
-        raise ConfigError("flight", _EXPECTED)
-    for name in topics:
-        if name not in (ANY, *flight):
-            raise AddressError("topic", name, f"one of {', '.join(flight)}")
+    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
+    types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
+    table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
+    for name, column in columns.items():
+        table[name] = column
+    return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
@@ -136,7 +127,7 @@ def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return the message for each time, -1 for none, the next one, and how far between these two the time is."""
+    """Return the message for each time, -1 for none, the next one, and the fraction of the way between these two."""
     if method == "own" or not len(stamps):  # by its place: two messages may have one time
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
@@ -173,14 +164,11 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
     """Return values between two; of angles the shorter way around, from 0 or minus half a period on, as they are."""
-    with np.errstate(invalid="ignore"):  # infinity minus itself
+    with np.errstate(invalid="ignore"):  # infinity minus itself, and no period
         step = second - first
-        seam = np.abs(step) > period / 2
-        if not seam.any():
-            return first + weight * step
-        found = first + weight * (step - np.sign(step) * period)
+        turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
-        return np.where(seam, start + np.mod(found - start, period), first + weight * step)
+        return np.where(np.abs(step) > period / 2, start + np.mod(turned - start, period), first + weight * step)
 
 
 def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus.client import Sample
-from nedbus.errors import AddressError, ConfigError, DecodeError, SourceError
+from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.extras import needs
 from nedbus.log_event import about
 from nedbus_msgs import (
@@ -30,32 +28,26 @@ from nedbus_msgs import (
     upgrade_with,
     vehicle_name,
 )
-from nedbus_msgs.arrays import MessageArray, arrays_of, to_array
+from nedbus_msgs.arrays import MessageArray, arrays_of
 
-from .flight_files import SUFFIXES, matching, the_one
-from .ulog import UlogTopics, read_ulog
-from .utc import TELLING, UtcOffset, tell_utc
+from .flight_files import SUFFIXES, matching, require_one_vehicle, the_one
+from .ulog import UlogTopic, UlogTopics, read_ulog
 
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from .reader import RecordedMessage, RecordingReader
+    from .reader import RecordedMessage, RecordedStream, RecordingReader
 
 _log = logging.getLogger(__name__)
 
 _CHUNK: Final = 65536  # messages of a recording that are decoded together
-_NULLABLE: Final = {  # of pandas; its floats are NaN
-    "bool": "boolean",
-    **{f"{sign}int{bits}": f"{sign.upper()}Int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
-}
 
 _Mask = npt.NDArray[np.bool_]
 Absent = Mapping[str, _Mask]
 """For each missing field, a mask of the messages that lack it."""
 Streams = dict[str, tuple[MessageArray, Absent]]
 """The messages of streams, by topic or topic/instance."""
-
 
 Pandas = Literal["pandas"]
 Polars = Literal["polars"]
@@ -99,86 +91,42 @@ def read(
 
     Its columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
     Fields that a layout or a source lacks are NaN, false or 0, and `nedbus.missing_of` names them.
-    Invalid messages are left out, and so is what is damaged; both are logged.
+    Invalid messages and damaged parts of the file are left out, and logged.
     With `dataframe` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
-    missing fields are null; that of pandas names them in `attrs["missing"]`, and has in `attrs["utc"]` what `utc_of`
-    returns, as a dict, if the flight tells UTC.
-    A list of topics, or of streams such as "sensor_gps/1", is a dict of these by stream, of one vehicle; "*" in it is
-    all that the file has, messages that only the file describes included.
+    missing fields are null; that of pandas names them in `attrs["missing"]`.
+    For a list of topics, or of streams such as "sensor_gps/1", it is a dict by stream, of one vehicle; "*" stands for
+    all streams of the file, including messages that only the file describes.
 
     Raises SourceError for a file that cannot be read, AddressError when no stream, or more than one, matches topic,
     vehicle and instance, ConfigError when the package that reads the file is not installed.
     """
-    streams, utc = read_streams(path, topic, vehicle=vehicle, instance=instance, utc=dataframe == "pandas")
-    tables = {name: to_dataframe(messages, absent, dataframe, utc) for name, (messages, absent) in streams.items()}
+    streams = read_streams(path, topic, vehicle=vehicle, instance=instance)
+    tables = {name: to_dataframe(messages, absent, dataframe) for name, (messages, absent) in streams.items()}
     return next(iter(tables.values())) if isinstance(topic, str) else tables
 
 
 def read_streams(
-    path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None, utc: bool
-) -> tuple[Streams, UtcOffset | None]:
-    """Return what `Flight.read` does for one stream, or each of several, by its name; with `utc`, that of the flight.
+    path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
+) -> Streams:
+    """Return the messages of one stream, or of several of one vehicle.
 
-    None is all, but of a log only what has a file here.
+    None is all streams, but of a log only those of known topics.
     """
     path, vehicle = Path(path).expanduser(), vehicle_name(vehicle)
-    chosen: dict[Address, None] = {}
     names = [ANY] if topics is None else [topics] if isinstance(topics, str) else topics
-    for name in names:
-        if not isinstance(name, str):
-            raise AddressError("topic", name, "the name of a topic or a stream")
     wanted = {name.partition("/")[0] for name in names}
-    with Flight(path, topics=None if ANY in wanted and names is topics else wanted | TOPICS.keys()) as flight:
+    with Flight(path, topics=None if ANY in wanted and topics is not None else wanted | TOPICS.keys()) as flight:
+        chosen: dict[Address, None] = {}
         for name in names:
             topic, _, number = name.rpartition("/")
             parts = (topic, vehicle, int(number)) if number.isdecimal() else (name, vehicle, instance)
-            found = matching(path, flight.addresses, Selection(*parts))
-            chosen |= dict.fromkeys([the_one(path, found, Selection(*parts))] if isinstance(topics, str) else found)
-        owner = _one_vehicle(path, chosen or flight.addresses, vehicle)
-        telling = flight.telling(owner) if utc else []
-        read_once = flight.read({*chosen, *telling})
-        streams = {address.stream: read_once[address] for address in chosen}
-        offset = tell_utc({address.stream: read_once[address][0] for address in telling})
+            select = the_one if isinstance(topics, str) else matching
+            chosen |= dict.fromkeys(select(path, flight.addresses, Selection(*parts)))
+        require_one_vehicle(path, chosen, vehicle)
+        streams = {address.stream: found for address, found in flight.read(chosen).items()}
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
-    return streams, offset
-
-
-def utc_of(
-    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
-) -> UtcOffset | None:
-    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and its source; None without one.
-
-    Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
-    `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
-
-    A GNSS receiver tells it if its `time_utc_usec` is not 0, and `timesync_status` the clock of a companion: that is
-    taken for UTC only if it has a date after 2000. Where messages disagree by more than a second there is none.
-
-    Raises AddressError for several vehicles, without the name of one; other errors are those of `read`.
-    """
-    vehicle = vehicle_name(vehicle)
-    if isinstance(flight, Mapping):
-        return tell_utc(flight)
-    if not isinstance(flight, str | Path):
-        samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
-        if samples:
-            _one_vehicle("the samples", (each.address for each in samples), vehicle)
-        by_stream = {each.address.stream: each.message for each in samples}
-        return tell_utc({name: to_array([message]) for name, message in by_stream.items()})
-    path = Path(flight).expanduser()
-    with Flight(path) as opened:
-        owner = _one_vehicle(path, matching(path, opened.addresses, Selection(vehicle=vehicle)), vehicle)
-        found = opened.read(opened.telling(owner))
-    return tell_utc({address.stream: messages for address, (messages, _) in found.items()})
-
-
-def _one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle: str) -> str:
-    """Return the vehicle of all these addresses; raise AddressError if there are several."""
-    first, *others = sorted({address.vehicle for address in addresses})
-    if others:
-        raise AddressError("vehicle", vehicle, f"one of those in {where}: {', '.join([first, *others][:10])}")
-    return first
+    return streams
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
@@ -197,146 +145,137 @@ def addresses_of(path: str | Path) -> list[Address]:
 
 
 class Flight:
-    """A .ulg log or an .mcap recording that is open for reading: `addresses`, and the messages of each.
+    """A .ulg log or an .mcap recording that is open for reading: its addresses, and the messages of each.
 
-    `topics`: those that are read of a log, None for all; `definitions`: that of each address.
-    `warnings`: what is damaged or left out, of what was read so far.
+    `topics`: the topics to read of a log, None for all; `definitions`: the definition of each address.
 
     Raises SourceError for a file that cannot be read.
     """
 
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
-        self.warnings: list[str] = []
-        self._reader: RecordingReader | None = None
-        self._log: UlogTopics | None = None
+        self.definitions: dict[Address, Definition[Any]]
+        self._file: RecordingReader | UlogTopics
+        self._invalid: list[str] = []
         if SUFFIXES.get(path.suffix) == "mcap":
-            self._reader = needs("mcap", f"{__package__}.reader").RecordingReader(path, vehicle="1")
-            self.definitions = {stream.address: stream.definition for stream in self._reader.counts}
+            reader = needs("mcap", f"{__package__}.reader").RecordingReader(path, vehicle="1")
+            self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
             if not self.definitions:
-                self._reader.close()
+                reader.close()
                 raise SourceError(str(path), "no message of PX4's topics is in this recording")
         else:
-            self._log = read_ulog(path, topics=topics)
-            self.warnings += self._log.warnings
-            self.definitions = {topic.address: topic.definition for topic in self._log.topics}
+            log = read_ulog(path, topics=topics)
+            self._file, self.definitions = log, {each: topic.definition for each, topic in log.topics.items()}
         self.addresses = sorted(self.definitions)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if self._reader is not None:
-            self._reader.close()
+        if not isinstance(self._file, UlogTopics):
+            self._file.close()
+
+    @property
+    def warnings(self) -> list[str]:
+        """Damage, and messages left out, of what was read so far."""
+        return [*self._file.warnings, *self._invalid]
 
     @property
     def damaged(self) -> bool:
         """True if damage cost messages of what was read so far."""
-        return any(part is not None and part.damaged for part in (self._reader, self._log))
+        return self._file.damaged
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return the messages of each address, and for each field that some of them lack a mask of those."""
-        if self._reader is None:
-            return {address: self._valid(address, *self._read_ulog(address)) for address in addresses}
-        read = self._read_mcap(self._reader, addresses)
-        self.warnings += (each for each in self._reader.warnings if each not in self.warnings)
-        return {address: self._valid(address, *read[address]) for address in addresses}
-
-    def telling(self, vehicle: str) -> list[Address]:
-        """Return the addresses of a vehicle whose messages may tell UTC."""
-        own = (each for each in self.addresses if each.vehicle == vehicle)
-        return [each for each in own if not self.definitions[each].types.keys().isdisjoint(TELLING)]
-
-    def _valid(
-        self, address: Address, messages: MessageArray, valid: _Mask, absent: Absent
-    ) -> tuple[MessageArray, Absent]:
-        if not valid.all():
-            count = f"{np.sum(~valid)} of {len(valid)} messages"
-            self.warnings.append(f"{address.stream}: {count} violate the rules and are left out")
-            messages, absent = messages[valid], {name: mask[valid] for name, mask in absent.items()}
-        if absent:
-            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
-            messages = messages.view(np.dtype(types, metadata={"missing": tuple(absent)}))
-        return messages, absent
-
-    def _read_ulog(self, address: Address) -> tuple[MessageArray, _Mask, Absent]:
-        topic = next(topic for topic in (self._log.topics if self._log else ()) if topic.address == address)
-        definition, columns = topic.definition, topic.columns
-        arrays, plan = arrays_of(definition), definition.plan(topic.columns)
-        messages = arrays.absent(len(columns["timestamp"]))
-        for name, old in plan.names.items():
-            messages[name] = columns[old]
-        for name, (old, convert) in plan.converted.items():
-            messages[name] = [convert(value) for value in columns[old].tolist()]
-        for name, olds in plan.parts.items():
-            for index, part in enumerate(olds):
-                messages[name][:, index] = np.nan if part is None else columns[part]
-        valid = arrays.valid_mask(messages)
-        for name, column in columns.items():
-            if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
-                wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
-                valid &= ~wrong.reshape(len(messages), -1).any(axis=1)
-        lacking = (name for name in definition.types if name not in plan.provided)
-        return messages, valid, {name: np.ones(len(messages), bool) for name in lacking}
-
-    def _read_mcap(
-        self, reader: RecordingReader, addresses: Collection[Address]
-    ) -> dict[Address, tuple[MessageArray, _Mask, Absent]]:
-        """Read the file once, for all of these, some thousand messages at a time."""
-        parts = {address: [_decode(self.definitions[address], [])] for address in addresses}
-        recorded = reader.messages(parts.keys())
+        if isinstance(self._file, UlogTopics):
+            topics = self._file.topics
+            return {address: self._valid(address, _decode_ulog(topics[address])) for address in addresses}
+        parts = {address: [_decode_cdr(self.definitions[address], [])] for address in addresses}
+        recorded = self._file.messages(parts.keys())
         while chunk := list(islice(recorded, _CHUNK)):
             by_address: dict[Address, list[RecordedMessage]] = {}
             for each in chunk:
                 by_address.setdefault(each.stream.address, []).append(each)
             for address, own in by_address.items():
-                parts[address].append(_decode(self.definitions[address], own))
-        return {address: _join(self.definitions[address], own) for address, own in parts.items()}
+                parts[address].append(_decode_cdr(self.definitions[address], own))
+        return {
+            address: self._valid(address, _Decoded(*map(np.concatenate, zip(*own, strict=True))))
+            for address, own in parts.items()
+        }
+
+    def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
+        """Leave out invalid messages, and name the fields that are missing."""
+        messages, valid, absent = decoded
+        if not valid.all():
+            count = f"{np.sum(~valid)} of {len(valid)} messages"
+            self._invalid.append(f"{address.stream}: {count} violate the rules and are left out")
+            messages, absent = messages[valid], absent[valid]
+        masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
+        if masks:
+            types = [(name, messages.dtype[name]) for name in self.definitions[address].names]
+            messages = messages.view(np.dtype(types, metadata={"missing": tuple(masks)}))
+        return messages, masks
 
 
-def _join(
-    definition: Definition[Any], parts: Sequence[tuple[MessageArray, _Mask, Absent]]
-) -> tuple[MessageArray, _Mask, Absent]:
-    """Return the parts as one, with masks of the fields that some of them lack."""
-    lacking = {name for _, _, absent in parts for name in absent}
-    absent = {
-        name: np.concatenate([part.get(name, np.zeros(len(array), bool)) for array, _, part in parts])
-        for name in definition.types
-        if name in lacking
-    }
-    arrays, valid, _ = zip(*parts, strict=True)
-    return np.concatenate(arrays), np.concatenate(valid), absent
+class _Decoded(NamedTuple):
+    """Messages of one definition, a mask of the valid ones, and for each field a mask of the messages that lack it."""
+
+    messages: MessageArray
+    valid: _Mask
+    absent: npt.NDArray[np.void]
+
+    @classmethod
+    def empty(cls, definition: Definition[Any], count: int) -> Self:
+        """Return messages of which nothing is provided, and none is valid yet."""
+        absent = np.zeros(count, [(name, bool) for name in definition.types])
+        return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
 
 
-def _decode(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> tuple[MessageArray, _Mask, Absent]:
-    """Return messages, which of them are valid, and which lack a field.
+def _decode_ulog(topic: UlogTopic) -> _Decoded:
+    definition, columns = topic.definition, topic.columns
+    decoded, plan = _Decoded.empty(definition, len(columns["timestamp"])), definition.plan(columns)
+    messages = decoded.messages
+    for name, old in plan.names.items():
+        messages[name] = columns[old]
+    for name, (old, convert) in plan.converted.items():
+        messages[name] = [convert(value) for value in columns[old].tolist()]
+    for name, olds in plan.parts.items():
+        for index, part in enumerate(olds):
+            messages[name][:, index] = np.nan if part is None else columns[part]
+    decoded.valid[:] = arrays_of(definition).valid_mask(messages)
+    for name, column in columns.items():
+        if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
+            wrong = column.astype(np.int64) >> 1 != 0  # a byte other than 0 and 1 is invalid
+            decoded.valid[wrong.reshape(len(messages), -1).any(axis=1)] = False
+    for name in definition.all_fields - plan.provided:
+        decoded.absent[name] = True
+    return decoded
 
-    They are decoded all at once, and one by one what that cannot decide.
-    """
+
+def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> _Decoded:
+    """Decode messages all at once, and those that this cannot decide one by one."""
     arrays = arrays_of(definition)
-    array, valid = arrays.absent(len(chunk)), np.zeros(len(chunk), bool)
-    by_stream: dict[int, list[int]] = {}  # a stream is one object of its reader
+    decoded = _Decoded.empty(definition, len(chunk))
+    by_stream: dict[RecordedStream, list[int]] = {}
     for index, recorded in enumerate(chunk):
-        by_stream.setdefault(id(recorded.stream), []).append(index)
-    absent: dict[str, _Mask] = {}
-    for rows in by_stream.values():
-        stream = chunk[rows[0]].stream
+        by_stream.setdefault(recorded.stream, []).append(index)
+    for stream, rows in by_stream.items():
         if stream.layout.types.items() <= definition.types.items():
-            array[rows], valid[rows] = arrays.decode_cdr([chunk[index].payload for index in rows], stream.layout)
-        lacking = definition.all_fields - definition.plan(stream.layout.fields).provided | stream.missing
-        for name in lacking:
-            absent.setdefault(name, np.zeros(len(chunk), bool))[rows] = True
-    decoded: dict[int, Message] = {}
-    for index in np.flatnonzero(~valid).tolist():
+            payloads = [chunk[index].payload for index in rows]
+            decoded.messages[rows], decoded.valid[rows] = arrays.decode_cdr(payloads, stream.layout)
+        for name in definition.all_fields - (definition.plan(stream.layout.fields).provided - stream.missing):
+            decoded.absent[name][rows] = True
+    alone: dict[int, Message] = {}
+    for index in np.flatnonzero(~decoded.valid).tolist():
         with suppress(DecodeError, ValidationError):
             fields = decode_with(definition, chunk[index].payload, chunk[index].stream.layout)
-            decoded[index] = upgrade_with(definition, fields)
-    if decoded:
-        array[list(decoded)] = arrays.of(list(decoded.values()))
-        valid[list(decoded)] = True
-    return array, valid, absent
+            alone[index] = upgrade_with(definition, fields)
+    if alone:
+        decoded.messages[list(alone)] = arrays.of(list(alone.values()))
+        decoded.valid[list(alone)] = True
+    return decoded
 
 
-def to_dataframe(messages: MessageArray, absent: Absent, library: Library, utc: UtcOffset | None = None) -> Any:
+def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
     """Return a structured array as a data frame, with nulls where a field is absent; for None as it is."""
     if library is None:
         return messages
@@ -348,19 +287,17 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library, utc: 
         values = messages[name]
         parts = [f"{name}[{index}]" for index in range(values.shape[1])] if values.ndim > 1 else [name]
         for part, each in zip(parts, values.reshape(len(values), len(parts)).T, strict=True):
-            column = np.ascontiguousarray(each)
-            if column.dtype.kind == "M":
-                series = package.Series(column).dt
-                columns[part] = series.tz_localize("UTC") if library == "pandas" else series.replace_time_zone("UTC")
-            elif name not in absent:
-                columns[part] = column
-            elif library == "polars":
-                columns[part] = package.Series(column).scatter(np.flatnonzero(absent[name]), None)
-            else:
-                kind = _NULLABLE.get(column.dtype.name, column.dtype)
-                columns[part] = package.Series(column, dtype=kind).mask(absent[name])
+            column = package.Series(np.ascontiguousarray(each))
+            if each.dtype.kind == "M":
+                zoned = column.dt.tz_localize if library == "pandas" else column.dt.replace_time_zone
+                column = zoned("UTC")
+            elif name in absent and library == "polars":
+                column = column.scatter(np.flatnonzero(absent[name]), None)
+            elif name in absent:
+                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()  # a float has NaN
+                column = nullable.mask(absent[name])
+            columns[part] = column
     data = package.DataFrame(columns)
     if library == "pandas":
         data.attrs["missing"] = sorted(missing_of(messages))
-        data.attrs |= {"utc": asdict(utc)} if utc else {}
     return data

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import BinaryIO, Final
 
 from nedbus.errors import AddressError, ConfigError, SourceError
-from nedbus_msgs import ANY, Address, Selection
+from nedbus_msgs import Address, Selection
 
 SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap"}
 """The kind of source that replays a file, by the file's suffix."""
@@ -23,18 +23,10 @@ def format_of(path: str | PurePath) -> str:
     return found
 
 
-def check_recording(path: Path, *, flight: str) -> None:
-    """Raise ConfigError for a recording whose name is that of another format.
-
-    `flight` is the file that the hint for a table or a picture names.
-    """
-    if SUFFIXES.get(path.suffix) == "mcap":
-        return
-    hints = {
-        ".csv": f'; for a table: nedbus.read("{flight}", dataframe="pandas").to_csv("{path.name}")',
-        **dict.fromkeys((".png", ".svg", ".pdf"), f"; for a picture: nedbus plot {flight} -o {path.name}"),
-    }
-    raise ConfigError(str(path), f"expected a recording: a file that ends with .mcap{hints.get(path.suffix, '')}")
+def check_recording(path: Path) -> None:
+    """Raise ConfigError for a recording whose name is that of another format."""
+    if SUFFIXES.get(path.suffix) != "mcap":
+        raise ConfigError(str(path), "expected a recording: a file that ends with .mcap")
 
 
 def open_flight(path: Path) -> BinaryIO:
@@ -49,28 +41,30 @@ def open_flight(path: Path) -> BinaryIO:
 
 def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
     """Return the addresses of a file that are selected; raise AddressError when there is none."""
-    found = [address for address in addresses if selection.matches(address)]
-    if found:
-        return found
-    has = f"which has {_list(addresses)}"
-    of_vehicle = [address for address in addresses if selection.vehicle in (ANY, address.vehicle)]
-    if not of_vehicle:
-        raise AddressError("vehicle", selection.vehicle, f"one that is in {path}, {has}")
-    if not any(selection.topic in (ANY, address.topic) for address in of_vehicle):
-        of = "" if selection.vehicle == ANY else f" of vehicle {selection.vehicle}"
-        raise AddressError("topic", selection.topic, f"one{of} that is in {path}, {has}")
-    raise AddressError("instance", selection.instance, f"one of {selection.topic} that is in {path}, {has}")
+    topic, vehicle = selection.topic, selection.vehicle
+    steps = {"vehicle": Selection(vehicle=vehicle), "topic": Selection(topic, vehicle), "instance": selection}
+    for part, step in steps.items():
+        if not any(map(step.matches, addresses)):
+            expected = f"one that is in {path}, which has {_list(addresses)}"
+            raise AddressError(part, getattr(selection, part), expected)
+    return list(filter(selection.matches, addresses))
 
 
-def the_one(path: Path, addresses: Sequence[Address], selection: Selection) -> Address:
+def the_one(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
     """Return the only address of a file that is selected; raise AddressError when there is none, or more than one."""
     found = matching(path, addresses, selection)
-    if len(found) == 1:
-        return found[0]
-    parts = ("topic", "vehicle", "instance")
-    lacking = [part for part in parts if len({getattr(address, part) for address in found}) > 1]
-    problem = f"one stream of {path}, where several match: name {' and '.join(lacking)} too, of {_list(found)}"
-    raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+    lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
+    if lacking:
+        problem = f"one stream of {path}, where several match: name {' and '.join(lacking)} too, of {_list(found)}"
+        raise AddressError(lacking[0], getattr(selection, lacking[0]), problem)
+    return found
+
+
+def require_one_vehicle(where: Path | str, addresses: Iterable[Address], vehicle: str) -> None:
+    """Raise AddressError if these addresses, which were selected by `vehicle`, are of several vehicles."""
+    vehicles = sorted({address.vehicle for address in addresses})
+    if len(vehicles) > 1:
+        raise AddressError("vehicle", vehicle, f"one of those in {where}: {', '.join(vehicles[:_MAX_NAMED])}")
 
 
 def _list(addresses: Sequence[Address]) -> str:

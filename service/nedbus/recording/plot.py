@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 
 from nedbus.errors import ConfigError, OutputError
 from nedbus.events import SEVERITIES, Event, Severity, spans_of
 from nedbus.whole_file import whole_file
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, Address
+from nedbus_msgs import DEFAULT_TOPIC, Address
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import missing_of
@@ -28,11 +27,9 @@ if TYPE_CHECKING:
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
-_HEIGHT: Final = 6.0  # inches of the upper part
-_FLAGS_HEIGHT: Final = 2.0  # inches of the lower part, at least
-_ROW: Final = 0.17  # inches of the lower part that each row needs
-_EVENT_ROW: Final = 0.21  # the same of a row of events, with its text
-_EVENTS_FRAME: Final = 0.5  # inches of the title and the axis of the events
+_HEIGHT: Final = 6.0  # inches of track, altitude and speed
+_ROW: Final = 0.2  # inches of a row below these
+_FRAME: Final = 0.6  # inches of the title and the axis of the rows
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 _WARNING_COLOR: Final = "#d62728"
 _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
@@ -45,18 +42,16 @@ _QUIET: Final = {
 }  # fmt: skip
 """The events of severity info that are shown, each with its row."""
 
-_NEAR: Final = 1.0  # s between an event and the message that tells where it was
+_NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
-_SHORTEST: Final = 60.0  # points of a text that is worth shortening
 MAX_STREAMS: Final = len(_COLORS)
 """The number of streams that one plot can show."""
 
-_FLAGS: Final = [flag for flag in FLAGS.values() if flag.kind == "estimate"]
+_FLAGS: Final = (  # of the estimate
+    "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
+)  # fmt: skip
 _HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
-_COUNTERS: Final = {
-    "xy_reset_counter": "xy", "z_reset_counter": "z", "vxy_reset_counter": "vxy", "vz_reset_counter": "vz",
-    "heading_reset_counter": "heading",
-}  # fmt: skip
+_COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy", "vz", "heading")}
 
 
 class _Stream(NamedTuple):
@@ -70,16 +65,6 @@ class _Stream(NamedTuple):
     def resets(self, counter: str) -> Any:
         """Return the times at which a reset counter changed [s]."""
         return self.seconds[1:][np.diff(self.messages[counter].astype(np.int16)) != 0]
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One row of the lower part: the intervals in which a flag is set, or the times of resets."""
-
-    label: str
-    color: str
-    bars: Sequence[tuple[float, float]]
-    marks: Sequence[float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,16 +87,15 @@ def draw(
     Each stream has at least one message.
     Times are seconds since the first message of all, positions local NED in metres; altitude is -z.
     Fields that `missing_of` names are not drawn, and the plot says so.
-    `events`: those of the streams' vehicles are marked if they are bad or to be watched, or of mode, arming or landing.
+    `events`: of those of the streams' vehicles, bad ones, those to watch, and modes, arming and landing are marked.
 
     Raises ConfigError for another suffix, OutputError when the file cannot be written; then there is none.
     """
     if Path(path).suffix not in _SUFFIXES:
         raise ConfigError(str(path), f"expected a picture: a file that ends with {' or '.join(_SUFFIXES)}")
-    figure = draw_figure(streams, title=title, events=events)
     try:
-        with whole_file(Path(path), replace=True) as part:
-            figure.savefig(part)
+        with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
+            draw_figure(streams, title=title, events=events).savefig(part)  # a character that the font lacks is a box
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
@@ -123,10 +107,10 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
         _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
         for (address, messages), color in zip(streams, _COLORS, strict=False)
     ]
-    rows = [row for stream in drawn for row in _rows(stream, f" {stream.address}" if len(drawn) > 1 else "")]
+    rows = _rows(drawn)
     marks = _marks(drawn, start / 1e6, events)
     by_row = _by_row(marks)
-    heights = [max(_FLAGS_HEIGHT, _ROW * len(rows)), _EVENTS_FRAME + _EVENT_ROW * len(by_row)][: 2 if by_row else 1]
+    heights = [_FRAME + _ROW * len(each) for each in (rows, by_row) if each]
     figure = Figure(figsize=(_WIDTH, _HEIGHT + sum(heights)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     mosaic: list[HashableList[str]] = [
@@ -142,12 +126,11 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
     for name in ("track", "altitude", "speed"):
         axes[name].grid(alpha=0.3)
     axes["track"].legend(fontsize="small", loc="best")
-    low = min(*(stream.seconds.min() for stream in drawn), *(mark.begin for mark in marks), math.inf)
-    high = max(*(stream.seconds.max() for stream in drawn), *(mark.end for mark in marks), -math.inf)
-    margin = 0.02 * (high - low or 1.0)
+    times = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
+    margin = 0.02 * (np.ptp(times) or 1.0)
     for name in axes.keys() - {"track"}:
-        axes[name].set_xlim(low - margin, high + 3 * margin)  # with room for the text of what happened last
-    figure.suptitle(_legible(title), parse_math=False)
+        axes[name].set_xlim(times.min() - margin, times.max() + 3 * margin)  # with room for the last text
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a name of a file may have any bytes
     figure.supxlabel(_explain_missing(drawn), fontsize="small")
     axes["events" if by_row else "flags"].set_xlabel("time [s]")
     if by_row:
@@ -166,8 +149,7 @@ def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
             axes.plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
     axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
     axes.locator_params(axis="x", nbins=6)  # more labels than these may touch each other
-    ends = "circle: start, square: end, " if any(stream.messages["xy_valid"].any() for stream in streams) else ""
-    axes.set_title(f"track; {ends}{_thin('xy_valid', streams)}")
+    axes.set_title("track; circle: start, square: end, thin: xy invalid")
 
 
 def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
@@ -175,7 +157,7 @@ def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
     for stream in streams:
         for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
             axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
-    title = f"altitude; {_thin('z_valid', streams)}, dashed: a reset of z or vz"
+    title = "altitude; thin: z invalid, dashed: a reset of z or vz"
     axes.set(ylabel="altitude above origin, -z [m]", title=title)
 
 
@@ -184,12 +166,7 @@ def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
         return stream.seconds, np.hypot(stream.messages["vx"], stream.messages["vy"])
 
     _draw_lines(axes, streams, "v_xy_valid", line_of, width=0.9)
-    axes.set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title=f"speed; {_thin('v_xy_valid', streams)}")
-
-
-def _thin(flag: str, streams: Sequence[_Stream]) -> str:
-    is_set = any(stream.messages[flag].any() for stream in streams)
-    return f"thin: {flag.removesuffix('_valid')} invalid" if is_set else f"thin: {flag} is never set"
+    axes.set(xlabel="time [s]", ylabel="horizontal speed [m/s]", title="speed; thin: v_xy invalid")
 
 
 def _draw_lines(
@@ -206,70 +183,69 @@ def _draw_lines(
         axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=stream.color, linewidth=width)
 
 
-def _rows(stream: _Stream, suffix: str) -> Iterator[_Row]:
-    """Yield a row for each flag of a stream, for each kind of reset that occurred, and for resets of heading."""
-    missing = missing_of(stream.messages)
-    for flag in _FLAGS:
-        if flag.name not in missing:
-            shown = _WARNING_COLOR if flag.inverted else stream.color
-            yield _Row(flag.name + suffix, shown, _intervals(stream.seconds, stream.messages[flag.name]), ())
-    for counter, name in _COUNTERS.items():
-        times = stream.resets(counter)
-        if counter not in missing and (name == "heading" or len(times)):
-            yield _Row(f"{name} resets{suffix}", stream.color, (), times)
+def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
+    """Return label, stream and field of each row: flags, kinds of reset that occurred, and resets of heading."""
+    rows: list[tuple[str, _Stream, str]] = []
+    for stream in streams:
+        suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
+        rows += ((name + suffix, stream, name) for name in _FLAGS if name not in missing)
+        for counter, name in _COUNTERS.items():
+            if counter not in missing and (name == "heading" or len(stream.resets(counter))):
+                rows.append((f"{name} resets{suffix}", stream, counter))
+    return rows
 
 
-def _draw_rows(axes: Any, rows: Sequence[_Row]) -> None:
-    for number, row in enumerate(rows):
-        axes.broken_barh(row.bars, (number - 0.35, 0.7), color=row.color)
-        axes.plot(row.marks, np.full(len(row.marks), number), "|", color=row.color, markersize=7)
-    axes.set_yticks(range(len(rows)), [row.label for row in rows], fontsize="x-small" if len(rows) > 12 else "small")
+def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
+    for number, (_, stream, field) in enumerate(rows):
+        if field in _COUNTERS:
+            times = stream.resets(field)
+            axes.plot(times, np.full(len(times), number), "|", color=stream.color, markersize=7)
+        else:
+            flag, color = stream.messages[field], _WARNING_COLOR if field == "dead_reckoning" else stream.color
+            is_shown = flag | np.append(False, flag[:-1])  # until the first message where it is not set
+            axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
+    axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
     axes.set(title="set flags, and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
 
 
 def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> list[_Mark]:
-    """Return what is marked of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
+    """Return the marks of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
     told = [event for event in events if event.boot is not None]
     marks: list[_Mark] = []
-    for vehicle in sorted({stream.address.vehicle for stream in streams}):
+    vehicles = sorted({stream.address.vehicle for stream in streams})
+    for vehicle in vehicles:
         seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
         first, last = float(seconds.min()), float(seconds.max())
-        found: dict[Event, _Mark] = {}
+        found: dict[Event, _Mark] = {}  # flags that began together have one mark, until the last one ends
         for span in spans_of([event for event in told if event.vehicle == vehicle]):
             event = span.begin
-            if event is None or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
+            if span.initial or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
                 continue
             offset = event.boot - start - event.time
             begin = span.since + offset
-            end = last if span.until is None else begin
-            if span.end is not None and span.end.boot is not None:
-                end = span.end.numbers.get("before", span.end.boot) - start  # before a reboot that ends it
-            known = found.get(event)
-            if max(first - begin, begin - last) <= last - first + _NEAR:
-                row = _QUIET.get(event.kind, event.kind.replace("_", " "))
-                text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
-                end = max(begin, min(end, last), -math.inf if known is None else known.end)
-                found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
+            if max(first - begin, begin - last) > last - first + _NEAR:
+                continue
+            row = _QUIET.get(event.kind, event.kind.replace("_", " "))
+            text = event.names[-1] if event.kind == "mode" else event.text if event.text != row else ""
+            row += f" {vehicle}" if len(vehicles) > 1 else ""
+            end = max(begin, last if span.until is None else min(span.until + offset, last))
+            end = max(end, found[event].end) if event in found else end
+            found[event] = _Mark(vehicle, row, event.severity, text, begin, end)
         marks += found.values()
     return sorted(marks, key=lambda mark: mark.begin)
 
 
 def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
-    """Return the marks of each row, by its label: rows with the worst first."""
-    several = len({mark.vehicle for mark in marks}) > 1
+    """Return the marks of each row by its label, rows with the worst first."""
     rows: dict[str, list[_Mark]] = {}
-    for mark in marks:
-        rows.setdefault(f"{mark.row} {mark.vehicle}" if several else mark.row, []).append(mark)
-
-    def rank(label: str) -> int:
-        return min(SEVERITIES.index(mark.severity) for mark in rows[label])
-
-    return {label: rows[label] for label in sorted(rows, key=rank)}
+    for mark in sorted(marks, key=lambda mark: SEVERITIES.index(mark.severity)):
+        rows.setdefault(mark.row, []).append(mark)
+    return {label: sorted(own, key=lambda mark: mark.begin) for label, own in rows.items()}
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark what is bad or to be watched where it began: on the track, and on the time axes of altitude and speed."""
+    """Mark the begin of bad events and of those to watch, on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
@@ -312,46 +288,22 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
 
 
 def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
-    """Write the text of each mark beside it, shortened to the room before the next one, or not at all."""
-    point = _DPI / 72
-    places = [float(axes.transData.transform((mark.begin, number))[0]) / point for mark in marks]
-    edge = float(axes.get_window_extent().x1) / point + _GAP
-    for mark, place, after in zip(marks, places, [*places[1:], edge], strict=True):
-        shown, room = _legible(mark.text), after - place - 2 * _GAP
+    """Write the text of each mark beside it if there is room before the next one."""
+    gap = _GAP * _DPI / 72
+    places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
+    for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
         text = axes.annotate(
-            shown, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
+            mark.text, (mark.begin, number), (_GAP, 0), textcoords="offset points", va="center_baseline",
             fontsize="x-small", parse_math=False,
         )  # fmt: skip
         text.set_in_layout(False)
-        if _width(text) > room and room < _SHORTEST:
+        box = text.get_window_extent()
+        if box.x0 + 1.05 * box.width > after - gap:  # the formats differ a little
             text.remove()
-            continue
-        while (width := _width(text)) > room:
-            shown = shown[: min(len(shown) - 1, int(len(shown) * room / width))]
-            text.set_text(shown.rstrip(" ,") + "\N{HORIZONTAL ELLIPSIS}")
-
-
-def _width(text: Any) -> float:
-    """Return the width of a text in points, and a little more: formats differ."""
-    return 1.05 * float(text.get_window_extent().width) * 72 / _DPI
 
 
 def _explain_missing(streams: Sequence[_Stream]) -> str:
     """Return the rows that are not drawn, as the flight does not have them."""
-    drawn = [flag.name for flag in _FLAGS] + list(_COUNTERS)
+    drawn = [*_FLAGS, *_COUNTERS]
     missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
     return "\n".join(f"{address} does not have {', '.join(names)}" for address, names in missing.items() if names)
-
-
-def _legible(text: str) -> str:
-    """Return a text with "?" for each character that the font lacks, and a remark if there is any."""
-    font = get_font(findfont(FontProperties()))
-    shown = "".join(character if font.get_char_index(ord(character)) else "?" for character in text)
-    return shown if shown == text else f"{shown} (?: a character that this font lacks)"
-
-
-def _intervals(seconds: Any, flag: Any) -> list[tuple[float, float]]:
-    """Return start and length of each interval in which a flag is set, up to the first message where it is not."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], flag, [False])).astype(np.int8)))
-    ends = np.minimum(edges[1::2], len(seconds) - 1)
-    return [(float(seconds[a]), float(seconds[b] - seconds[a])) for a, b in zip(edges[::2], ends, strict=True)]

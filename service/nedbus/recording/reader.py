@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
@@ -16,7 +16,7 @@ from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_
 from .chunks import READ_ERRORS, ChunkFile, records_of
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
     """One channel: its address, the layout of its messages, and the fields that its source did not provide."""
 
@@ -26,13 +26,11 @@ class RecordedStream:
     missing: frozenset[str]
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedMessage:
-    """One message of a file: its CDR payload, and when it was published and recorded [ns]."""
+class RecordedMessage(NamedTuple):
+    """One message of a file: its CDR payload, and the time of its recording [ns]."""
 
     stream: RecordedStream
     payload: bytes
-    published: int
     logged: int
 
 
@@ -40,7 +38,7 @@ class RecordingReader:
     """An MCAP file that is open for reading; a context manager. Messages are read one chunk at a time.
 
     `vehicle` is that of channels that name none; `counts` has the number of messages of each stream.
-    What is damaged is left out; `warnings` say so, and are complete when `messages` or `check` has ended.
+    `warnings` name the damage that is left out, and are complete when `messages` or `check` has ended.
 
     Raises SourceError for a file that is not MCAP or cannot be opened.
     """
@@ -54,21 +52,16 @@ class RecordingReader:
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
-        summary = self._file.summary
-        if summary is not None:
-            self._schemas.update(summary.schemas)
-            for channel in summary.channels.values():
-                self._add(channel)
-        totals = summary.statistics.channel_message_counts if summary and summary.statistics else {}
+        totals: dict[int, int] = {}
+        for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # after their schemas
+            self._learn(record)
+            if isinstance(record, Statistics):
+                totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
-        try:
-            if self._all_known:
-                self.counts = _sum((self._streams[number], total) for number, total in totals.items())
-            else:
-                self.counts = self._count()
-        except SourceError:
-            self.close()
-            raise
+        if self._all_known:
+            self.counts = {stream: total for number, total in totals.items() if (stream := self._streams[number])}
+        else:
+            self.counts = self._count()
 
     @property
     def damaged(self) -> bool:
@@ -76,7 +69,7 @@ class RecordingReader:
         return self._file.damaged
 
     def check(self) -> None:
-        """Read the file once, so that `warnings` and `damaged` are complete and `counts` has what can be read."""
+        """Read the file once, so that `warnings`, `damaged` and `counts` are those of the messages that can be read."""
         for _ in self._file.parts(self._channels()):
             pass
         if self.damaged:
@@ -86,20 +79,13 @@ class RecordingReader:
         """Yield all messages, or those of some addresses, in the order of the file."""
         for part in self._file.parts(self._channels(only)):
             try:
-                yield from self._messages_of(part, only)
+                for record in records_of(part):
+                    if not isinstance(record, Message):
+                        self._learn(record)
+                    elif (stream := self._stream(record)) and (only is None or stream.address in only):
+                        yield RecordedMessage(stream, record.data, record.log_time)
             except READ_ERRORS:
                 self._file.warn("damaged: a chunk has an invalid record; the rest of that chunk is left out", lost=True)
-
-    def _messages_of(self, part: bytes, only: Collection[Address] | None) -> Iterator[RecordedMessage]:
-        for record in records_of(part):
-            if isinstance(record, Schema):
-                self._schemas.setdefault(record.id, record)
-            elif isinstance(record, Channel):
-                self._add(record)
-            elif isinstance(record, Message):
-                stream = self._stream(record)
-                if stream is not None and (only is None or stream.address in only):
-                    yield RecordedMessage(stream, record.data, record.publish_time, record.log_time)
 
     def __enter__(self) -> Self:
         return self
@@ -111,22 +97,23 @@ class RecordingReader:
         """Return the channels of some addresses, or all that can be read; None before all are known."""
         if not self._all_known:
             return None
-        return [
-            number
-            for number, stream in self._streams.items()
-            if stream is not None and (only is None or stream.address in only)
-        ]
+        streams = self._streams.items()
+        return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
     def _count(self) -> dict[RecordedStream, int]:
-        """Count the messages that can be read."""
-        counts = _sum((recorded.stream, 1) for recorded in self.messages())
+        """Count the messages that can be read; raise SourceError if damage leaves none."""
+        counts = Counter(recorded.stream for recorded in self.messages())
         if not counts and self.damaged:
+            self.close()
             raise SourceError(str(self.path), f"no message can be read: {'; '.join(self.warnings[:3])}")
         return counts
 
-    def _add(self, channel: Channel) -> None:
-        if channel.id not in self._streams:
-            self._streams[channel.id] = self._describe(self._schemas.get(channel.schema_id), channel)
+    def _learn(self, record: McapRecord) -> None:
+        """Keep a schema or a channel, unless there is one of this number already."""
+        if isinstance(record, Schema):
+            self._schemas.setdefault(record.id, record)
+        elif isinstance(record, Channel) and record.id not in self._streams:
+            self._streams[record.id] = self._describe(self._schemas.get(record.schema_id), record)
 
     def _stream(self, message: Message) -> RecordedStream | None:
         if message.channel_id not in self._streams:
@@ -171,12 +158,3 @@ class RecordingReader:
             return Address(metadata["vehicle"], metadata["topic"], None if instance is None else int(instance))
         namespace, topic, instance_number = split_ros2_topic(channel.topic)
         return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
-
-
-def _sum(parts: Iterable[tuple[RecordedStream | None, int]]) -> dict[RecordedStream, int]:
-    """Return the number of messages by stream, without what is left out."""
-    counts = Counter[RecordedStream]()
-    for stream, count in parts:
-        if stream is not None:
-            counts[stream] += count
-    return dict(counts)

@@ -1,4 +1,4 @@
-"""Record what a subscription receives."""
+"""Record a subscription to an MCAP file."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from nedbus.errors import ClosedError, NoDataError
 from .flight_files import check_recording
 from .writer import RecordingWriter
 
-_FLUSH_INTERVAL: Final = 1.0  # s: what a power cut costs at most
-_POLL_INTERVAL: Final = 0.2  # s between two checks of whether to stop
+_FLUSH_INTERVAL: Final = 1.0  # s: the most that a power cut costs
+_POLL_INTERVAL: Final = 0.2  # s between two looks at `stop`
 
 
 class Recorder:
@@ -25,7 +25,7 @@ class Recorder:
     """
 
     def __init__(self, subscription: Subscription, path: Path) -> None:
-        check_recording(path, flight="flight.mcap")
+        check_recording(path)
         self._subscription = subscription
         self._writer = RecordingWriter(path)
 

@@ -25,7 +25,7 @@ _MESSAGE_HEADER: Final = 3  # bytes
 _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
 _MIN_READ_COST: Final = 4096  # bytes of the budget that any read costs
-_BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside what its size makes plausible
+_BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside 1000 times its size
 _MAX_FIELDS: Final = 1000  # that are read of a format; a message has fewer
 _MAX_NESTING: Final = 3  # levels of messages within messages; PX4 has one
 _INDEX = re.compile(r"\[(\d+)\]")
@@ -39,7 +39,7 @@ UlogColumns = Mapping[str, npt.NDArray[np.generic]]
 
 @dataclass(frozen=True, slots=True)
 class UlogTopic:
-    """One topic of a log, whose message is described by a file of ours, or by the log itself."""
+    """One topic of a log; its message is a known one, or described by the log."""
 
     address: Address
     definition: Definition[Any]
@@ -50,11 +50,11 @@ class UlogTopic:
 class UlogTopics:
     """Topics of a log.
 
-    `warnings`: what is damaged or left out; `damaged`: whether damage may have cost messages.
+    `warnings`: the damage, and the parts that are left out; `damaged`: True if damage may have cost messages.
     A log has no checksums: damage inside the values of a message cannot be noticed.
     """
 
-    topics: list[UlogTopic]
+    topics: dict[Address, UlogTopic]
     warnings: list[str]
     damaged: bool
 
@@ -62,23 +62,20 @@ class UlogTopics:
 def read_ulog(
     path: Path, *, topics: Collection[str] | None = TOPICS, vehicle: str | None = None, default_vehicle: str = "1"
 ) -> UlogTopics:
-    """Return these topics of a log, all of it for None: of those without a file of ours its formats say what they are.
+    """Return these topics of a log, or all for None; unknown messages are described by the log's formats.
 
     `vehicle` is the log's MAV_SYS_ID unless it is given, and `default_vehicle` if the log has none.
 
     Raises SourceError when it is not a ULog file, or has none of the topics.
     """
     log, damage = _load(path, topics)
-    found = UlogTopics([], damage, bool(damage))
+    found = UlogTopics({}, damage, bool(damage))
     vehicle = vehicle or _system_id(log) or default_vehicle
     several = {data.name for data in log.data_list if data.multi_id > 0}
-    release = log.msg_info_dict.get("ver_sw_release")
-    is_older = isinstance(release, int) and 0 < release >> 16 < _OLDEST
-    seen: set[tuple[str, int]] = set()
     for data in log.data_list:
         name = f"{data.name} [{data.multi_id}]"
         try:
-            definition = BY_TOPIC.get(data.name) or _describe(log, data.name)
+            definition = BY_TOPIC.get(data.name) or _describe(log.message_formats, data.name)
             instances = TOPICS[data.name].instances if data.name in TOPICS else data.name in several
             address = Address(vehicle, data.name, data.multi_id if instances else None)
         except (AddressError, ValueError) as exc:
@@ -86,12 +83,12 @@ def read_ulog(
             found.damaged |= data.name in TOPICS or isinstance(exc, AddressError)
             continue
         columns = _by_field(data.data)
-        known = definition.known_types
         if data.name not in BY_TOPIC:  # their types are the log's own, but pyulog reads char as int8
             chars = [field for field, kind in definition.types.items() if kind.base == "uint8" and field in columns]
             columns |= {field: columns[field].view(np.uint8) for field in chars}
+        known = definition.known_types
         wrong = {field for field, column in columns.items() if field in known and not _has_type(known[field], column)}
-        if wrong and is_older:
+        if wrong and _is_older(log):
             found.warnings.append(f"{name}: {', '.join(sorted(wrong))} left out: of another type before PX4 1.13")
             columns = {field: column for field, column in columns.items() if field not in wrong}
             wrong = set()
@@ -100,17 +97,15 @@ def read_ulog(
             names = ", ".join(sorted(wrong | lacking))
             found.warnings.append(f"{name}: the definition of {names} is damaged")
             found.damaged = True
-        same = next((other for other in found.topics if address == other.address), None)
-        if same and not _equal(same.columns, columns):
-            found.warnings.append(f"{name} is left out: a second one")
-            found.damaged |= (data.name, data.multi_id) in seen
-        elif not same and not wrong and "timestamp" in columns:
-            found.topics.append(UlogTopic(address, definition, columns))
-        seen.add((data.name, data.multi_id))
+        if address in found.topics:
+            if not _equal(found.topics[address].columns, columns):
+                found.warnings.append(f"{name} is left out: a second one")
+                found.damaged |= instances or data.multi_id == 0
+        elif not wrong and "timestamp" in columns:
+            found.topics[address] = UlogTopic(address, definition, columns)
     if not found.topics:
         wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
-        reason = f"no message of {wanted} is in this log"
-        raise SourceError(str(path), "; ".join([reason, *found.warnings[:3]]))
+        raise SourceError(str(path), "; ".join([f"no message of {wanted} is in this log", *found.warnings[:3]]))
     return found
 
 
@@ -119,18 +114,17 @@ def _equal(one: UlogColumns, other: UlogColumns) -> bool:
     return one.keys() == other.keys() and all(one[name].tobytes() == other[name].tobytes() for name in one)
 
 
-def _describe(log: Any, topic: str) -> Definition[Any]:
-    """Return what the formats of a log say of a message; those within it are made fields; ValueError if that fails."""
+def _describe(formats: Mapping[str, Any], topic: str) -> Definition[Any]:
+    """Return the definition of a message that the log describes; raise ValueError if it is invalid."""
     name = "".join(part.capitalize() for part in topic.split("_"))
-    return _define(name, tuple(islice(_fields(log.message_formats, topic), _MAX_FIELDS)))
+    return _define(name, tuple(islice(_fields(formats, topic), _MAX_FIELDS)))
 
 
-@lru_cache(1024)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
-def _define(name: str, fields: tuple[tuple[str, FieldType], ...]) -> Definition[Any]:
-    return define(name, fields)
+_define = lru_cache(1024)(define)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
 
 
 def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:
+    """Yield names and types of a format; those of a nested message have its name as a prefix."""
     for kind, length, field in formats[name].fields:
         if field.startswith("_padding"):
             continue
@@ -144,10 +138,9 @@ def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int 
 
 
 class _BoundedFile:
-    """A file with a budget of bytes to read, as pyulog can loop in a damaged one; `cut` if it ends too early."""
+    """A file with a budget of bytes to read: pyulog can loop in a damaged file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
-        self.cut = False
         self._file = file
         self._budget = _BUDGET + 1000 * size
         self.seek = file.seek
@@ -157,9 +150,6 @@ class _BoundedFile:
     def read(self, size: int = -1) -> bytes:
         data = self._file.read(size)
         self._budget -= _MIN_READ_COST + len(data)
-        # Only the read of a message's header may find the end of the file.
-        if len(data) < size and (data or size != _MESSAGE_HEADER):
-            self.cut = True
         if self._budget < 0:
             raise ULogException("invalid structure: its parts refer back to each other")
         return data
@@ -178,37 +168,36 @@ def _load_pyulog(printed: list[str]) -> ModuleType:
 
 def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
     """Return pyulog's ULog, and a list of damages."""
-    printed: list[str] = []
+    damage: list[str] = []
     try:
         with open_flight(path) as file:
             bounded = _BoundedFile(file, path.stat().st_size)
-            log = _load_pyulog(printed).ULog(bounded, None if topics is None else list(topics))
-        end = None if log.has_data_appended else _find_damage(path)
+            log = _load_pyulog(damage).ULog(bounded, None if topics is None else list(topics))
+        end = "" if log.has_data_appended else _find_damage(path)
     except OSError as exc:
         raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
     except _READ_ERRORS as exc:
         raise SourceError(str(path), f"not a readable ULog file ({exc})") from exc
-    damage = [f"damaged: {line}" for line in printed[:5]]
-    if log.file_corruption and not damage:
-        damage.append("damaged: parts of it were skipped")
-    elif bounded.cut:
-        damage.append("cut: it ends inside a message")
-    elif end is not None and not damage:
-        damage.append(f"damaged: no message begins at byte {end}")
-    return log, damage
+    if damage:
+        return log, [f"damaged: {line}" for line in damage[:5]]
+    if log.file_corruption:
+        return log, ["damaged: parts of it were skipped"]
+    return log, [end] if end else []
 
 
-def _find_damage(path: Path) -> int | None:
-    """Return where a log does not go on with a message, as pyulog skips what it does not know without a word."""
+def _find_damage(path: Path) -> str:
+    """Return the first damage of a log's structure, empty without one: pyulog skips unknown messages silently."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(_FILE_HEADER)
         while head := file.read(_MESSAGE_HEADER):
+            if len(head) == _MESSAGE_HEADER and head[2] not in _MESSAGE_TYPES:
+                return f"damaged: no message begins at byte {file.tell() - len(head)}"
             end = file.tell() + int.from_bytes(head[:2], "little")
-            if len(head) < _MESSAGE_HEADER or head[2] not in _MESSAGE_TYPES or end > size:
-                return file.tell() - len(head)
+            if len(head) < _MESSAGE_HEADER or end > size:
+                return "cut: it ends inside a message"
             file.seek(end)
-    return None
+    return ""
 
 
 def _has_type(kinds: Iterable[FieldType], column: npt.NDArray[np.generic]) -> bool:
@@ -218,6 +207,12 @@ def _has_type(kinds: Iterable[FieldType], column: npt.NDArray[np.generic]) -> bo
         and column.shape[1:] == ((kind.length,) if kind.length else ())
         for kind in kinds
     )
+
+
+def _is_older(log: Any) -> bool:
+    """Return whether a log is from before the oldest known layouts."""
+    release = log.msg_info_dict.get("ver_sw_release")
+    return isinstance(release, int) and 0 < release >> 16 < _OLDEST
 
 
 def _system_id(log: Any) -> str | None:

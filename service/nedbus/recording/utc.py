@@ -1,22 +1,26 @@
-"""UTC of a flight, as its own messages tell it."""
+"""The UTC of a flight, from its own messages."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from nedbus_msgs.arrays import MessageArray
+from nedbus.client import Sample
+from nedbus_msgs import ANY, Selection, vehicle_name
+from nedbus_msgs.arrays import MessageArray, to_array
 
-TELLING: Final = ("time_utc_usec", "estimated_offset")
-"""The fields that tell it, the better one first: a GNSS receiver's UTC, and the offset to a companion's clock."""
+from .arrays import Flight, missing_of
+from .flight_files import matching, require_one_vehicle
 
+_FIELDS: Final = ("time_utc_usec", "estimated_offset")  # a GNSS receiver's UTC, or the offset to a companion's clock
 _RELATIVE: Final = "timestamp_time_relative"  # us, of a receiver's UTC after its timestamp
 _PLAUSIBLE: Final = (946_684_800_000_000, 4_102_444_800_000_000)  # us: 2000 to 2100; other clocks have no date
-_TOLERANCE: Final = 1_000_000  # us from the median to what still agrees with it
+_TOLERANCE: Final = 1_000_000  # us from the median; messages within agree
 _AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock that was set
 
 
@@ -24,7 +28,7 @@ _AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock t
 class UtcOffset:
     """Unix time minus the vehicle's `timestamp` [us], and its source.
 
-    `source`: the stream that tells it. With timesync_status it is the clock of a companion, as good as that one is.
+    `source`: its stream. With timesync_status it is the clock of a companion, and as good as that clock.
     `offset_us`: the median of its messages. A GNSS fix is some tenths of a second older than its message.
     `count`: the messages that agree to a second; `spread_us`: from the least to the greatest of these.
     """
@@ -39,16 +43,44 @@ class UtcOffset:
         return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(timestamp) + self.offset_us)
 
 
-def tell_utc(streams: Mapping[str, MessageArray]) -> UtcOffset | None:
-    """Return the offset that the best of these streams tells, None if none does."""
-    for field in TELLING:
+def utc_of(
+    flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
+) -> UtcOffset | None:
+    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and its source; None without one.
+
+    Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
+    `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
+
+    The source is a GNSS receiver whose `time_utc_usec` is not 0, or the clock of a companion in `timesync_status`,
+    which counts as UTC only with a date after 2000. Where messages disagree by more than a second there is none.
+
+    Raises AddressError for several vehicles, without the name of one; other errors are those of `read`.
+    """
+    vehicle = vehicle_name(vehicle)
+    if isinstance(flight, Mapping):
+        return _find_utc(flight)
+    if not isinstance(flight, str | Path):
+        samples = [each for each in flight if vehicle in (ANY, each.vehicle)]
+        require_one_vehicle("the samples", (each.address for each in samples), vehicle)
+        return _find_utc({each.address.stream: to_array([each.message]) for each in samples})
+    path = Path(flight).expanduser()
+    with Flight(path) as opened:
+        addresses = matching(path, opened.addresses, Selection(vehicle=vehicle))
+        require_one_vehicle(path, addresses, vehicle)
+        used = [each for each in addresses if not opened.definitions[each].types.keys().isdisjoint(_FIELDS)]
+        return _find_utc({address.stream: messages for address, (messages, _) in opened.read(used).items()})
+
+
+def _find_utc(streams: Mapping[str, MessageArray]) -> UtcOffset | None:
+    """Return the offset of the best of these streams, None if no stream has one."""
+    for field in _FIELDS:
         for name, messages in sorted(streams.items()):
-            metadata: Mapping[str, Any] = messages.dtype.metadata or {}
-            if field not in (messages.dtype.names or ()) or field in metadata.get("missing", ()):
+            names = set(messages.dtype.names or ()) - missing_of(messages)
+            if field not in names:
                 continue
             times, value = messages["timestamp"].astype(np.int64), messages[field].astype(np.int64)
-            utc = value if field == TELLING[0] else times - value
-            if field == TELLING[0] and _RELATIVE in (messages.dtype.names or ()):
+            utc = value if field == "time_utc_usec" else times - value
+            if field == "time_utc_usec" and _RELATIVE in names:
                 utc = value - messages[_RELATIVE]
             offsets = (utc - times)[(utc >= _PLAUSIBLE[0]) & (utc < _PLAUSIBLE[1])]
             middle = int(np.median(offsets)) if len(offsets) else 0

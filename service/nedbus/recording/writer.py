@@ -10,6 +10,7 @@ import errno
 import os
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from itertools import repeat
 from operator import itemgetter
 from pathlib import Path
@@ -37,19 +38,17 @@ class RecordingWriter:
 
     There is one channel for each address and provenance, in the current layout of its message, or in that of PX4 which
     has just the fields that its source provides, where no layout of PX4 has all.
-    A chunk, of up to `chunk_size` bytes before compression, is what damage of one bit costs.
+    Damage of one bit costs a chunk, of up to `chunk_size` bytes before compression.
 
-    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written: then what was flushed
-    can still be read.
+    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written; messages that were
+    flushed can still be read.
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
         self.path = Path(path)
         self.messages = 0
-        try:
+        with _writing(self.path):
             self._file = _AppendFile(self.path)
-        except OSError as exc:
-            raise OutputError(self.path, exc) from exc
         # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
         self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=chunk_size)
         self._writer.start(profile="ros2", library="nedbus")
@@ -108,32 +107,24 @@ class RecordingWriter:
             yield logged, channel, data[index * size : (index + 1) * size], published, max(0, number) % 2**32
 
     def _add(self, encoded: Iterable[_Encoded]) -> None:
-        try:
+        with _writing(self.path):
             for logged, channel, data, published, number in encoded:
                 self._writer.add_message(channel, logged, data, published, number)
                 self.messages += 1
-        except OSError as exc:
-            raise OutputError(self.path, exc) from exc
 
     def flush(self) -> None:
         """Sync everything to the disk, so that a power cut loses none of it."""
-        try:
+        with _writing(self.path):
             self._writer.flush()
             self._file.sync()
-        except OSError as exc:
-            raise OutputError(self.path, exc) from exc
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
         if self._file.closed:
             return
-        try:
+        with closing(self._file), _writing(self.path):
             self._writer.finish()
             self._file.sync(end=b"")
-        except OSError as exc:
-            raise OutputError(self.path, exc) from exc
-        finally:
-            self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -166,11 +157,19 @@ class RecordingWriter:
         return channel, layout
 
 
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Raise OutputError for an OSError in the block."""
+    try:
+        yield
+    except OSError as exc:
+        raise OutputError(path, exc) from exc
+
+
 class _AppendFile:
     """A file for the MCAP writer that has a valid end after each `sync`."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
         self._file = path.open("xb", buffering=0)
         self._pending = bytearray()
         self._offset = 0
@@ -189,7 +188,7 @@ class _AppendFile:
         """Do nothing: `sync` writes to the disk."""
 
     def sync(self, end: bytes = _END) -> None:
-        """Write what is pending, and an end behind it, to the disk; restore the previous end if that fails."""
+        """Write the pending data and an end behind it to the disk; restore the previous end if that fails."""
         pending = bytes(self._pending)
         self._pending.clear()
         try:
@@ -201,17 +200,8 @@ class _AppendFile:
             raise
         os.fsync(self._file.fileno())
         self._offset += len(pending)
-        if self._is_deleted():
+        if not os.fstat(self._file.fileno()).st_nlink:
             raise OSError(errno.ESTALE, "it was deleted while it was written")
-
-    def _is_deleted(self) -> bool:
-        file = os.fstat(self._file.fileno())
-        if file.st_nlink:  # also a file that was only moved
-            return False
-        try:  # some file systems do not count links
-            return not os.path.samestat(file, self._path.stat())
-        except OSError:
-            return True
 
     def _write_at_offset(self, data: bytes) -> None:
         rest = memoryview(data)

@@ -12,7 +12,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from nedbus.errors import ConfigError
 from nedbus.transport import Tls, check_endpoints, dial_endpoint, router_endpoints
-from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle
+from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_name
 
 
 def split_sources(value: object) -> object:
@@ -40,10 +40,6 @@ def split_http(where: str) -> tuple[str, int]:
 def is_loopback(host: str) -> bool:
     """Return whether only this host reaches a server on this address."""
     return host in {"127.0.0.1", "::1", "localhost"}
-
-
-def _number_as_text(value: object) -> object:
-    return str(value) if type(value) is int else value
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
@@ -76,7 +72,7 @@ class Settings(BaseSettings):
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
     prefix: Annotated[str, _checked(check_prefix)] = Field(DEFAULT_PREFIX, description="First chunks of every key")
-    vehicle: Annotated[str, BeforeValidator(_number_as_text), _checked(check_vehicle)] = Field(
+    vehicle: Annotated[str, BeforeValidator(vehicle_name), _checked(check_vehicle)] = Field(
         "1", description="Vehicle of sources that name none"
     )
     source: Annotated[tuple[str | dict[str, Any], ...], NoDecode, BeforeValidator(split_sources)] = Field(

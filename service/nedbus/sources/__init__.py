@@ -2,12 +2,12 @@
 
 from .account import KEPT_OF_FILE, FileAccount, follow, read_account, times_of
 from .conversion import convert
-from .mavlink.link import Link, check_link, open_link
+from .mavlink.link import Link, open_link, parse_link
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
 from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 
 __all__ = [
     "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Link", "LiveSource", "Rejection", "ReplayRun",
-    "ReplaySource", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "check_link", "convert",
-    "follow", "open_link", "parse_source", "read_account", "source_text_of_file", "times_of",
+    "ReplaySource", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "convert", "follow",
+    "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "times_of",
 ]  # fmt: skip

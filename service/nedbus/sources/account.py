@@ -1,4 +1,4 @@
-"""The events of all vehicles of a file, as the messages of its replay tell them."""
+"""The events of all vehicles of a file, detected in the messages of its replay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KEPT_OF_FILE: Final = 100_000
 """Events that are kept of a file, the last ones."""
 
 _CHECK_INTERVAL: Final = 0.5  # s of the flight between two checks for silent streams, and for events that settled
-_SETTLE_TIME: Final = 10.0  # s after the last message at which events that had not settled are told
+_SETTLE_TIME: Final = 10.0  # s after the last message at which unsettled events are reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +46,32 @@ def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
 
 
 def times_of(path: Path, addresses: Iterable[Address]) -> Times:
-    """Return how the times of a file are told: in UTC for each vehicle whose messages tell it."""
+    """Return the clock for the times of a file: UTC for each vehicle whose messages contain it."""
     vehicles = {address.vehicle for address in addresses}
-    told = {name: recording.utc_of(path, vehicle=name) for name in vehicles}
-    return Times(offsets={name: utc.offset_us / 1e6 for name, utc in told.items() if utc is not None})
+    found = {name: recording.utc_of(path, vehicle=name) for name in vehicles}
+    return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found.items() if utc is not None})
 
 
 def follow(
     messages: Iterable[SourceMessage], account: Account
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account, and yield each with why it is rejected, or with its payload."""
-    looked = due = 0.0
+    """Add the messages of a replay to an account, and yield each with the reason of its rejection, or its payload."""
+    checked = due = 0.0
     for message in messages:
-        due = message.due
-        while due - looked >= _CHECK_INTERVAL:
-            looked += _CHECK_INTERVAL
-            account.look(looked)
-        yield message, *_add(account, message)
+        due, reason, payload = message.due, message.error, None
+        while due - checked >= _CHECK_INTERVAL:
+            checked += _CHECK_INTERVAL
+            account.look(checked)
+        if reason is None:
+            definition = message.definition or BY_TOPIC[message.address.topic]
+            try:
+                fields = upgrade_fields(definition, message.fields)
+                payload = codec_of(definition).encode_fields(fields)
+                account.add(message.address, fields, due)
+            except InvalidMessageError as exc:
+                reason = exc.reason
+        if reason is not None:
+            account.reject(message.address, reason, due)
+        yield message, reason, payload
     account.look(due)
     account.settle(due + _SETTLE_TIME)
-
-
-def _add(account: Account, message: SourceMessage) -> tuple[str | None, bytes | None]:
-    reason = message.error
-    if reason is None:
-        definition = message.definition or BY_TOPIC[message.address.topic]
-        try:
-            fields = upgrade_fields(definition, message.fields)
-            payload = codec_of(definition).encode_fields(fields)
-        except InvalidMessageError as exc:
-            reason = exc.reason
-        else:
-            account.add(message.address, fields, message.due)
-            return None, payload
-    account.reject(message.address, reason, message.due)
-    return reason, None

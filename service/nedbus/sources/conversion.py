@@ -19,9 +19,9 @@ from .source import SourceMessage
 
 _log = logging.getLogger(__name__)
 
-_MAX_START: Final = 2**63  # ns: what follows must fit as well
+_MAX_START: Final = 2**63  # ns: later times must fit as well
 _CHUNK: Final = 1024  # messages that are written together
-_CHUNK_BYTES: Final = 2**18  # what damage costs, some seconds of a flight
+_CHUNK_BYTES: Final = 2**18  # lost to damage, some seconds of a flight
 _MAX_LOGGED: Final = 5  # rejected messages that are logged
 
 
@@ -31,17 +31,15 @@ def convert(
     *,
     source: str,
     on_progress: Callable[[int], object],
-    flight: str = "flight.ulg",
 ) -> str:
     """Write messages to a new MCAP file and return a summary; without success there is no file.
 
     A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
-    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far,
-    and `flight` is the file that the hint of an error names.
+    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far.
 
     Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
     """
-    recording.check_recording(path, flight=flight)
+    recording.check_recording(path)
     try:
         with whole_file(path) as part:
             return _write(messages, part, source=source, on_progress=on_progress)

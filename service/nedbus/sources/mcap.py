@@ -8,7 +8,7 @@ from typing import Final
 
 from nedbus.errors import ConfigError, DecodeError, SourceError
 from nedbus.recording import RecordedMessage, RecordedStream, RecordingReader
-from nedbus_msgs import BY_TOPIC, Address, decode_with
+from nedbus_msgs import Address, decode_with
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -21,8 +21,7 @@ class McapSource:
     """An MCAP file, read one chunk at a time."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
-        self._path = path
-        self._default_vehicle = context.vehicle
+        self._path, self._default_vehicle = path, context.vehicle
         self._options, self._vehicle, self._topics = options, options.vehicle, options.chosen_topics
         self.finite, self.loop = not options.loop, options.loop
         self.speed, self.wait = options.speed, options.wait
@@ -32,7 +31,8 @@ class McapSource:
         with self._reader() as reader:
             reader.check()
         counts = {stream: count for stream, count in reader.counts.items() if self._delivers(stream)}
-        addresses = sorted({stream.address for stream in counts})
+        definitions = {stream.address: stream.definition for stream in counts}
+        addresses = sorted(definitions)
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
             found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "none of PX4's topics"
@@ -40,18 +40,13 @@ class McapSource:
         if self._vehicle is not None and len(vehicles) > 1:
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
         total = sum(counts.values())
+        absent = self._options.absent_from({each.topic for each in addresses}, "this recording")
         return ReplayRun(
             messages=self._messages(),
-            addresses=tuple(sorted({self._rename(address) for address in addresses})),
+            addresses={self._rename(address): definitions[address] for address in addresses},
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
-            warnings=(
-                *reader.warnings,
-                *self._options.absent_from({each.topic for each in addresses}, "this recording"),
-            ),
-            definitions={
-                stream.address.topic: stream.definition for stream in counts if stream.address.topic not in BY_TOPIC
-            },
+            warnings=(*reader.warnings, *absent),
             damage=f"{self._path}: damage cost messages: {'; '.join(reader.warnings)}" if reader.damaged else None,
         )
 

@@ -79,7 +79,7 @@ class Options(BaseModel):
         return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
 
     def absent_from(self, topics: Collection[str], where: str) -> list[str]:
-        """Return a warning of what was asked for by name, and is none of these topics."""
+        """Return a warning that names the requested topics and messages that are none of these topics."""
         absent = [name for name in self.topics if name != ANY and _topics_of(name).isdisjoint(topics)]
         return [f"no message of {', '.join(absent)} is in {where}"] if absent else []
 

@@ -1,9 +1,9 @@
-"""The two kinds of sources, replays and live ones, and what they yield."""
+"""The two kinds of sources, replays and live ones, and the messages that they yield."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from nedbus.transport import Session, Tls
@@ -47,7 +47,7 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """All that vehicles publish and a live source does not deliver, which yields it when it changes.
+    """Topics that vehicles publish and a live source does not deliver; yielded when they change.
 
     `not_carried`: messages that have no definition here.
     `silent`: addresses that are announced, and of which nothing arrives while other topics of their vehicles do.
@@ -62,20 +62,18 @@ class ReplayRun:
     """One run of a replay.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: every address that occurs in the messages.
+    `addresses`: every address that occurs in the messages, with the definition of these, None for that of its topic.
     `total`: the number of messages, None if they never end.
-    `summary`: a description for the log; `warnings`: what is damaged or left out.
-    `definitions`: those of the messages on topics that have no file.
-    `damage`: what damage cost, if it cost messages; at its end the run has failed then.
+    `summary`: a description for the log; `warnings`: damage, and parts that are left out.
+    `damage`: the cost of damage, if messages were lost; at its end the run has failed then.
     """
 
     messages: Iterator[SourceMessage]
-    addresses: tuple[Address, ...]
+    addresses: Mapping[Address, Definition[Any] | None]
     total: int | None
     summary: str
     warnings: tuple[str, ...] = ()
     damage: str | None = None
-    definitions: Mapping[str, Definition[Any]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +111,7 @@ class LiveSource(Protocol):
     """A source that receives from vehicles; which addresses it has is known when messages arrive."""
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
-        """Yield what arrives until the iterator is closed, and None at least twice a second when nothing does.
+        """Yield events until the iterator is closed, and None at least twice a second when there is none.
 
         `router`: the session of the service where that is a router itself; it is lent, and must not be closed.
 

@@ -24,7 +24,7 @@ from .source import Source, SourceContext
 class SourceKind:
     """One kind of source: its options, its target, and the class that implements it, imported on first use.
 
-    `target`: what follows the colon; None for nothing, in brackets if it is optional.
+    `target`: the part after the colon; None if there is none, in brackets if it is optional.
     `extra`: the extra of nedbus that it needs.
     """
 
@@ -118,7 +118,7 @@ def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:
-    """Return the text of a source that is given as a table; raise ConfigError for what no text can say."""
+    """Return the text of a source that is given as a table; raise ConfigError for a mistake."""
     options = dict(table)
     name = options.pop("kind", None)
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
@@ -149,7 +149,7 @@ def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) 
 
 
 def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
-    """Return what is wrong with an option, and its name."""
+    """Return the mistake in an option, and its name."""
     detail = error.errors()[0]
     name = str(detail["loc"][0])
     field = kind.options.model_fields.get(name)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.recording import UlogTopic, read_ulog
-from nedbus_msgs import ALL, BY_TOPIC, DEFAULT, Definition
+from nedbus_msgs import ALL, DEFAULT, Definition
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
@@ -20,15 +20,12 @@ from .source import ReplayRun, SourceContext, SourceMessage
 _MAX_GAP: Final = 60_000_000  # us: a longer gap in a log is a damaged timestamp, not a time to wait for
 _CHUNK: Final = 1000  # rows that are converted to Python values at a time
 
-_BOOLS: Final = {0: False, 1: True}  # valid bytes of a bool; the model rejects any other
-
 
 class UlogSource:
     """A .ulg file; `open` reads its topics into memory."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
-        self._path = Path(path).expanduser()
-        self._options = options
+        self._path, self._options = Path(path).expanduser(), options
         self._default_vehicle = context.vehicle
         self.finite, self.loop = not options.loop, options.loop
         self.speed, self.wait = options.speed, options.wait
@@ -39,7 +36,7 @@ class UlogSource:
         log = read_ulog(
             self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
         )
-        topics, warnings = log.topics, list(log.warnings)
+        topics, warnings = list(log.topics.values()), list(log.warnings)
         clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
         for topic, clock in zip(topics, clocks, strict=True):
             outliers = int(np.count_nonzero(clock != topic.columns["timestamp"]))
@@ -57,15 +54,12 @@ class UlogSource:
         layout = f", layout {layouts}" if layouts else ""
         return ReplayRun(
             messages=heapq.merge(*map(_messages, topics, dues), key=lambda message: message.due),
-            addresses=tuple(topic.address for topic in topics),
+            addresses={topic.address: topic.definition for topic in topics},
             total=total,
             summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
             damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
-            definitions={
-                topic.address.topic: topic.definition for topic in topics if topic.address.topic not in BY_TOPIC
-            },
         )
 
 
@@ -84,13 +78,14 @@ def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[n
     values: list[object] = column.tolist()
     if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
         return [_to_bool(value) for value in values]
-    return [tuple(value) for value in values if isinstance(value, list)] if column.ndim == 2 else values
+    return list(map(tuple, column.tolist())) if column.ndim == 2 else values
 
 
 def _to_bool(value: object) -> object:
+    """Return 0 and 1 as a bool, and any other byte as it is: the model rejects it."""
     if isinstance(value, list):
         return tuple(map(_to_bool, value))
-    return _BOOLS.get(value, value) if isinstance(value, int) else value
+    return bool(value) if value in (0, 1) else value
 
 
 def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:

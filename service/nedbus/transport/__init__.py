@@ -17,7 +17,7 @@ from .rmw_zenoh import (
     px4_publishers_key_expr,
     subscription_token,
 )
-from .router import RouterConfig, open_router, read_router_config, router_endpoints, router_max_sessions
+from .router import RouterConfig, open_router, read_router_config, router_endpoints
 from .router_log import UPLINK_POLL, Uplinks, log_refusals
 from .router_state import RouterState, ask_routers
 from .session import (
@@ -50,6 +50,6 @@ __all__ = [
     "Verdict", "alive_keys", "ask", "ask_routers", "check_endpoints", "check_pem", "dial_endpoint", "entity_name",
     "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",
     "node_token", "open_client", "open_router", "probe_writes", "publisher_token", "px4_publishers_key_expr", "query",
-    "read_router_config", "request_samples", "require_unforked", "router_endpoints", "router_max_sessions",
-    "split_endpoint", "subscription_token", "translate_error", "while_open",
+    "read_router_config", "request_samples", "require_unforked", "router_endpoints", "split_endpoint",
+    "subscription_token", "translate_error", "while_open",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ _MAX_WAITING: Final = 131_072  # answers; Zenoh must never wait for room while i
 _MAX_CHANGES: Final = 4096  # that wait
 _MAX_KEY_LENGTH: Final = MAX_ANSWER_BYTES // MAX_ANSWERS
 _INCOMPLETE_PAUSE: Final = 10.0  # s after an incomplete answer
-_CONTRADICTED_PAUSE: Final = 0.2  # s after one that looks complete, and lacks what is known
+_CONTRADICTED_PAUSE: Final = 0.2  # s after one that looks complete, and lacks known tokens
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
@@ -34,11 +34,11 @@ def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
 class AliveTokens:
     """The liveliness tokens that match a key expression, followed by one thread.
 
-    Asking a router for all of them costs all its clients, and following them costs nothing while nothing changes: the
-    router is asked when the caller wants that, and when more changed than are kept. Zenoh 1.10 leaves out of an answer
-    any of the tokens that it tells the same session of meanwhile, and the answer looks complete: it is asked again
-    until what is known is in the answer. At most 10,000 tokens are kept of all peers; that there are more, or that the
-    router was too slow to list them, is logged.
+    A query for all tokens costs all clients of a router, and following them costs nothing while nothing changes: the
+    router is asked on request of the caller, and after an overflow of the changes. Zenoh 1.10 leaves out of an answer
+    any tokens that it sends to the subscriber of the same session meanwhile, and the answer looks complete: it is asked
+    again until the answer has all known tokens. At most 10,000 tokens are kept; more of them, or a router that is too
+    slow to list them, are logged.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
@@ -68,27 +68,27 @@ class AliveTokens:
 
         A router that is asked for all has `timeout` seconds to answer.
         """
-        told = self._take_told()
+        changed = self._take_changes()
         changes: list[tuple[str, bool]] = []
-        if len(told) == _MAX_CHANGES:  # others were dropped, of tokens that appeared or went
+        if len(changed) == _MAX_CHANGES:  # others were dropped, of tokens that appeared or went
             changes += [(key, False) for key in self._keys]
             self._answers = None
             self.ask()
-        if self._answers is not None:  # taken after what the subscriber was told, and older than that
+        if self._answers is not None:  # taken after the changes, and older than they are
             changes += self._take_answers(self._answers)
-        changes = [change for change in changes + told if self._note(*change)]
+        changes = [change for change in changes + changed if self._note(*change)]
         if self._answers is None and time.monotonic() >= self._next_query:
             self._next_query = math.inf
             self._expected, self._answered = self._keys.copy(), set()
             self._answers = _ask(self._session, self._key_expr, timeout)
         return changes
 
-    def _take_told(self) -> list[tuple[str, bool]]:
-        told: list[tuple[str, bool]] = []
+    def _take_changes(self) -> list[tuple[str, bool]]:
+        changed: list[tuple[str, bool]] = []
         with suppress(zenoh.ZError):  # the session is closed
-            while len(told) < _MAX_CHANGES and (sample := self._handler.try_recv()) is not None:
-                told.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
-        return told
+            while len(changed) < _MAX_CHANGES and (sample := self._handler.try_recv()) is not None:
+                changed.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
+        return changed
 
     def _take_answers(self, answers: Answers) -> list[tuple[str, bool]]:
         keys = [str(reply.ok.key_expr) for reply in answers.take() if reply.ok is not None]

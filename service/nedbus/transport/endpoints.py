@@ -10,7 +10,7 @@ from typing import Final
 from nedbus.errors import ConfigError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""Where `nedbus serve` listens, and what clients join, unless something else is set."""
+"""The default: `nedbus serve` listens here, and clients connect to it."""
 
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
@@ -37,7 +37,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
 
 
 def explain_endpoints(endpoints: Sequence[str]) -> str | None:
-    """Return why none of these can be reached, as far as this host knows: names without an address; else None."""
+    """Return the reason if none of these can be reached, as this host finds no address of their names; else None."""
     hosts = []
     for parts in map(split_endpoint, endpoints):
         if parts is None:
@@ -53,5 +53,5 @@ def explain_endpoints(endpoints: Sequence[str]) -> str | None:
 
 
 def dial_endpoint(endpoint: str) -> str:
-    """Return where a client on this host connects to a router that listens here, on all interfaces perhaps."""
+    """Return the endpoint for a client on this host of a router that listens here, perhaps on all interfaces."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

@@ -7,7 +7,7 @@ import logging
 import os
 import re
 import resource
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -42,7 +42,7 @@ def open_router(
     `tls` is for the `tls/` routers that it joins, unless the file has a TLS section of its own.
 
     Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
-    The admin space shows `max_sessions` in `metadata`, and the limit of open files is raised for these sessions.
+    The admin space shows `max_sessions` in `metadata`, and the soft limit of open files is raised to the hard one.
 
     Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, a TLS file that cannot be
     read, or a plugin that the file requires.
@@ -76,37 +76,29 @@ def open_router(
     metadata = _get(config, "metadata")
     if metadata is None or isinstance(metadata, dict):  # it is the user's: it may be anything
         insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
-    allow_sessions(sessions, pending=_get(config, "transport/unicast/accept_pending"))
+    allow_sessions(sessions)
     try:
         return open_session(config)
     except zenoh.ZError as exc:
         raise ListenError(router_endpoints(listen, config_file), error_reason(exc)) from exc
 
 
-def allow_sessions(sessions: int, *, pending: int) -> None:
-    """Raise the soft limit of open files of this process for a router's sessions and pending handshakes.
+def allow_sessions(sessions: int) -> None:
+    """Raise the soft limit of open files of this process to the hard one, as each session of a router is an open file.
 
-    Each is an open file; a usual soft limit is 1024. At the limit a router accepts no more connections, and Zenoh does
-    not log it. Logs a warning when the hard limit leaves no room for all sessions.
+    At the limit a router accepts no more connections, and Zenoh does not log it. Logs a warning when there is no room
+    for all sessions.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY:
-        return
-    needed = sessions + pending + _OTHER_FILES
-    target = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    if soft < target:
-        with suppress(OSError, ValueError, OverflowError):  # a kernel may allow less than the hard limit says
-            resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
-            soft = target
-    if soft < sessions + _OTHER_FILES:
-        _log.warning(
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(OSError, ValueError):  # a kernel may allow less than the hard limit says
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < sessions + _OTHER_FILES:
+        text = (
             "only %s open files are allowed: room for about %s sessions, and not for the %s of max_sessions:"
-            " raise the limit (ulimit -n, LimitNOFILE=)",
-            soft,
-            max(0, soft - _OTHER_FILES),
-            sessions,
-            extra=about("router"),
+            " raise the limit (ulimit -n, LimitNOFILE=)"
         )
+        _log.warning(text, soft, max(0, soft - _OTHER_FILES), sessions, extra=about("router"))
 
 
 def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None) -> tuple[str, ...]:
@@ -119,27 +111,23 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
     return _endpoints(_read_config(config_file), "listen") or (DEFAULT_ENDPOINT,)
 
 
-def router_max_sessions(config_file: Path | None = None) -> int:
-    """Return the number of sessions that a router accepts: that of the file, else Zenoh's default.
-
-    Raises ConfigError for a malformed file.
-    """
-    config = zenoh.Config() if config_file is None else _read_config(config_file)
-    return int(_get(config, "transport/unicast/max_sessions"))
-
-
 class RouterConfig(NamedTuple):
-    """The endpoints in a router's configuration file, and the PEM files of its TLS section by name."""
+    """The configuration of a router: endpoints, the PEM files of its TLS section by name, and its limit of sessions."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
     tls_files: Mapping[str, Path]
+    max_sessions: int
 
 
-def read_router_config(path: Path) -> RouterConfig:
-    """Read a file for zenohd or for a router of ours; raise ConfigError, with line and column, for a mistake."""
-    config = _parse_config(path)
-    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config))
+def read_router_config(path: Path | None = None) -> RouterConfig:
+    """Read a file for zenohd or for a router of ours, by default Zenoh's defaults.
+
+    Raises ConfigError, with line and column, for a mistake.
+    """
+    config = zenoh.Config() if path is None else _parse_config(path)
+    sessions = int(_get(config, "transport/unicast/max_sessions"))
+    return RouterConfig(_endpoints(config, "listen"), _endpoints(config, "connect"), _tls_files(config), sessions)
 
 
 def _get(config: zenoh.Config, key: str) -> Any:
@@ -160,8 +148,7 @@ def _read_config(path: Path) -> zenoh.Config:
     """Read a file that a router in this process is to use; raise ConfigError if it requires a plugin."""
     config = _parse_config(path)
     plugins = _get(config, "plugins").items()
-    required = [name for name, settings in plugins if settings and settings.get("__required__")]
-    if required:
+    if required := [name for name, settings in plugins if settings and settings.get("__required__")]:
         reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
@@ -169,7 +156,7 @@ def _read_config(path: Path) -> zenoh.Config:
 
 def _check_files(path: Path, config: zenoh.Config) -> None:
     """Log the plugins of a file, and raise ConfigError for a TLS file that cannot be read: Zenoh would not name it."""
-    if plugins := list(_get(config, "plugins")):
+    if plugins := _get(config, "plugins"):
         text = "%s: without %s: this router loads no plugins, as zenohd does"
         _log.warning(text, path, _names(plugins), extra=about("router"))
     for name, file in _tls_files(config).items():
@@ -178,7 +165,7 @@ def _check_files(path: Path, config: zenoh.Config) -> None:
             raise ConfigError.in_file(path, reason)
 
 
-def _names(plugins: Sequence[str]) -> str:
+def _names(plugins: Iterable[str]) -> str:
     return " and ".join(f"plugin {name}" for name in plugins)
 
 
@@ -193,7 +180,7 @@ def _parse_config(path: Path) -> zenoh.Config:
             config.insert_json5("mode", '"router"')  # as zenohd does
     except zenoh.ZError as exc:
         text = str(exc)
-        position = re.search(r"line: (\d+), column: (\d+)", text) or re.search(r"--> (\d+):(\d+)", text)
+        position = re.search(r"(?:line: |--> )(\d+)(?:, column: |:)(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
         # Without the drawing of Zenoh's parser and its source paths.
         message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)

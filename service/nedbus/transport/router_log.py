@@ -89,9 +89,9 @@ def _protocol_and_port(locator: str) -> tuple[str, str]:
 
 
 def log_refusals() -> None:
-    """Log each client that a router of this process refuses from now on; Zenoh does not say from where it connects.
+    """Log each client that a router of this process refuses from now on; Zenoh does not log its address.
 
-    It takes the place of stdout, to which all else passes on: the lines that RUST_LOG asks of Zenoh.
+    It takes the place of stdout, and passes on all other lines, such as those that RUST_LOG asks of Zenoh.
     """
     stdout = os.dup(1)
     read, write = os.pipe()

@@ -1,4 +1,4 @@
-"""The state of the routers of a network, from their admin spaces: sessions, and how many there may be."""
+"""The state of the routers of a network, from their admin spaces: sessions and their limit."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_ROUTERS: Final = 1000  # that are returned: any peer may claim to be a rout
 class RouterState:
     """A router by its Zenoh id, its sessions now, those with other routers included, and the number it accepts.
 
-    `max_sessions` is None where the router does not say: Zenoh tells it only in `metadata` of its configuration.
+    `max_sessions` is None if it is not in `metadata` of the configuration of the router: Zenoh has no other place.
     """
 
     zid: str
@@ -30,7 +30,7 @@ class RouterState:
 
     @property
     def load(self) -> float | None:
-        """The part of its sessions that a router has in use, 1.0 when it is full; None where it does not say."""
+        """The part of its sessions that a router has in use, 1.0 when it is full; None if the limit is unknown."""
         return None if self.max_sessions is None else self.sessions / self.max_sessions
 
 

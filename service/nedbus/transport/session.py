@@ -114,7 +114,7 @@ def open_client(
             left = end - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
                 break
-    # Of most failures Zenoh says no more than that there is no connection.
+    # For most failures Zenoh reports no more than "Unable to connect".
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 

@@ -54,7 +54,7 @@ class Tls:
         return settings
 
     def explain(self) -> str | None:
-        """Return why a router may refuse these files: one has expired, or they do not belong together; else None.
+        """Return the reason if a router may refuse these files: expired, or not of one authority; else None.
 
         It needs no network, and no package but Python's: the certificate is shown to a server in this process that
         trusts the authority.
@@ -95,7 +95,7 @@ def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path
 
 
 def _verify(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
-    """Return why a server that trusts this authority refuses this certificate, None if it accepts it."""
+    """Return the reason if a server that trusts this authority refuses this certificate, else None."""
     own = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     own.check_hostname = False
     own.verify_mode = ssl.CERT_NONE  # of the server, which only exists here

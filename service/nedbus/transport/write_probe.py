@@ -1,7 +1,7 @@
-"""Probe which vehicles may be written: Zenoh drops what is not allowed, without an error at its sender.
+"""Probe for the permission to publish vehicles: Zenoh drops forbidden messages without an error at the sender.
 
 One session subscribes to keys under the vehicles that are no topic, another one publishes there.
-The publisher sees whether the router told it of that subscriber. If it did, and nothing arrives, it may not write.
+The publisher sees a match if the router announced that subscriber. With a match and no message it may not write.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _SPARE: Final = 16  # room of the channel beyond one probe of each vehicle
 def probe_writes(
     reader: Session, writer: Session, vehicles: Collection[str], *, prefix: str, timeout: float = 1.0
 ) -> dict[str, Verdict]:
-    """Return which vehicles `writer` may publish; unknown if `reader` may not look.
+    """Return the verdict for each vehicle that `writer` may publish or not; unknown if `reader` may not subscribe.
 
-    `timeout`: seconds until the router has told of the subscriber, and then until a message arrives that is allowed.
+    `timeout`: seconds until the router has announced the subscriber, and then until an allowed message arrives.
     """
     probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of a reader does not match its chunk with @
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}

@@ -19,6 +19,7 @@ from .style import Style
 
 _PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
 _MAX_SIDE: Final = 2000  # pixels of a picture
+_PARTS: Final = {"FeatureCollection": "features", "GeometryCollection": "geometries", "Feature": "geometry"}
 
 Ring = list[tuple[float, float]]
 
@@ -90,16 +91,13 @@ class Background:
 
 def _rings(shape: Any) -> Iterator[Ring]:
     """Yield the lines of a GeoJSON object, or of its coordinates, however deeply nested; a point is a line of one."""
-    if isinstance(shape, dict) and shape["type"] in {"FeatureCollection", "GeometryCollection"}:
-        for each in shape["features" if shape["type"] == "FeatureCollection" else "geometries"]:
-            yield from _rings(each)
-    elif isinstance(shape, dict) and shape["type"] == "Feature":
-        yield from _rings(shape["geometry"]) if shape["geometry"] is not None else ()
-    elif isinstance(shape, dict):
-        yield from _rings(shape["coordinates"])
+    if not shape:
+        return
+    if isinstance(shape, dict):
+        yield from _rings(shape[_PARTS.get(shape["type"], "coordinates")])
     elif isinstance(shape[0], int | float):
         yield [_place(shape)]
-    elif isinstance(shape[0][0], int | float):
+    elif isinstance(shape[0], list) and isinstance(shape[0][0], int | float):
         yield [_place(each) for each in shape]
     else:
         for each in shape:

@@ -1,4 +1,4 @@
-"""The events of a page in the order of their time, and what they mean: spans, states, stories, moments in words."""
+"""The events of a page in the order of their time, and their spans, states, stories and times in words."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _TENTH: Final = 0.1  # s: an address names moments no more exactly
 
 
 class Chronicle:
-    """The account of a page, and the events `before` it; read anew only when more has happened.
+    """The account of a page, and the events `before` it; evaluated anew only when more has happened.
 
-    `times`: how times are told; `start`: when a recording began, s since the epoch, where that is known.
+    `start`: the beginning of a recording, s since the epoch, where it is known.
     """
 
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
@@ -54,31 +54,23 @@ class Chronicle:
 
     def moment(self, seconds: float) -> str:
         """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
-        return self.time_text(seconds)[:-2] if self.has_utc else _elapsed(seconds)
+        return to_clock(seconds + (self.start or 0.0))[:-2] if self.has_utc else _elapsed(seconds)
 
     def clock(self, seconds: float) -> str:
         """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
         utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
         return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
 
-    def time_text(self, seconds: float) -> str:
-        """Return a time of the account as `Times.find` understands it: UTC, or seconds since boot."""
-        if self.has_utc:
-            return to_clock(seconds + (self.start or 0.0))
-        first = next(iter(self.events), None)
-        return f"{seconds if first is None or first.boot is None else seconds + first.boot - first.time:.1f}"
-
     def story(self, vehicle: str, now: float, at: Event | float | None) -> Story | None:
-        """Return what is wrong with a vehicle now, or was in the last minutes, or what a chosen event or time is about.
+        """Return the story of a condition that holds now or ended lately, or of a chosen event or time.
 
         `at`: the event or time that is chosen, None for now.
         """
         self._read()
-        if isinstance(at, Event):
-            return next(iter(self._tell(vehicle, at)), None)
+        stories = self._tell(vehicle, at)
         if at is not None:
-            return next(iter(self._tell(vehicle, at + _TENTH)), None)
-        stories = [story for story in self._tell(vehicle, None) if story.since <= now]
+            return next(iter(stories), None)
+        stories = [story for story in stories if story.since <= now]
         going = [story for story in stories if story.until is None or story.until > now]
         if going:
             return max(going, key=lambda story: story.is_bad)
@@ -88,15 +80,14 @@ class Chronicle:
     def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
         """Return the stories of an event, a time, or all times; told once for all viewers until more happens."""
         if (vehicle, at) not in self._stories:
-            known = self.account.vehicles.get(vehicle)
-            topics = list(known.messages.values()) if known is not None else []
-            events = self._by_vehicle.get(vehicle, [])
+            known, events = self.account.vehicles.get(vehicle), self._by_vehicle.get(vehicle, [])
+            topics, initial = ([], []) if known is None else (list(known.topics), list(known.initial))
             if isinstance(at, Event):
                 story = about(at, events, topics=topics)
                 self._stories[vehicle, at] = [] if story is None else [story]
             else:
-                initial = list(known.initial) if known is not None else []
-                self._stories[vehicle, at] = tell(events[-_MAX_EVENTS:], initial, topics=topics, at=at)
+                moment = None if at is None else at + _TENTH
+                self._stories[vehicle, at] = tell(events[-_MAX_EVENTS:], initial, topics=topics, at=moment)
         return self._stories[vehicle, at]
 
     def _read(self) -> None:

@@ -1,4 +1,4 @@
-"""Column data that a viewer is sent: only the points and cells that are new."""
+"""Column data of a viewer, updated by new points and changed columns alone."""
 
 from __future__ import annotations
 
@@ -31,20 +31,16 @@ def table(*names: str) -> ColumnDataSource:
 
 
 def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Send the cells that are different, or all when the number of rows is."""
+    """Send the columns that are different, or all when the number of rows is."""
     old = source.data
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
         source.data = new
-        return
-    patches = {}
-    for name, values in new.items():
-        cells = enumerate(zip(old[name], values, strict=True))
-        patch = [(index, value) for index, (was, value) in cells if was != value and repr(was) != repr(value)]  # NaN
-        if patch:
-            patches[name] = patch
-    if patches:
-        source.patch(patches)
+    else:  # repr, as NaN is not equal to itself
+        cells = slice(len(rows))
+        changed = {name: [(cells, values)] for name, values in new.items() if repr(values) != repr(old[name])}
+        if changed:
+            source.patch(changed)
 
 
 class Tracks:
@@ -62,18 +58,12 @@ class Tracks:
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
         """Send the new points of these."""
-        begins = tracks != self._tracks  # as after a jump of the time, which makes other histories
-        if begins:
+        if tracks != self._tracks:  # as after a jump of the time, which makes other histories
             self._lay_out(tracks)
         cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
         for index, (address, track) in enumerate(tracks.items()):
             self._add_points(cells, index, address, track)
-        if begins:
-            filled: dict[str, Any] = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in cells}
-            for name, column in filled.items():
-                column[list(cells[name])] = list(cells[name].values())
-            self.source.data = filled
-        elif cells["east"]:
+        if cells["east"]:
             self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
 
     def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
@@ -85,6 +75,7 @@ class Tracks:
         written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
         self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
         self._slots = longest // self._step + 2  # with the one that is not complete yet, and the gap
+        self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
 
     def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
         """Add the cells that change, by column and slot."""
@@ -95,19 +86,17 @@ class Tracks:
             return
         self._seen[index] = end
         names = (_TRUE,) if address.topic == TRUTH else (f"valid{number % PALETTE}", _DOUBT)
-        gap = dict.fromkeys(("east", *names), math.nan)
+
+        def put(slot: int, point: Mapping[str, float]) -> None:
+            for name in ("east", *names):
+                for place in (0, ring) if slot == 0 else (slot,):  # so that the line goes on from the last slot
+                    cells[name][index * (ring + 2) + place] = point.get(name, math.nan)
+
         points = history.points(seen // step * step, end)
-        changed: dict[int, dict[str, float]] = {}
         broken = False
         for position, point in enumerate(points.tolist(), end - len(points)):
             east, north, doubtful = point[_EAST], point[_NORTH], point[_DOUBTFUL]
             broken = math.isnan(east) or (broken and position % step > 0)
-            values = {**gap, "east": round(east, 2)}
-            values[names[-1 if doubtful > 0 else 0]] = math.nan if broken else round(north, 2)
-            changed[position // step % ring] = values
-        changed[((end - 1) // step + 1) % ring] = gap
-        if 0 in changed:
-            changed[ring] = changed[0]  # so that the line goes on from the last slot to the first
-        for slot, values in changed.items():
-            for name, value in values.items():
-                cells[name][index * (ring + 2) + slot] = value
+            kind = names[-1 if doubtful > 0 else 0]
+            put(position // step % ring, {"east": round(east, 2), kind: math.nan if broken else round(north, 2)})
+        put(((end - 1) // step + 1) % ring, {})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -141,7 +140,6 @@ class Fleet:
         self._left_out: set[Address] = set()
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
-        self._lock = threading.Lock()
 
     def add(self, sample: Sample[Any], time: float) -> None:
         """Add a sample at this time [s since the epoch]."""
@@ -152,10 +150,8 @@ class Fleet:
                 if len(self._left_out) < MAX_STREAMS:
                     self._left_out.add(address)
                 return
-            stream = Stream(self.origin, self._long)
-            with self._lock:
-                self.streams[address] = stream
-                self._left_out.discard(address)
+            stream = self.streams[address] = Stream(self.origin, self._long)
+            self._left_out.discard(address)
             if address.topic == TRUTH:
                 self._truths[address.vehicle] = stream
         stream.add(sample, time, None if address.topic == TRUTH else self._truths.get(address.vehicle))
@@ -169,9 +165,8 @@ class Fleet:
 
     def clear(self) -> None:
         """Forget all but the common origin: the time has jumped."""
-        with self._lock:
-            for part in (self.streams, self._truths, self._left_out, self._rejected, self._reports):
-                part.clear()
+        for part in (self.streams, self._truths, self._left_out, self._rejected, self._reports):
+            part.clear()
 
     def look(
         self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
@@ -181,10 +176,8 @@ class Fleet:
 
         `states`: of vehicles, by name. `alive`: the addresses that are published now, None if that is not known.
         """
-        with self._lock:
-            streams = sorted(self.streams.items())
         lines: dict[str, list[Line]] = {}
-        for address, stream in streams:
+        for address, stream in sorted([*self.streams.items()]):  # at once: another thread adds streams
             if stream.last is None:
                 continue
             health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
@@ -224,13 +217,12 @@ class Fleet:
 
     def _make_room(self, time: float) -> bool:
         """Forget a stream of other messages, or one that is silent; return whether there was one."""
-        with self._lock:
-            address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
-            if is_position(address) and time - self.streams[address].time < _SILENT:
-                return False
-            del self.streams[address]
-            if address.topic == TRUTH:
-                del self._truths[address.vehicle]
+        address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
+        if is_position(address) and time - self.streams[address].time < _SILENT:
+            return False
+        del self.streams[address]
+        if address.topic == TRUTH:
+            del self._truths[address.vehicle]
         return True
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ _MARGIN: Final = 0.08  # of what is shown, around it
 _FOLLOWED_SIDE: Final = 60.0  # m around a vehicle that is followed
 _LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label
 _MAX_EVENTS: Final = 60
+_SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 
 
 class Map:
@@ -95,8 +97,13 @@ class Map:
         ]  # fmt: skip
         replace(self.events, marks)
 
+    def resize(self, size: str) -> None:
+        """Take the size of the map from a browser, such as 600x500 [pixels]."""
+        if found := _SIZE.fullmatch(size):
+            self.size = float(found[1]), float(found[2])
+
     def _frame_of(self, shown: Sequence[tuple[Row, Place]], tracks: dict[Address, Track]) -> list[list[float]]:
-        """Return from where to where the map is, east and north."""
+        """Return the extent of the map: [west, east], [south, north] [m]."""
         points = [np.array([place[:2] for _, place in shown] or [(0.0, 0.0)])]
         points += [tracks[each.main.address][0].points()[:, 1:3] for each, _ in shown]
         found = np.concatenate(points)
@@ -110,7 +117,7 @@ class Map:
     def _labels(
         self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
     ) -> dict[str, tuple[str, bool]]:
-        """Return the labels that do not lie on each other, the worst first, and which are on the left of their mark."""
+        """Return the labels that do not overlap, the worst first, and whether each is on the left of its mark."""
         (west, east), (south, north) = frame
         width, height = self.size
         scale, right = max((east - west) / width, (north - south) / height), east  # m a pixel

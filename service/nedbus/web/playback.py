@@ -26,7 +26,7 @@ from nedbus.sources import (
     source_text_of_file,
     times_of,
 )
-from nedbus_msgs import BY_TOPIC, Address, codec_of
+from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
 from .fleet import Fleet
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 _MINUTE: Final = 60.0  # s that are shown before the time that is chosen
 _WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two of them
-_KEPT: Final = ("VehicleStatus", "SensorGps", "BatteryStatus")  # messages whose values the page shows
+_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # whose values are shown
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
@@ -44,8 +44,8 @@ class Recording:
     """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
 
     Of most other messages, which outnumber them, only PX4's time is kept. `whole`: the flight at two points a second;
-    `account`: its events, whose clock is seconds since the first message; `chronicle`: how the page tells them.
-    `entries`: of each message its address, and its payload, timestamp, or why it was rejected; `dues`: when [s].
+    `chronicle`: its events, whose clock is seconds since the first message.
+    `entries`: of each message its address, and its payload, timestamp or reason of rejection; `dues`: its time [s].
 
     Raises ConfigError and SourceError for a file that cannot be read.
     """
@@ -54,8 +54,7 @@ class Recording:
         spec = parse_source(source_text_of_file(path))
         self.name = path.name
         self.whole = Fleet(long=_WHOLE)
-        self.account = Account(KEPT_OF_FILE)
-        self.chronicle = Chronicle(self.account, times=Times())
+        self.chronicle = Chronicle(Account(KEPT_OF_FILE), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
@@ -83,7 +82,7 @@ class Recording:
     def _read(self) -> None:
         try:
             self.chronicle.times = times_of(self._path, self._run.addresses)
-            for message, reason, payload in follow(self._run.messages, self.account):
+            for message, reason, payload in follow(self._run.messages, self.chronicle.account):
                 self._add(message, reason, payload)
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))
@@ -92,12 +91,11 @@ class Recording:
 
     def _add(self, message: SourceMessage, reason: str | None, payload: bytes | None) -> None:
         address, stamp = message.address, cast("int", message.fields.get("timestamp", 0))
-        definition = BY_TOPIC.get(address.topic)
         kept: bytes | str | int = stamp if reason is None else reason
-        if payload is not None and definition is not None and (is_position(address) or definition.name in _KEPT):
+        if payload is not None and (is_position(address) or address.topic in _KEPT):
             kept = payload
             if is_position(address):
-                row = codec_of(definition).decode_row(payload)
+                row = codec_of(DEFAULT).decode_row(payload)
                 self.whole.add(Sample(row, address, round(message.due * 1e9)), message.due)
         offset = self.chronicle.times.offsets.get(address.vehicle)
         if self.chronicle.start is None and reason is None and offset is not None:

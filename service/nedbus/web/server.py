@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-import socket
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,17 +15,15 @@ from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
 from bokeh.document import Document
 from bokeh.models.widgets import Div
-from bokeh.resources import Resources
 from bokeh.server.auth_provider import NullAuth
 from bokeh.server.server import Server
-from bokeh.server.views.static_handler import StaticHandler
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
 from nedbus.client import Bus
 from nedbus.errors import ListenError
 from nedbus.events import ALL
-from nedbus.monitoring import Exporter, Page, Sight
+from nedbus.monitoring import Exporter, Page, Sight, leads_here
 from nedbus.settings import is_loopback
 from nedbus_msgs import Selection
 
@@ -40,7 +36,6 @@ from .viewer import Viewer
 MAX_VIEWERS: Final = 32
 """Pages that are open at the same time."""
 
-_TICK: Final = 100  # ms between two moves of the map
 _ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
 _STOP_POLL: Final = 100  # ms until the end is noticed
 _MAX_BODY_BYTES: Final = 2**16  # of a request, which has none: Tornado keeps it before its Host is checked
@@ -57,22 +52,21 @@ class Where:
     origins: tuple[str, ...] = ()
     background: Path | None = None
 
+    def open_background(self) -> Background | None:
+        """Read the file under the map."""
+        return None if self.background is None else Background(self.background)
+
 
 def serve_live(
     bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
 ) -> None:
-    """Serve the page of what a selection matches until `stop` is set; `tell` gets its address when it is there.
+    """Serve the page of a selection until `stop` is set; call `tell` with its address when it listens.
 
     Raises ConfigError for a bad background, ListenError if it cannot listen.
     """
     live = LiveFleet(bus, selection, version=version)
-    background = Background(where.background) if where.background is not None else None
-
-    def open_page(document: Document) -> None:
-        viewer = Viewer(document, live.fleet, live.chronicle, background=background)
-        document.add_periodic_callback(viewer.update, _TICK)
-
-    server = WebServer(where, open_page, live.pages)
+    background = where.open_background()
+    server = WebServer(where, lambda page: Viewer(page, live.fleet, live.chronicle, background=background), live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
         reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
         tell(server.url)
@@ -85,15 +79,11 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
     Raises ConfigError and SourceError for a file that cannot be read, and as `serve_live`.
     """
-    recording = Recording(path)
-    background = Background(where.background) if where.background is not None else None
+    recording, background = Recording(path), where.open_background()
 
     def open_page(document: Document) -> None:
         player = Player(recording)
-        viewer = Viewer(
-            document, player.fleet, recording.chronicle, title=recording.name, background=background, player=player
-        )
-        document.add_periodic_callback(viewer.update, _TICK)
+        Viewer(document, player.fleet, recording.chronicle, title=path.name, background=background, player=player)
 
     server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
     tell(server.url)
@@ -101,7 +91,7 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
 
 class LiveFleet:
-    """Read what a selection matches into a fleet, and keep an account of it, until it is told to stop.
+    """Read a selection into a fleet and a chronicle.
 
     `run` reads until an event is set; `pages`: metrics and health, as `nedbus export` serves them.
     """
@@ -123,7 +113,6 @@ class LiveFleet:
         self.run, self.pages = self._exporter.run, self._exporter.pages
 
     def _look(self, sight: Sight) -> None:
-        """Make the picture of now."""
         account = self._exporter.account
         self.fleet.reject(sight.rejected)
         states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
@@ -132,10 +121,10 @@ class LiveFleet:
 
 
 class WebServer:
-    """Serve a page, and pages of text by their path, until it is told to stop.
+    """Serve a page, and pages of text by their path.
 
     A foreign page that is open in the same browser gets nothing, also where its own name leads here (DNS rebinding):
-    browsers have to call this one by a name of this host or one of `where.origins`.
+    browsers have to call this one by a name that only leads here, as `HttpServer` has it, or by one of `where.origins`.
 
     Raises ListenError when it cannot listen there.
     """
@@ -146,8 +135,6 @@ class WebServer:
         for name in ("bokeh", "tornado.access", "tornado.general"):
             logging.getLogger(name).setLevel(logging.ERROR)  # each tab that is closed would be a warning
         host = where.host
-        names = set(where.origins)
-        text_names = names if is_loopback(host) else None
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
@@ -159,27 +146,19 @@ class WebServer:
         try:
             self._server = Server(
                 {"/": Application(FunctionHandler(open_or_refuse))}, io_loop=self._loop, address=host, port=where.port,
-                allow_websocket_origin=["*"], auth_provider=_Names(names), keep_alive_milliseconds=5000,
+                allow_websocket_origin=["*"], auth_provider=_Names(where), keep_alive_milliseconds=5000,
                 unused_session_lifetime_milliseconds=_UNUSED_LIFETIME,
                 check_unused_sessions_milliseconds=_UNUSED_LIFETIME // 3,
                 websocket_max_message_size=_MAX_MESSAGE_BYTES,
                 http_server_kwargs={"max_body_size": _MAX_BODY_BYTES, "max_buffer_size": 2 * _MAX_MESSAGE_BYTES},
-                extra_patterns=[(path, _Text, {"make": make, "names": text_names}) for path, make in pages.items()],
+                extra_patterns=[(path, _Text, {"make": make, "where": where}) for path, make in pages.items()],
             )  # fmt: skip
         except OSError as exc:
             reason = (exc.strerror or str(exc)).lower()
             hint = "choose another address with --http"
             raise ListenError([f"http://{host}:{where.port}"], reason, hint=hint) from exc
-        # The server would send all of BokehJS, of which half is for formulas and WebGL, which nothing here uses.
-        parts = Resources(
-            mode="server", root_url="/", path_versioner=StaticHandler.append_version,
-            components=["bokeh", "bokeh-widgets", "bokeh-tables"],
-        )  # fmt: skip
-        self._server._tornado.resources = lambda *_: parts  # type: ignore[method-assign]  # noqa: SLF001
-        port = self._server.port or where.port
-        names |= _names_of(host, port)
-        shown = "127.0.0.1" if host in _ANY else host
-        self.url = f"http://{_join(shown, port)}"
+        shown = "127.0.0.1" if host in _ANY else f"[{host}]" if ":" in host else host
+        self.url = f"http://{shown}:{self._server.port}"
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set, in this thread."""
@@ -193,12 +172,12 @@ class WebServer:
 
 
 class _Names(NullAuth):
-    """Answer only browsers that ask for one of these names."""
+    """Refuse requests under foreign names."""
 
     login_url = "/"  # Bokeh demands it where users are checked; no browser is sent there
 
-    def __init__(self, names: Collection[str]) -> None:
-        self._names = names
+    def __init__(self, where: Where) -> None:
+        self._where = where
         super().__init__()
 
     @property
@@ -206,43 +185,31 @@ class _Names(NullAuth):
         """Return the check of a request, before any answer; all viewers are the same user."""
 
         async def check(handler: RequestHandler) -> str:
-            _require_name(handler, self._names)
+            _require_name(handler, self._where)
             return "viewer"
 
         return check
 
 
-def _require_name(handler: RequestHandler, names: Collection[str]) -> None:
+def _require_name(handler: RequestHandler, where: Where) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
-    for name in (host, headers.get("Origin", f"//{host}").partition("//")[2]):  # Origin: null has no name
-        if name not in names:
-            raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
+    origin = headers.get("Origin", f"//{host}").partition("//")[2]  # Origin: null has no name
+    is_own = host in where.origins or leads_here(host, local=is_loopback(where.host))
+    if not is_own or origin not in (host, *where.origins):
+        name = origin if is_own else host
+        raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
 
 
 class _Text(RequestHandler):
-    def initialize(self, make: Callable[[], Page], names: Collection[str] | None) -> None:
-        self._make, self._names = make, names
+    def initialize(self, make: Callable[[], Page], where: Where) -> None:
+        self._make, self._where = make, where
 
     def get(self) -> None:
-        if self._names is not None:
-            _require_name(self, self._names)
+        if is_loopback(self._where.host):
+            _require_name(self, self._where)
         page = self._make()
         self.set_status(page.status)
         self.set_header("Content-Type", page.content_type)
         self.set_header("X-Content-Type-Options", "nosniff")
         self.finish(page.content)
-
-
-def _names_of(host: str, port: int) -> set[str]:
-    """Return the names by which a browser may ask for a page on this address."""
-    names = {"localhost", "127.0.0.1", "::1", host}
-    if host in _ANY:
-        names |= {socket.gethostname(), socket.getfqdn()}
-        with suppress(OSError):  # a host that does not find itself: --origin names it
-            names |= {str(address[4][0]) for address in socket.getaddrinfo(socket.gethostname(), None)}
-    return {_join(name, port) for name in names}
-
-
-def _join(host: str, port: int) -> str:
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -118,14 +118,12 @@ class Stream:
 
     def places_at(self, times: list[float]) -> list[Place | None]:
         """Return the last valid places at these times [s]; None where the histories do not reach back."""
-        found: list[Place | None] = [None] * len(times)
-        for history in (self.long, self.minute):
-            points = history.points()
-            points = points[~np.isnan(points[:, 1])]
-            for index, after in enumerate(points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()):
-                if after > 0:
-                    found[index] = Place(float(points[after - 1, 1]), float(points[after - 1, 2]), math.nan, True)
-        return found
+        points = np.concatenate([self.long.points(), self.minute.points()])
+        points = points[~np.isnan(points[:, 1])]
+        points = points[points[:, 0].argsort(kind="stable")]
+        numbers = points[:, 0].searchsorted(np.array(times) * 1e3, side="right").tolist()
+        found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
+        return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
 
     def _add_point(self, message: VehicleLocalPosition, time: float, truth: Stream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)

@@ -1,4 +1,4 @@
-"""The looks of the page: a dark and a light theme, shapes of states, and the template of its text."""
+"""The style of the page: a dark and a light theme, shapes of states, and the template of its text."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def read_asset(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """The colours of a page, and what is made of them; text on its ground has a contrast of 4.5 and more."""
+    """The colours of a page, its theme and its CSS; text on its ground has a contrast of 4.5 and more."""
 
     name: str
     ground: str

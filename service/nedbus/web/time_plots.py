@@ -47,9 +47,10 @@ class Timeline:
         self._spans = table("begin", "end", "row", "colour")
         self._now = table("time")
         self._style = style
-        self._names: list[str] = []
+        self._ticker = FixedTicker()
         self.range = Range1d()
         self.figure = _time_figure(self.range, clock, y_range=Range1d(), height=100, css_classes=["time"])
+        self.figure.yaxis.ticker = self._ticker
         self.figure.ygrid.grid_line_color = None
         self.figure.hbar(
             y="row", left="begin", right="end", source=self._spans, height=0.28, color="colour", alpha=0.75
@@ -93,13 +94,12 @@ class Timeline:
         ]  # fmt: skip
         replace(self._spans, bars)
         replace(self._now, [{"time": now * 1e3}])
-        if names != self._names:
-            self._names = names
-            axis = self.figure.yaxis[0]
-            axis.ticker = FixedTicker(ticks=list(rows.values()))
-            axis.major_label_overrides = {row: "link, page" if name == ALL else name[:14] for name, row in rows.items()}
-            room = max(_MIN_ROWS - len(names), 0) / 2
-            self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
+        self._ticker.ticks = list(rows.values())
+        self.figure.yaxis.major_label_overrides = {
+            row: "link, page" if name == ALL else name[:14] for name, row in rows.items()
+        }
+        room = max(_MIN_ROWS - len(names), 0) / 2
+        self.figure.y_range.update(start=0.4 - room, end=len(names) + 0.6 + room)
 
 
 class Plots:
@@ -131,14 +131,14 @@ class Plots:
                 source.stream(columns, rollover=history.size)
 
     def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
-        """Show when events of the vehicle happened, and how long they held, up to `end` [s]."""
+        """Mark the times of events of the vehicle, and shade its conditions, up to `end` [s]."""
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [
-            {"begin": begin * 1e3, "end": stop * 1e3, "colour": colours[severity]}
-            for severity in ("watch", "bad")
-            for begin, stop in _union([span for span in spans if span.severity == severity], end)
-        ]
+            {"begin": span.since * 1e3, "end": (end if span.until is None else span.until) * 1e3,
+             "colour": colours[span.severity]}
+            for span in spans if span.severity != "info" and span.until != span.since
+        ]  # fmt: skip
         replace(self._spans, held)
 
     def _draw(self, title: str, names: tuple[str, ...]) -> figure:
@@ -161,15 +161,3 @@ def _time_figure(span: Range1d, clock: Any, **options: Any) -> figure:
     )
     plot.xaxis.formatter = clock
     return plot
-
-
-def _union(spans: Sequence[Span], end: float) -> list[list[float]]:
-    """Return from when to when any of these held [s]: those that overlap are one."""
-    found: list[list[float]] = []
-    for span in spans:  # in the order of their beginnings
-        stop = end if span.until is None else span.until
-        if found and span.since <= found[-1][1]:
-            found[-1][1] = max(found[-1][1], stop)
-        elif stop > span.since:
-            found.append([span.since, stop])
-    return found

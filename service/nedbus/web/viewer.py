@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import time
+import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import urlencode
@@ -28,14 +27,13 @@ from .stream import is_position
 from .style import DARK, LIGHT, read_asset
 from .time_plots import Plots, Timeline, is_notable, move
 
+_TICK: Final = 100  # ms between two moves of the map
 _TEXT_TICKS: Final = 5  # moves of the map between two updates of text and plots
 _MAX_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the first of them
-_SLOW: Final = 1.0  # s between two pictures from which on the page says so
 _MINUTE: Final = 60.0
 _AROUND: Final = 30.0  # s that are shown before and after a moment that is chosen
-_DAY: Final = 86_400.0
+_SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
 _MAX_DIGITS: Final = 9  # of the number of a picture
-_MAX_SIDE: Final = 20_000  # pixels of a map
 _MAX_SAID: Final = 300  # characters of what a browser asks for
 _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s of a recording
 
@@ -43,8 +41,8 @@ _STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s 
 class Viewer:
     """One page in one browser; `update` sends what is new of the fleet, ten times a second.
 
-    `world`: the events. `player`: of a recording, of which long histories are whole.
-    What the address of the page asks for is shown first, and the address follows what is shown, so that it can be sent.
+    `world`: the events. `player`: the time in a recording, whose long histories are the whole flight.
+    The address of the page names vehicle, moment, view and theme, and follows them, so that it can be shared.
     """
 
     def __init__(
@@ -54,7 +52,7 @@ class Viewer:
         asked = _arguments(document)
         self.chosen: str | None = asked.get("vehicle")
         self.pinned: float | None = None  # a moment that is chosen, of live vehicles
-        self._asked_time = asked.get("time")
+        self._asked_time = _seconds_in(asked.get("time", ""))
         self._is_choice = self.chosen is not None
         self._event: Event | None = None  # that is chosen, of the chosen vehicle
         self._is_open = False  # the table of streams
@@ -62,7 +60,7 @@ class Viewer:
         self._fleet, self._world, self._player = fleet, world, player
         self._whole = player.recording.whole if player is not None else fleet
         self._style, self._name, self._document = LIGHT if asked.get("theme") == "light" else DARK, title, document
-        self._ticks, self._sent, self._updated, self._slow = 0, 0, time.monotonic(), 0.0
+        self._ticks = self._sent = 0
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
@@ -76,13 +74,12 @@ class Viewer:
             placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
         )
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"])
-        # What the page and the viewer say to each other: the number of a picture, that it was drawn, a click or a key,
-        # and the address.
+        # Channels between page and viewer: the number of a picture, that it was drawn, a click or a key, the address.
         self._beat, self._drawn, self._said, self._address = (TextInput(visible=False) for _ in range(4))
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
         self._beat.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
         self._address.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
-        self._said.on_change("value", lambda _, __, said: self._act(said))
+        self._said.on_change("value", lambda _, __, said: self._act(*_action_in(said)))
         self._search.on_change("value_input", lambda _, __, ___: self._show_now())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
         self._on_tap(self._map.events, lambda: self._map.told, self._show)
@@ -93,6 +90,7 @@ class Viewer:
         args = {"said": self._said, "map": self._map.figure, "search": self._search}
         document.js_on_event(DocumentReady, CustomJS(args=args, code=read_asset("actions.js")))
         document.add_root(self._lay_out(sheets))
+        document.add_periodic_callback(self.update, _TICK)
         if player is not None:
             player.on_jump = self._show_now
 
@@ -100,12 +98,10 @@ class Viewer:
         """Send what is new, as soon as the browser has drawn the last: the map each time, the rest twice a second."""
         if self._player is not None:
             self._player.tick()
-        now = time.monotonic()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
-        self._slow = now - self._updated if now - self._updated > _SLOW else 0.0
-        self._sent, self._updated = self._sent + 1, now
+        self._sent += 1
         if self._drawn.value and not self._grid.children:  # map and list are there sooner without
             self._grid.children = [*self._plots.draw()]
         picture = self._fleet.picture
@@ -125,7 +121,6 @@ class Viewer:
         self._ticks = 0
 
     def _show(self, event: Event) -> None:
-        """Show when and where something happened."""
         if event.vehicle != ALL:
             self._choose(event.vehicle)
         self._go_to(event.time)
@@ -143,23 +138,15 @@ class Viewer:
             self._player.jump(seconds)
 
     def _go_to_asked(self) -> None:
-        """Go to the moment that the address asks for, as soon as events tell when that was."""
-        events = self._world.events
-        if self._asked_time is None or not events or (self._player is not None and not self._player.recording.length):
-            return
-        near = next((each for each in reversed(events) if each.vehicle == self.chosen), events[-1])
-        with suppress(ValueError):  # an address that was written by hand: no moment is chosen then
-            moment = self._world.times.find(self._asked_time, near)
-            if abs(moment - near.time) < _DAY:
-                if self._player is not None:
-                    if not self._player.recording.has(moment):
-                        return  # it is still read
-                    self._player.toggle(pause=True)
-                self._go_to(moment)
-        self._asked_time = None
+        """Go to the moment in the address, as soon as the recording has been read that far."""
+        asked, player = self._asked_time, self._player
+        if asked is not None and (player is None or player.recording.has(asked)):
+            if player is not None:
+                player.toggle(pause=True)
+            self._go_to(asked)
+            self._asked_time = None
 
     def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
-        """Write all text, the title and the address."""
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
@@ -174,7 +161,7 @@ class Viewer:
             story = self._world.story(chosen.vehicle, now, at)
             if self.pinned is not None:
                 then = replace(chosen, state=self._world.state(chosen.vehicle, now))
-        self._text["head"].text = panels.head(self._name, picture, clock, self._slow)
+        self._text["head"].text = panels.head(self._name, picture, clock)
         self._text["list"].text = panels.vehicles(rows, self.chosen)
         self._text["why"].text = panels.why(then, story, now, self.pinned is not None)
         self._text["nums"].text = panels.numbers(chosen)
@@ -185,7 +172,7 @@ class Viewer:
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
             "view": self._map.focus if self._map.focus != "all" else None,
-            "time": self._world.time_text(now) if self.pinned is not None or player is not None else None,
+            "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
         if self._drawn.value:  # a browser that is not there yet would miss it
             self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
@@ -222,13 +209,9 @@ class Viewer:
     def _events_of_chosen(self) -> list[Event]:
         return [event for event in self._world.events if event.vehicle == self.chosen and is_notable(event)]
 
-    def _act(self, said: str) -> None:
-        """Do what a click or a key asks for; anything else is ignored."""
-        try:
-            action, value, _ = json.loads(said[:_MAX_SAID])
-        except (ValueError, TypeError):
-            return
-        (name, _, option), value = str(action).partition(":"), str(value)
+    def _act(self, action: str, value: str) -> None:
+        """Perform the action of a click or a key; ignore anything else."""
+        (name, _, option), player = action.partition(":"), self._player
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
                 self._choose(value)
@@ -243,27 +226,18 @@ class Viewer:
             case "streams":
                 self._is_open = not self._is_open
             case "size":
-                sides = [int(side) for side in value.split("x") if side.isdecimal() and 0 < int(side) < _MAX_SIDE]
-                if len(sides) == 2:
-                    self._map.size = float(sides[0]), float(sides[1])
-            case _:
-                self._navigate(name)
-        self._show_now()
-
-    def _navigate(self, key: str) -> None:
-        """Go to another vehicle, event or time."""
-        player = self._player
-        match key.lower():
+                self._map.resize(value)
             case "now":
                 self._go_to(None)
-            case "down" | "up" as side:
-                self._choose_next(1 if side == "down" else -1)
+            case "down" | "up":
+                self._choose_next(1 if name == "down" else -1)
             case "next" | "previous":
-                self._show_next(is_later=key == "next")
+                self._show_next(is_later=name == "next")
             case "play" if player is not None:
                 player.toggle()
-            case "left" | "right" if player is not None:
-                player.jump(player.time + _STEPS.get(key, 0.0))
+            case "left" | "right" | "LEFT" | "RIGHT" if player is not None:
+                player.jump(player.time + _STEPS[name])
+        self._show_now()
 
     def _choose_next(self, step: int) -> None:
         if names := self._listed:  # which goes round
@@ -280,7 +254,7 @@ class Viewer:
     def _on_tap(
         self, source: ColumnDataSource, shown: Callable[[], Sequence[Any]], show: Callable[[Any], object]
     ) -> None:
-        """Show what is tapped, which is no selection: the same may be tapped again."""
+        """Show the tapped row, and clear the selection, so that the same row can be tapped again."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
             if rows and 0 <= rows[0] < len(shown()):
@@ -305,8 +279,22 @@ class Viewer:
         return column(*parts, sizing_mode="stretch_width", stylesheets=page)
 
 
+def _action_in(said: str) -> tuple[str, str]:
+    """Return the action and its value that `actions.js` sent, empty ones for anything else."""
+    try:
+        action, value, _ = json.loads(said[:_MAX_SAID])
+    except (ValueError, TypeError):
+        return "", ""
+    return str(action), str(value)
+
+
 def _arguments(document: Document) -> Mapping[str, str]:
-    """Return what the address of the page asks for."""
+    """Return the arguments in the address of the page."""
     request = getattr(document.session_context, "request", None)  # none without a browser
     given = request.arguments if request is not None else {}
     return {name: values[0].decode(errors="replace")[:_MAX_SAID] for name, values in given.items() if values}
+
+
+def _seconds_in(text: str) -> float | None:
+    """Return a time in an address by the account's clock [s], None if it is none."""
+    return float(text) if _SECONDS.fullmatch(text) else None

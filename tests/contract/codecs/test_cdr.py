@@ -138,7 +138,7 @@ def test_value_of_another_type_or_range_is_rejected(name: str, value: object) ->
 
 def test_whole_numbers_are_floats_too() -> None:
     """An int where a float is meant is that float, as everywhere here."""
-    fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {"x": 3, "delta_xy": [1, 2]}
+    fields = downgrade(VehicleLocalPosition(timestamp=7), "1.16") | {"x": 3, "delta_xy": (1, 2)}
     assert decode_cdr(encode_cdr(fields, layout="1.16"), layout="1.16")["x"] == 3.0
 
 

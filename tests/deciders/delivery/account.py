@@ -24,14 +24,12 @@ UNLIMITED: Final = 100_000
 class Setting(NamedTuple):
     """The first state of a world.
 
-    `keeps`: the cache of each publisher, in messages. `capacity`: of the queue. `begins`: of a publisher that is
-    heard by a heartbeat first, that message is asked for.
+    `keeps`: the cache of each publisher, in messages. `capacity`: of the queue.
     """
 
     mode: Mode = "every"
     keeps: tuple[int, ...] = (UNLIMITED,)
     capacity: int = UNLIMITED
-    begins: bool = True
 
 
 class Request(NamedTuple):
@@ -66,7 +64,7 @@ class QueueAccount(PendingQueue):
     """The account as PendingQueue keeps it, with a clock of the test's."""
 
     def __init__(self, setting: Setting) -> None:
-        self._begins, self._now, self._since_link = setting.begins, 0.0, 0.0
+        self._now, self._since_link = 0.0, 0.0
         decoder = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus")
         super().__init__(setting.mode, decoder, clock=lambda: self._since_link)  # steps take no time
         self._capacity = mock.patch.object(pending_queue, "CAPACITY", setting.capacity)
@@ -77,7 +75,7 @@ class QueueAccount(PendingQueue):
             super().put(batch, overflowed=overflowed)
 
     def heartbeat(self, key: str, publisher: str, number: int) -> None:
-        self.on_heartbeat(key, publisher, number, begins=self._begins)
+        self.on_heartbeat(key, publisher, number)
 
     def link(self, *, broken: bool) -> None:
         if broken:
@@ -88,9 +86,9 @@ class QueueAccount(PendingQueue):
     def requests(self) -> list[Request]:
         with self._patience:
             self._now += 1.0
-            for writer in self.requesting:
+            for writer in list(self.account.requesting):
                 self.next_request(writer, self._now)
-        asked = [(writer, writer.request.asked) for writer in self.requesting if writer.request is not None]
+        asked = [(writer, writer.request.asked) for writer in self.account.requesting if writer.request is not None]
         return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
@@ -99,6 +97,10 @@ class QueueAccount(PendingQueue):
         self._now += 1e7 if final else 0.0
         with self._capacity:
             self.on_retransmission(request.handle, found, ended=True, now=self._now)
+
+    @property
+    def held(self) -> int:
+        return self.account.held
 
     def read(self, *, batch: bool) -> tuple[list[int], int] | None:
         if batch:
@@ -204,9 +206,8 @@ class World:
     def heartbeat(self, slot: int) -> None:
         life = self._running[slot % len(self._running)]
         if life.sent and not self._latest:
-            if life.known >= 0 or self._unsettled or self.setting.begins:
-                life.whole |= life.known < 0 and self._unsettled
-                life.known = life.sent - 1
+            life.whole |= life.known < 0 and self._unsettled
+            life.known = life.sent - 1
             self.account.heartbeat(life.key, name_of(life.name), life.sent - 1)
 
     def answer(self, position: int, missing: int = 0, final: int = 0) -> None:

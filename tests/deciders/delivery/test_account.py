@@ -35,10 +35,9 @@ class AccountMachine(RuleBasedStateMachine):
         mode=st.sampled_from(["every", "every", "latest"]),
         keeps=st.lists(st.sampled_from([UNLIMITED, 3, 0]), min_size=1, max_size=3),
         capacity=st.sampled_from([UNLIMITED, UNLIMITED, 16]),
-        begins=st.booleans(),
     )
-    def begin(self, mode: Mode, keeps: list[int], capacity: int, begins: bool) -> None:
-        setting = Setting(mode, tuple(keeps), capacity, begins)
+    def begin(self, mode: Mode, keeps: list[int], capacity: int) -> None:
+        setting = Setting(mode, tuple(keeps), capacity)
         self.world = World(setting, QueueAccount(setting))
 
     publish = step("publish", SLOT, COUNT, FLAG)
@@ -75,7 +74,7 @@ SEEDS = [
     # 1 is asked for, 2 told of by a heartbeat, and nobody is there to answer: 1 is lost, and 2 is not counted.
     (Setting(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
     # Only 2 to 4 are kept, and then 3 to 5: 1 is lost, and 5 is asked for all the same.
-    (Setting(keeps=(3,), begins=False), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
+    (Setting(keeps=(3,)), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
     # 1 and 3 are missing, and 3 to 5 are kept: 2, which is here, is not passed over.
     (Setting(keeps=(3,)), "publish 0 6, deliver 1, drop 0 1, drop 1 1"),
 ]

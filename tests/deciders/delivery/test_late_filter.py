@@ -8,7 +8,7 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.bridges.late_filter import DRIFT, MAX_LATENESS, STEADY, LateFilter
+from nedbus.bridges.late_filter import DRIFT, MAX_LATENESS, LateFilter
 from nedbus_msgs import Address
 from tests.flights.messages import message
 
@@ -37,7 +37,7 @@ def test_difference_of_two_clocks_does_not_matter(ahead: float) -> None:
     """A vehicle whose clock is wrong by seconds or by years is as current as any."""
     late = LateFilter()
     assert all(admitted(late, *((ahead + each / 100, each / 100) for each in range(500))))
-    assert (late.held, late.report()) == (0, None)
+    assert late.report() is None
 
 
 def test_recovered_samples_are_held_back_and_counted() -> None:
@@ -46,10 +46,9 @@ def test_recovered_samples_are_held_back_and_counted() -> None:
     assert all(admitted(late, *((each / 100, each / 100) for each in range(200))))
     burst = admitted(late, *((2 + each / 100, 12 + each / 2000) for each in range(1000)))
     assert burst == sorted(burst), "once current, always current"
-    assert burst.count(False) == late.held
     assert 900 <= burst.count(False) <= 960
     assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
-    assert late.report() == f"{ONE}: messages from before that were held back: {late.held}, up to 10.0 s late"
+    assert late.report() == f"{ONE}: messages from before that were held back: {burst.count(False)}, up to 10.0 s late"
     assert late.report() is None
 
 
@@ -70,12 +69,12 @@ def test_last_value_from_before_is_held_back() -> None:
 
 
 def test_clock_that_is_set_back_by_another_implementation() -> None:
-    """Late and not catching up: after 2 s that is a clock."""
+    """Late for two minutes is no longer late: that is a clock."""
     late = LateFilter()
-    admitted(late, *((each / 100, each / 100) for each in range(200)))
-    steps = admitted(late, *((each / 100 - 3600, each / 100) for each in range(200, 800)))
+    admitted(late, *((each / 10, each / 10) for each in range(20)))
+    steps = admitted(late, *((each / 10 - 3600, each / 10) for each in range(20, 2_000)))
     assert steps == sorted(steps)
-    assert steps.count(False) == STEADY / SECOND * 100
+    assert 0 < steps.count(False) <= 2 * DRIFT / SECOND * 10
 
 
 def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:

@@ -13,11 +13,10 @@ from hypothesis import given
 from nedbus import Counts, Mode
 from nedbus.client.rate_gate import RATES, RateGate, check_max_rate, rate_step
 from nedbus.client.receiving import Decoder, LayoutLookup, MaxRateQueue
-from nedbus.client.receiving.max_rate import DOWNSAMPLED_TIMEOUT
 from nedbus.errors import ConfigError
 from nedbus.transport import RawSample
 
-from .raw_samples import KEY, OTHER_KEY, drain, put, raw, timestamps
+from .raw_samples import KEY, drain, put, raw, timestamps
 
 DOWNSAMPLED = f"{KEY}/@rate/5"
 
@@ -59,8 +58,7 @@ def test_downsampled_stream_passes() -> None:
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
     assert queue.counts == Counts(received=5)
-    queue.on_token(KEY, 0.0, alive=True)
-    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == set()
+    assert set(queue.downsampled) == {KEY}
 
 
 def test_gap_of_a_downsampled_stream_is_lost() -> None:
@@ -91,26 +89,12 @@ def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
     assert [sample.lost for sample in drain(queue)] == [1]
 
 
-@pytest.mark.parametrize("stamped", [True, False])
-def test_stream_at_full_rate_is_downsampled_here(stamped: bool, clock: Clock) -> None:
-    """5 of 100 Hz are queued, by their arrival: a plain publisher need not stamp. None of the others is lost."""
-    queue = make_queue()
-    for number in range(1000):
-        clock.now = number * 10_000_000
-        sample = at(number / 100, number, key=KEY) if stamped else raw(None, timestamp=10 * number)
-        queue.put_full_rate([sample] if number != 505 else [])
-    assert timestamps(queue) == list(range(0, 10_000, 200))
-    assert queue.counts == Counts(received=50)
-    queue.on_token(KEY, 0.0, alive=True)
-    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == {KEY}
-
-
 def test_last_message_comes_once() -> None:
     """It is the first if nothing else is; what it has overtaken, itself included, is left out then."""
     queue = make_queue()
-    queue.put_full_rate([at(10.0, None, key=KEY)])
+    queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
-    queue.put_full_rate([at(10.3, None, key=KEY)])
+    queue.put_last([at(10.3, None, key=KEY)])
     assert timestamps(queue) == [10_000, 10_200]
     assert queue.counts == Counts(received=2)
 
@@ -118,41 +102,9 @@ def test_last_message_comes_once() -> None:
 def test_restart_with_an_earlier_clock_passes() -> None:
     """A vehicle that restarts before its clock is set is heard at once."""
     queue = make_queue()
-    queue.put_full_rate([at(1000.0, None, key=KEY)])
+    queue.put_last([at(1000.0, None, key=KEY)])
     queue.put([at(5.0, 0), at(5.2, 1)])
     assert timestamps(queue) == [1_000_000, 5000, 5200]
-
-
-def test_full_rate_ends_with_the_first_downsampled_message(clock: Clock) -> None:
-    """Both may arrive for a moment: each message comes once, in order."""
-    queue = make_queue()
-    queue.put_full_rate([at(1.0, 100, key=KEY)])
-    clock.now += 200_000_000
-    queue.put_full_rate([at(1.2, 120, key=KEY)])
-    queue.put([at(1.2, 0)])
-    clock.now += 200_000_000
-    queue.put_full_rate([at(1.3, 130, key=KEY), at(1.4, 140, key=KEY)])
-    queue.put([at(1.4, 1)])
-    assert timestamps(queue) == [1000, 1200, 1400]
-    assert queue.counts == Counts(received=3)
-
-
-def test_stream_is_read_at_full_rate_when_its_publisher_does_not_downsample() -> None:
-    """One that is alive for a while and not heard downsampled; a publisher that returns is waited for again."""
-    queue = make_queue()
-    for key in (KEY, OTHER_KEY):
-        queue.on_token(key, 0.0, alive=True)
-    queue.put([at(1.0, 0)])
-    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT - 0.1) == set()
-    queue.on_token(OTHER_KEY, 1.0, alive=True)  # told twice
-    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == {OTHER_KEY}
-    queue.put([at(1.0, 0, key=f"{OTHER_KEY}/@rate/5")])
-    assert queue.full_rate_keys(DOWNSAMPLED_TIMEOUT) == set()
-    queue.on_token(OTHER_KEY, 10.0, alive=False)
-    assert queue.full_rate_keys(20.0) == set()
-    queue.on_token(OTHER_KEY, 20.0, alive=True)
-    assert queue.full_rate_keys(20.0) == set()
-    assert queue.full_rate_keys(20.0 + DOWNSAMPLED_TIMEOUT) == {OTHER_KEY}
 
 
 def passed(rate: float, times: list[float]) -> list[float]:

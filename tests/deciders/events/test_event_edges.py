@@ -152,6 +152,18 @@ def test_what_holds_from_first_to_last_is_the_state_at_any_time(sent: Sent) -> N
     assert [each.initial for each in state.conditions] == [True]
 
 
+def test_condition_that_a_worse_one_replaces_ends_there(sent: Sent) -> None:
+    """A battery that was low at the first message, becomes critical and is changed, is low no longer."""
+    for second, warning in enumerate((1, 2, 0)):
+        sent(float(second), "battery_status", 0, warning=warning, connected=True)
+    spans = spans_of(list(sent.account.events), sent.account.vehicles["1"].initial)
+    assert [(span.text, span.since, span.until) for span in spans] == [
+        ("battery low", 0.0, 1.0), ("battery critical", 1.0, 2.0),
+    ]  # fmt: skip
+    assert [state_at(spans, time).severity for time in (0.5, 1.5, 2.5)] == ["watch", "bad", "info"]
+    assert sent.stories() == [("battery critical", 2.0)]
+
+
 def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
     """Of two things within a minute each has its own story, and an end has that of its begin."""
     sent(0.0)

@@ -87,7 +87,7 @@ def test_report_of_many_vehicles_is_read() -> None:
     for number in range(1000):
         flight.send(vehicle=f"vehicle-{number}", xy_valid=False)
         for topic in topics:
-            flight.account.vehicles[f"vehicle-{number}"].messages[topic] = topic
+            flight.account.vehicles[f"vehicle-{number}"].topics.add(topic)
     assert len(json.dumps(asdict(report(flight)))) < 2**20
 
 

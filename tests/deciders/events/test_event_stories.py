@@ -16,7 +16,7 @@ def why(flight: Flight, *, at: float | None = None) -> list[Story]:
     """Return the stories of a vehicle; `at` is by the account's clock."""
     followed = flight.account.vehicles["1"]
     events = sorted(flight.account.take(0)[0], key=lambda each: each.time)
-    return tell(events, followed.conditions.values(), topics=list(followed.messages.values()), at=at)
+    return tell(events, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
 def lose_gps(flight: Flight) -> None:

@@ -528,7 +528,7 @@ def test_memory_is_bounded() -> None:
         flight.send(f"unknown_{number}", vehicle="v1")
     known = flight.account.vehicles["v1"]
     assert len(known._detectors) <= 1000
-    assert len(known.messages) <= 1000
+    assert len(known.topics) <= 1000
     for number in range(KEPT + 100):
         flight.status(DISARMED, vehicle="v2", nav_state=number % 2)
     new, told = flight.account.take(0)

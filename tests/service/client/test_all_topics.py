@@ -17,7 +17,7 @@ from pyulog import ULog
 import nedbus
 from nedbus.recording import RecordingReader
 from nedbus_msgs import BY_TOPIC, MESSAGES, TOPICS, describe, upgrade_with
-from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import LOGS
 from tests.peers.command_line import run_command

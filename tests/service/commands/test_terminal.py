@@ -23,7 +23,7 @@ from rich.console import Console
 import nedbus
 from nedbus.cli.output.samples import Lines
 from nedbus.cli.output.streams import printable, to_text
-from nedbus.cli.output.table import LiveTable, to_table
+from nedbus.cli.output.table import live_table, to_table
 from nedbus.transport import Session, open_router
 from nedbus_msgs import DEFAULT
 from tests.flights.messages import VALID, VLP, message
@@ -60,30 +60,24 @@ ROWS = [
 
 
 @pytest.mark.parametrize("width", [30, 40, 64, 80, 110])
-def test_table_fits(width: int) -> None:
+def test_table_fits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     """Lines fit, wide ones show more columns; a name is whole while columns can be left out, and then folded."""
-    lines = to_table(HEAD, ROWS, width=width, optional=OPTIONAL).splitlines()
+    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: width)
+    lines = to_table(HEAD, ROWS, optional=OPTIONAL).splitlines()
     assert all(len(line) <= width for line in lines)
-    shown = "".join("".join(lines).split())
-    assert shown.count("vehicle") == 2
-    assert {word in shown for word in ("stale:", "nothing", "invalid", "reckoning")} == {True}
+    shown = " ".join(lines)
+    assert {word in shown for word in ("stale:", "4.2 s", "invalid", "reckoning")} == {True}
     assert ("JITTER" in lines[0]) == (width >= 110)
-    names = [line.split()[0] for line in lines if not line.startswith(" ")]
-    assert (ROWS[0][0] in names) == (width >= 60)
-    assert all(re.search(r"[/_]$|groundtruth$|position$|^VEHICLE|^TOPIC$", name) for name in names)
+    assert (ROWS[0][0] in shown) == (width >= 60)
 
 
-def test_text_is_folded_at_words() -> None:
-    """A path is folded after slashes and words; a long name after its vehicle; and nothing without a terminal."""
-    assert len(to_table(HEAD, ROWS).splitlines()) == 1 + len(ROWS)
-    remark = "/a/rather/long/path/to/some/flight_of_today.ulg: no such file or directory"
-    folded = to_table(("SOURCE", "REMARK"), [("sim:", remark)], width=24)
-    parts = "/a/rather/long/|path/to/some/|flight_of_|today.ulg: no|such file or|directory"
-    assert "|".join(line[8:] for line in folded.splitlines()[1:]) == parts
-    long = f"{'v' * 64}/vehicle_local_position"
-    lines = to_table(HEAD, [(long, *ROWS[0][1:])], width=80, optional=OPTIONAL).splitlines()
-    assert [line.split()[0] for line in lines[1:]] == ["v" * 64 + "/", "vehicle_local_position"]
-    assert all(len(line) <= 80 for line in lines)
+def test_table_is_whole_without_a_terminal() -> None:
+    """Where stdout is no terminal nothing is folded or left out, and no text is markup."""
+    cells = ("1/[bold]", *ROWS[1][1:-1], "x" * 300)
+    head, *lines = to_table(HEAD, [*ROWS, cells]).splitlines()
+    assert head.split() == list(HEAD)
+    assert [line.split()[0] for line in lines] == [ROWS[0][0], ROWS[1][0], "1/[bold]"]
+    assert lines[-1].endswith("x" * 300)
 
 
 def sample(address: nedbus.Address) -> nedbus.Sample:
@@ -101,7 +95,7 @@ def lines(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Lines]:
 
     def make(width: int) -> Lines:
         monkeypatch.setattr("nedbus.cli.output.samples.terminal_width", lambda: width)
-        return Lines(nedbus.Selection())
+        return Lines()
 
     return make
 
@@ -110,7 +104,7 @@ def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None
     """Narrower and narrower: eph goes first, then heading, then velocity; position, doubts and loss never."""
     one = sample(nedbus.Address("1", VLP))
     seen: list[list[str]] = []
-    for width in range(150, 73, -1):
+    for width in range(150, 87, -1):
         head, line = lines(width)(one).splitlines()
         assert len(head) <= width
         assert len(line) <= width
@@ -120,25 +114,6 @@ def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None
             seen.append(columns)
     most = ["Z m", "VZ m/s", "HDG deg", "EPH m"]
     assert seen == [[*most[:count], "STATE"] for count in (4, 3, 2, 1)]
-
-
-def test_addresses_are_cut_only_where_nothing_is_free(lines: Callable[[int], Lines]) -> None:
-    """The middle of a topic is left out as far as its line has no room for it, and a narrow one has no free columns."""
-    for width in range(74, 110):
-        line = lines(width)(sample(nedbus.Address("1", "vehicle_local_position_groundtruth"))).splitlines()[1]
-        assert len(line) == width or "1/vehicle_local_position_groundtruth " in line
-    to_line = lines(80)
-    for address in ALL_TOPICS:
-        assert f"{address} " in to_line(nedbus.Sample(message(1, **VALID), address, 0))
-
-
-def test_short_addresses_remain_different(lines: Callable[[int], Lines]) -> None:
-    """The four topics of a vehicle are told apart where only a part of their names has room."""
-    for width in (1, 80, 85, 90):
-        to_line = lines(width)
-        shown = {to_line(sample(address)).splitlines()[-1].split()[0] for address in ALL_TOPICS}
-        assert len(shown) == len(DEFAULT.topics)
-        assert width > 1 or "1/veh…tion" in shown
 
 
 def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
@@ -294,30 +269,12 @@ def test_signal_while_a_table_starts(
     handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(raised), LiveTable(HEAD, ()) as table:
-            table.show(ROWS)
+        with pytest.raises(raised), live_table(HEAD, ()) as show:
+            show(ROWS)
     finally:
         for each, handler in handlers.items():
             signal.signal(each, handler)
     assert shown == [False, True]
-
-
-@pytest.mark.parametrize(("height", "more"), [(12, 7), (2, 8)])
-def test_live_table_of_wrapped_rows_fits(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], height: int, more: int
-) -> None:
-    """Rows of several lines leave room for the number of those that are not shown, on the lowest terminal too."""
-    monkeypatch.setattr("nedbus.cli.output.table.terminal_width", lambda: 60)
-    monkeypatch.setattr("nedbus.cli.output.table.shutil.get_terminal_size", lambda: os.terminal_size((60, height)))
-    handler = signal.getsignal(signal.SIGTERM)
-    try:
-        with LiveTable(("VEHICLE/TOPIC", "HZ", "STATE"), ()) as table:
-            table.show([(ROWS[0][0], "100.0", ROWS[1][-1])] * 9)
-    finally:
-        signal.signal(signal.SIGTERM, handler)
-    drawn = capsys.readouterr().out.splitlines()
-    assert f"{more} more" in drawn
-    assert len(drawn) <= max(height, 6)
 
 
 @pytest.mark.parametrize("command", ["echo", "hz"])
@@ -422,13 +379,11 @@ def test_flood_of_keys_leaves_hz_small(endpoint: str, bus: nedbus.Bus) -> None:
     assert max(table.count("\n") for table in hz.out.split("VEHICLE/TOPIC")) <= 53
 
 
-LIMITS = {
+CLOSING = {
     "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
     "exec 2>&-": "os.close(2); sys.stderr = None",
-    "ulimit -n 12": "resource.setrlimit(resource.RLIMIT_NOFILE, (12, 12))",
 }
 CLOSED = "nedbus: cannot write: standard output is closed\n"
-TOO_FEW = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
 
 
 @pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
@@ -438,18 +393,14 @@ TOO_FEW = "nedbus: only 12 open files are allowed: set 'ulimit -n 64' or more\n"
         *(("exec >&-", command, (1, 0, CLOSED)) for command in ("list", "schema", "get", "--version", "pki ca .")),
         ("exec 2>&-", "list", (0, 2, "")),
         ("exec 2>&-", "get -v 9", (1, 0, "")),
-        *(("ulimit -n 12", command, (1, 0, TOO_FEW)) for command in ("list", "serve -s sim:", "schema")),
     ],
 )
-def test_closed_stream_or_too_few_files_are_one_line(
+def test_closed_stream_is_one_line(
     start: Start, endpoint: str, bus: nedbus.Bus, *, limit: str, command: str, expected: object, shell: bool
 ) -> None:
-    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain.
-
-    With few files Zenoh would abort the process with a page of Rust.
-    """
+    """`nedbus list >&-` says that nothing can be written; without stderr there is nowhere to complain."""
     bus.publisher(VLP, vehicle="1").publish(message(1))
-    script = f"import os, resource, sys\n{LIMITS[limit]}\nfrom nedbus.cli import main\nmain()"
+    script = f"import os, sys\n{CLOSING[limit]}\nfrom nedbus.cli import main\nmain()"
     if shell:
         line = f"{limit}; NEDBUS_CONNECT={endpoint} exec {sys.executable} -m nedbus {command}"
         ended = subprocess.run(["bash", "-c", line], capture_output=True, timeout=DEADLINE, check=False, text=True)
@@ -538,7 +489,7 @@ def test_closed_terminal_ends_no_service(on_terminal: OnTerminal, bus: nedbus.Bu
 @pytest.mark.slow
 @pytest.mark.process
 def test_make_run(tmp_path: Path) -> None:
-    """A second one says that a nedbus runs already, and how to choose; Ctrl-C ends the first without make's error."""
+    """A second one says that the address is in use, and how to choose; Ctrl-C ends the first without make's error."""
     program = tmp_path / "venv" / "bin" / "nedbus"
     program.parent.mkdir(parents=True)
     program.write_text(f'#!/bin/sh\nexec {sys.executable} -m nedbus "$@"\n')
@@ -553,7 +504,7 @@ def test_make_run(tmp_path: Path) -> None:
         wait_for(lambda: "In a second terminal" in log.read_text(), what="the service")
         second = subprocess.run(command, capture_output=True, check=False, text=True, timeout=DEADLINE)
         assert second.returncode == 2
-        assert "(a nedbus runs there already): end it, or choose another address with --http\n" in second.stderr
+        assert "(address already in use): choose another address with --http\n" in second.stderr
         assert 'make run ARGS="' in second.stderr
         os.killpg(first.pid, signal.SIGINT)
         assert first.wait(DEADLINE) in {0, -signal.SIGINT}

@@ -95,21 +95,6 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
     assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 
-@pytest.mark.parametrize("sent", [b"", b"GET /page HTTP/1.0\r\nHost:"], ids=["silent", "half a request"])
-def test_silent_clients_block_nobody(server: Pages, sent: bytes) -> None:
-    """With 16 clients that send nothing, or half a request, the next one is answered, and the oldest has to go."""
-    address = "127.0.0.1", server.port
-    with ExitStack() as closing:
-        silent = [closing.enter_context(socket.create_connection(address, DEADLINE)) for _ in range(16)]
-        for client in silent:
-            client.sendall(sent)
-        for _ in range(20):
-            assert server.ask("/page") == (200, "a page\n")
-        assert silent[0].recv(1) == b""
-        silent[-1].sendall(b"\r\n\r\n" if sent else b"GET /page HTTP/1.0\r\n\r\n")
-        assert b"200 OK" in silent[-1].recv(1000)
-
-
 @pytest.mark.parametrize(
     ("sent", "answer"),
     [

@@ -22,7 +22,7 @@ from nedbus import SourceStatus, StreamHealth, StreamStatus
 from nedbus.cli.commands.bridges import serve_pages
 from nedbus.client import Health, Histogram
 from nedbus.daemon import Daemon, SourceMeasures
-from nedbus.daemon.status import State
+from nedbus.daemon.worker import State
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, metrics, service_pages
 from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_metrics
@@ -198,7 +198,7 @@ def test_what_peers_say_is_one_line() -> None:
     forgotten = VehicleReport("bad", "no position", 1.0, ("silent",))
     assert vehicles_page(AccountReport("service", "host", 5000.0, vehicles={"7": forgotten})).status == 200
     assert vehicles_page(AccountReport("service", "host", 50.0, vehicles={"7": forgotten})).status == 503
-    assert vehicles_page(AccountReport("service", "host", 50.0)) == Page.text("no vehicle is known")
+    assert vehicles_page(AccountReport("service", "host", 50.0, {})) == Page.text("no vehicle is known")
 
 
 @pytest.mark.parametrize("every", [1, 3])
@@ -327,7 +327,7 @@ def streams(count: int, topic: str = VLP) -> list[Stream]:
     health = StreamHealth(topic)
     for each in range(3):
         health.add(message(each), received=each, lost=each)
-    return [Stream(f"v{number}", topic, f"source {number % 2}", health.snapshot(3)) for number in range(count)]
+    return [Stream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3)) for number in range(count)]
 
 
 def test_number_of_streams_is_bounded() -> None:
@@ -358,7 +358,7 @@ def test_positions_have_labels_before_others() -> None:
 def test_labels_are_escaped() -> None:
     """A source with quotes and line breaks in it is one label, and the page has the metrics of the process."""
     source = 'ulog:a"b\\c\nd{}é'
-    strange = replace(streams(1)[0], source=source, latencies=Histogram((0.001, 1.0)))
+    strange = replace(streams(1)[0], labels=("v0", VLP, source), latencies=Histogram((0.001, 1.0)))
     families = stream_metrics([*streams(3), strange], messages="nedbus_messages_received")
     text = metrics_page(families).content.decode()
     found = read_families(text)
@@ -409,7 +409,7 @@ def test_vehicle_that_was_switched_off_has_no_age(
         wait_for(lambda: "gone" not in bus.vehicles(), what="the end of its token")
         assert ages() == {"here", "gone"}
         monkeypatch.setattr(metrics, "SWITCHED_OFF", 0.0)
-        assert ages() == {"here"}
+        wait_for(lambda: ages() == {"here"}, what="the next look")
         assert pages.values("nedbus_messages_received_total", vehicle="gone", topic=VLP)
         with other.publisher(VLP, vehicle="gone"):
             wait_for(lambda: ages() == {"here", "gone"}, what="it to come back")

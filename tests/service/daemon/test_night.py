@@ -13,7 +13,7 @@ from playwright.sync_api import Browser
 import nedbus
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import BY_TOPIC, Address, Provenance
-from nedbus_msgs.codecs.arrays import arrays_of
+from nedbus_msgs.arrays import arrays_of
 from tests.flights.messages import VALID, VLP
 from tests.peers.browser import PATIENCE, browser, open_tabs
 from tests.peers.command_line import run_command

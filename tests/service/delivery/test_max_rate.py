@@ -5,7 +5,6 @@ Publishers thin by a clock that these tests turn: 10 ms a message, however fast 
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from contextlib import closing, suppress
@@ -17,13 +16,12 @@ import nedbus
 from nedbus import Mode
 from nedbus.client.publishing.downsampler import Downsampler
 from nedbus.client.rate_gate import rate_step
-from nedbus.client.receiving import MaxRateQueue
 from nedbus.transport import Session
 from nedbus_msgs import Address, AddressError, Selection, encode
 from tests.flights.messages import VLP, message
 from tests.peers.processes import Start
 from tests.service.commands.answering import answering, reply_with
-from tests.waits import DEADLINE, wait_for, wait_for_reader
+from tests.waits import DEADLINE, wait_for
 
 from .downsampling import MS, Clock, Link, clock, is_wanted, publish, take_last, wait_for_demand
 from .publishing import is_read, take, wait_for_subscriber
@@ -255,106 +253,24 @@ def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: 
             assert subscription.counts == nedbus.Counts(received=1 + 50)
 
 
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let readers give up the wait for a downsampled stream at once."""
-    monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
-
-
-def test_publisher_of_an_older_nedbus(
-    endpoint: str, bus: nedbus.Bus, impatient: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_publisher_that_does_not_downsample_is_named(
+    endpoint: str, bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """One that thins nothing is read whole, downsampled by the reader, said once; when it learns to thin, no longer."""
-    knows = False
-    put = Downsampler.put
-    monkeypatch.setattr(Downsampler, "put", lambda *args: put(*args) if knows else None)
+    """Its stream does not arrive, and the log says so once; it is never read at full rate, nor is any other."""
+    put, cannot = Downsampler.put, []
+    monkeypatch.setattr(Downsampler, "put", lambda self, *args: None if self in cannot else put(self, *args))
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
+    cannot.append(publishers[1]._downsampler)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=10) as subscription:
+        wait_for_demand(publishers[0])
         for publisher in publishers:
-            wait_for_subscriber(publisher)
-        taken: list[nedbus.Sample] = []
-        last = 0
-
-        def publish_until_taken() -> bool:
-            nonlocal last
-            last += 1
-            for publisher in publishers:
-                publisher.publish(message(last))
-            with suppress(nedbus.NoDataError):
-                taken.append(subscription.receive(0.01))
-            return len(taken) >= 6
-
-        wait_for(publish_until_taken, what="messages")
-        for vehicle in ("7", "8"):
-            sent = [each.sent for each in taken if each.vehicle == vehicle if each.sent is not None]
-            # Two at once perhaps, after a pause of this process.
-            assert len(sent) <= 10 * (sent[-1] - sent[0]) / 1e9 + 2.1
-        assert subscription.counts == nedbus.Counts(received=len(taken))
-        assert caplog.text.count("its publisher does not downsample") == 1
-        knows = True
-        wait_for(lambda: publish_until_taken() and not any(map(is_read, publishers)), what="no full rate")
-        assert subscription.counts.lost == 0
-
-
-def test_more_streams_than_changes_are_kept(
-    endpoint: str, bus: nedbus.Bus, impatient: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each of them is read at full rate where none is downsampled, although most of their tokens were dropped."""
-    monkeypatch.setattr(Downsampler, "put", lambda *_: None)
-    monkeypatch.setattr("nedbus.transport.alive_tokens._MAX_CHANGES", 2)
-    publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(8)]
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, max_rate=10):
-        wait_for(lambda: all(map(is_read, publishers)), what="readers at full rate")
-
-
-def test_plain_zenoh_publisher(endpoint: str, raw: Session, impatient: None, caplog: pytest.LogCaptureFixture) -> None:
-    """One without a liveliness token is read whole by who asks for this one stream; a timestamp it need not have."""
-    key = "nedbus/7/vehicle_local_position"
-    with nedbus.connect(endpoint) as other, other.subscribe(VLP, vehicle="7", max_rate=10) as subscription:
-        wait_for_reader(raw, key)
-        publisher = raw.declare_publisher(key)
-        taken: list[int] = []
-        last = 0
-
-        def put_until_taken() -> bool:
-            nonlocal last
-            last += 1
-            publisher.put(encode(message(last)))
-            with suppress(nedbus.NoDataError):
-                taken.append(subscription.receive(0.01).message.timestamp)
-            return len(taken) >= 4
-
-        start = time.monotonic()
-        wait_for(put_until_taken, what="messages")
-        assert time.monotonic() - start >= 0.2  # 4 messages at 10 Hz, two of them at once perhaps
-        assert caplog.text.count("its publisher does not downsample") == 1
-
-
-def test_vehicle_that_downsamples_is_never_read_at_full_rate(
-    bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A downsampled stream is not read at full rate, also when its last message was long ago."""
-    looks: list[set[str]] = []
-    full_rate_keys = MaxRateQueue.full_rate_keys
-
-    def look(queue: MaxRateQueue, now: float) -> set[str]:
-        looks.append(full_rate_keys(queue, now))
-        return looks[-1]
-
-    monkeypatch.setattr(MaxRateQueue, "full_rate_keys", look)
-    publisher = bus.publisher(VLP, vehicle="7")
-    publisher.publish(message(1))
-    with caplog.at_level(logging.WARNING), bus.subscribe(VLP, max_rate=5) as subscription:
-        assert take(subscription, 1) == [1]
-        wait_for_demand(publisher)
-        publish(publisher, clock, 2, 1)
-        assert take(subscription, 1) == [2]
+            publish(publisher, clock, 1, 20)
+        assert take(subscription, 2) == [1, 11]
+        assert not any(map(is_read, publishers))
         monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
-        before = len(looks)
-        wait_for(lambda: len(looks) > before + 1, what="a look at streams that nobody thins")
-        assert not any(looks)
-        assert not is_read(publisher)
-    assert not caplog.text
+        wait_for(lambda: "not downsampled" in caplog.text, what="the warning")
+        assert caplog.text.count("1 streams that are not downsampled") == caplog.text.count(publishers[1].key) == 1
+        assert subscription.counts == nedbus.Counts(received=2)
 
 
 def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:

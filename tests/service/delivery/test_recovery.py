@@ -16,7 +16,7 @@ import zenoh
 import nedbus
 from nedbus import Counts
 from nedbus.client.housekeeping import Housekeeping
-from nedbus.client.receiving import Receiver, pending_queue, retransmission, writer_proxy
+from nedbus.client.receiving import Receiver, retransmission, stateful_reader, writer_proxy
 from nedbus.client.receiving.decoder import WAKE_UP
 from nedbus.client.receiving.receiver import drain
 from nedbus.transport import RetransmitRequest, Session, open_client, open_router, request_samples
@@ -214,7 +214,7 @@ def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> Non
     lossy.publish(3)
     assert lossy.receive(1) == [3]
     assert {key for key, _, _ in lossy.asked} == {KEY}
-    assert not lossy.queue.requesting
+    assert not lossy.queue.account.requesting
 
 
 def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Session) -> None:
@@ -228,7 +228,7 @@ def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Se
         lossy.queue.missing = {1}
         lossy.publish(0, 1, 2)
         assert lossy.receive(3) == [0, 1, 2]
-        assert lossy.queue.requesting  # the others still wait
+        assert lossy.queue.account.requesting  # the others still wait
         taken.clear()
 
 
@@ -271,14 +271,14 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
-    wait_for(lambda: lossy.queue.requesting, what="the hole")
+    wait_for(lambda: lossy.queue.account.requesting, what="the hole")
     lossy.subscription.close()
     assert lossy.subscription.counts.lost == 2
 
 
 def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
-    monkeypatch.setattr(pending_queue, "_MAX_HELD_OF_KEY", 50)
+    monkeypatch.setattr(stateful_reader, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
     assert lossy.receive(59) == [0, *range(2, 60)]
@@ -290,7 +290,10 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
-    wait_for(lambda: (lossy.queue.waiting, lossy.queue.held) == (10, 9), what="what comes before the hole and after it")
+    wait_for(
+        lambda: (lossy.queue.waiting, lossy.queue.account.held) == (10, 9),
+        what="what comes before the hole and after it",
+    )
     asked_before = list(lossy.asked)
     assert lossy.receive(20) == list(range(20))
     assert (asked_before, lossy.asked) == ([], [(KEY, 10, 11)])

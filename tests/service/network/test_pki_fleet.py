@@ -409,7 +409,7 @@ def test_certificates_are_whole(pki: Path, *, earlier: bool) -> None:
 def test_shipped_file_is_what_rules_writes(tmp_path: Path) -> None:
     """The vehicle in config/router-secure.json5 is written by the same command as any other."""
     copy = Path(shutil.copy(CONFIG, tmp_path))
-    assert write_access_rules(copy, ["1"]) == ([], [])
+    write_access_rules(copy, ["1"])
     assert read_access_rules(copy) == ["1"]
     assert copy.read_text() == CONFIG.read_text()
     write_access_rules(copy, FLEET)
@@ -429,12 +429,12 @@ def test_rules_are_written_from_a_list(file: Path, pki: Path, tmp_path: Path) ->
 
     assert rules()[0] == ["1"]
     changes, said = rules("--from", str(names))
-    assert changes == ["+ 2", "+ 10", "+ wing", "- 1"]
+    assert changes == ["+ 10", "+ 2", "+ wing", "- 1"]
     assert "names 3 vehicles: the router takes it when it starts again" in said
     assert rules("--add", "2", "1")[0] == ["+ 1"]
     assert rules("--remove", "wing", "10")[0] == ["- 10", "- wing"]
     assert rules()[0] == ["1", "2"]
-    assert rules("--from", str(pki))[0] == ["+ 99", "+ 200"]
+    assert rules("--from", str(pki))[0] == ["+ 200", "+ 99"]
     assert stat.S_IMODE(file.stat().st_mode) == 0o640
     before = file.read_bytes()
     assert "it does not name vehicle '7'" in rules("--remove", "7", code=2)[1]
@@ -452,7 +452,7 @@ def test_rules_are_written_from_a_list(file: Path, pki: Path, tmp_path: Path) ->
 def test_rules_of_200_vehicles_hold(run_router: RunRouter, file: Path, join: Join) -> None:
     """A router takes them all, each vehicle may write its own keys only, and one that was removed nothing."""
     write_access_rules(file, FLEET)
-    assert read_access_rules(file) == FLEET
+    assert read_access_rules(file) == sorted(FLEET)
     end = run_router(file)
     reader = join("reader")
     for vehicle in SAMPLE:

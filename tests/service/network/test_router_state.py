@@ -24,7 +24,7 @@ from nedbus.doctor.prober import check_endpoint
 from nedbus.errors import ConfigError
 from nedbus.monitoring import Exporter, exporter, service_pages
 from nedbus.settings import load_settings
-from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, router, router_max_sessions
+from nedbus.transport import RouterState, Session, ask_routers, open_client, open_router, read_router_config, router
 from nedbus.transport.router import allow_sessions
 from nedbus.transport.router_state import read_state
 from tests.peers.certificates import CONFIG
@@ -72,7 +72,7 @@ def router_in(endpoint: str, seen: str) -> Finding:
     found: list[Finding] = []
 
     def look() -> bool:
-        findings = check_network(Observation("nedbus", "0", None, has_tls=False), endpoint, None, 0.0)
+        findings = check_network(Observation("nedbus", "0", None), endpoint, None, 0.0)
         found[:] = [each for each in findings if each.check == "router"]
         return [each.seen for each in found] == [seen]
 
@@ -114,7 +114,7 @@ def test_shipped_files_say_it_twice_alike(name: str) -> None:
     assert json.loads(config.get_json("metadata")) == {"max_sessions": limit}
     blocks = re.findall(r"^  (\w+):", (CONFIG / name).read_text(), re.MULTILINE)
     assert {"mode", "listen", "scouting", "timestamping", "adminspace", "transport"} <= set(blocks)
-    assert router_max_sessions() == limit == 1000
+    assert read_router_config().max_sessions == limit == 1000
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_limit_of_a_broken_file_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "router.json5"
     file.write_text("{ mode: ")
     with pytest.raises(ConfigError):
-        router_max_sessions(file)
+        read_router_config(file)
 
 
 @pytest.mark.parametrize(
@@ -318,23 +318,23 @@ class Limits:
 @pytest.mark.parametrize(
     ("limits", "soft", "warns"),
     [
-        (Limits(1024, 500_000), 2100, False),
-        (Limits(1024, resource.RLIM_INFINITY), 2100, False),
+        (Limits(1024, 500_000), 500_000, False),
+        (Limits(1024, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
         (Limits(20_000, 20_000), 20_000, False),
         (Limits(resource.RLIM_INFINITY, resource.RLIM_INFINITY), resource.RLIM_INFINITY, False),
         (Limits(1024, 1500), 1500, False),
         (Limits(256, 1024), 1024, True),
         (Limits(256, 4096, refused=True), 256, True),
     ],
-    ids=["raised", "no hard limit", "enough", "none", "fewer handshakes", "too low", "refused"],
+    ids=["raised", "no hard limit", "enough", "none", "just enough", "too low", "refused"],
 )
 def test_files_of_a_router(
     limits: Limits, soft: int, warns: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The soft limit is raised as far as sessions and handshakes need, and what is missing is told."""
+    """The soft limit is raised to the hard one; a warning says that this is too low."""
     monkeypatch.setattr(router, "resource", limits)
     with caplog.at_level(logging.WARNING):
-        allow_sessions(1000, pending=1000)
+        allow_sessions(1000)
     assert limits.now[0] == soft
     assert bool(caplog.records) is warns
     if warns:

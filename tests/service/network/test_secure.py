@@ -330,9 +330,8 @@ def test_thinned_stream_flows_as_the_stream_does(
 
 
 PERMISSION: Final = "nedbus.daemon.write_permission."
-SOON: Final = {f"{PERMISSION}{name}": 0.3 for name in ("_CONFIRM", "_POLL", "_ARRIVED")} | {
+SOON: Final = {f"{PERMISSION}{name}": 0.3 for name in ("_CONFIRM", "_POLL", "_ARRIVED", "_UNSURE_PAUSE", "_PAUSE")} | {
     f"{PERMISSION}_FIRST": (0.1, 0.3),
-    f"{PERMISSION}_PAUSES": (0.3,),
 }
 
 
@@ -354,7 +353,7 @@ def test_refused_service_says_so_until_the_rules_are_mended(
     options = (*flags_of(pki, certificate), "-s", "sim:?vehicle=2", "--http", pages.where)
     service = start_hasty(start, SOON, "serve", "-c", endpoint, *options)
     refused = (503, "the router refuses vehicle 2\n")
-    wait_for(lambda: "the router refuses vehicle 2: nothing of it reaches anybody" in service.err, what="the refusal")
+    wait_for(lambda: "the router refuses vehicle 2: its messages reach no reader" in service.err, what="the refusal")
     assert (pages.ask("/healthz"), pages.ask("/readyz")) == (refused, refused)
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [1.0]
     assert json.loads(pages.ask("/status")[1])["refused"] == ["2"]
@@ -399,14 +398,14 @@ def look(permission: WritePermission) -> Mapping[str, bool]:
     ("history", "outcome"),  # the outcome: refused or not, and the pause after it
     [
         (["denied"], (None, 1)),
-        (["denied", "denied", "denied"], (True, 30)),
+        (["denied", "denied", "denied"], (True, 60)),
         (["denied", "denied", "allowed"], (False, 600)),
-        (["denied", "denied", "allowed", "denied"], (False, 1)),
+        (["denied", "denied", "allowed", "denied"], (None, 1)),
         (["denied", "unknown", "denied", "denied"], (True, 60)),
         (["denied", "denied", "denied", "unknown"], (True, 60)),
         (["denied", "denied", "denied", "allowed"], (False, 600)),
         (["allowed", "unknown"], (None, 60)),
-        (["unknown"] * 9, (None, 600)),
+        (["unknown"] * 9, (None, 60)),
     ],
     ids=lambda value: " ".join(map(str, value)),
 )

@@ -15,7 +15,7 @@ import nedbus
 from nedbus.errors import AddressError, ConfigError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
-from nedbus_msgs.codecs.arrays import MessageArray, arrays_of
+from nedbus_msgs.arrays import MessageArray, arrays_of
 from tests.flights.messages import VLP
 
 BOOT = 1_700_000_000_000_000  # us, of a vehicle in 2023
@@ -208,10 +208,8 @@ def test_tables_are_frames_with_nulls(tmp_path: Path) -> None:
     assert panda["vehicle_attitude.q[3]"].iloc[1] == np.float32(math.sin(0.5))
     assert bear["utc"].dtype == pl.Datetime("us", "UTC")
     assert panda["utc"].iloc[1] == bear["utc"][1] == datetime.fromtimestamp(BOOT / 1e6 + 1.1, UTC)
-    assert panda.attrs["utc"] == {"source": "sensor_gps/0", "offset_us": BOOT, "count": 1, "spread_us": 0}
-    assert nedbus.read(path, dataframe="pandas").attrs["utc"]["source"] == "sensor_gps/0"
+    assert nedbus.utc_of(path) == nedbus.UtcOffset("sensor_gps/0", BOOT, 1, 0)
     assert np.isnat(nedbus.align({VLP: POSITIONS}, utc=True)["utc"]).all()
-    assert "utc" not in nedbus.align({VLP: POSITIONS}, dataframe="pandas").attrs
 
 
 def test_utc_is_told_or_absent() -> None:

@@ -150,7 +150,7 @@ def why(name: str, *, at: float | None = None) -> list[Story]:
     followed = read.account.vehicles["1"]
     if at is not None:
         at = read.times.find(str(at), told[-1])
-    return tell(told, followed.conditions.values(), topics=list(followed.messages.values()), at=at)
+    return tell(told, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
 def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:
@@ -208,9 +208,9 @@ def test_gps_loss_with_all_messages() -> None:
         "gps_fix_lost", "few_satellites", "not_fused", "dead_reckoning", "jump",
     }  # fmt: skip
     assert story.lacking == ()
-    assert story.topics == (
+    assert story.topics == [
         "estimator_status_flags", "failsafe_flags", "vehicle_gps_position", "vehicle_local_position", "vehicle_status",
-    )  # fmt: skip
+    ]  # fmt: skip
 
 
 def test_what_held_at_a_moment() -> None:

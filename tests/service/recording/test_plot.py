@@ -98,7 +98,7 @@ def test_invalid_estimate_is_thin_and_out_of_the_scale(others: list[tuple[Addres
 
 
 def test_estimate_that_is_never_valid_is_in_the_scale() -> None:
-    """Where nothing is valid the limits are those of what is drawn, and the titles say so. Messages made up."""
+    """Where nothing is valid the limits are those of what is drawn. Messages made up."""
     address, array = flight_of()
     array["xy_valid"] = array["z_valid"] = array["v_xy_valid"] = False
     array["x"] *= 100
@@ -106,8 +106,6 @@ def test_estimate_that_is_never_valid_is_in_the_scale() -> None:
     assert parts["track"].get_ylim()[1] > 990
     assert parts["altitude"].get_ylim()[1] > 4.95
     assert parts["speed"].get_ylim()[0] < 1.0 < parts["speed"].get_ylim()[1]
-    assert parts["track"].get_title() == "track; thin: xy_valid is never set"
-    assert parts["speed"].get_title() == "speed; thin: v_xy_valid is never set"
 
 
 def test_height_shows_its_own_resets() -> None:

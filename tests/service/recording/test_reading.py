@@ -82,7 +82,7 @@ def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     has = f"which has 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
     with pytest.raises(AddressError, match=f"^vehicle '2' is not valid: expected one that is in {flight}, {has}"):
         nedbus.read(flight, vehicle="2")
-    with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one of est.* in {flight}, {has}"):
+    with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one that is in {flight}, {has}"):
         nedbus.read(flight, "estimator_local_position", instance=5)
     with pytest.raises(SourceError, match="no such file"):
         nedbus.read(tmp_path / "none.ulg")
@@ -105,7 +105,7 @@ def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
     truth = f"{VLP}_groundtruth"
     with pytest.raises(AddressError, match=f"topic '{truth}' is not valid: expected one that is in .* has 1/.* more$"):
         nedbus.read(path, truth)
-    with pytest.raises(AddressError, match=f"topic '{VLP}' is not valid: expected one of vehicle 99 that is in"):
+    with pytest.raises(AddressError, match=f"topic '{VLP}' is not valid: expected one that is in"):
         nedbus.read(path, vehicle="99")
 
 
@@ -232,14 +232,12 @@ def test_plot_leaves_out_what_the_flight_does_not_have(tmp_path: Path) -> None:
 
 
 def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
-    """It is drawn, and says why it is empty; no name is a formula, and what the font lacks is an explained "?"."""
+    """It is drawn, and its titles explain the thin lines; any name of a file is drawn, and none as a formula."""
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
     texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg", title=name)
-    titles = {"track; thin: xy_valid is never set", "speed; thin: v_xy_valid is never set"}
-    assert {*titles, "altitude; thin: z_valid is never set, dashed: a reset of z or vz"} <= set(texts)
-    [title] = [text for text in texts if text.startswith("flight $1$ of $x, ")]
-    assert title.endswith(", ?? and broken ?.ulg (?: a character that this font lacks)")
+    assert {"altitude; thin: z invalid, dashed: a reset of z or vz", "speed; thin: v_xy invalid"} <= set(texts)
+    assert name.replace("\udcff", "?") in texts
 
 
 def test_missing_fields_are_named(tmp_path: Path) -> None:
@@ -322,7 +320,7 @@ def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.Lo
 
 
 def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many topics are wanted, and with the messages that tell UTC."""
+    """However many topics are wanted."""
     path = tmp_path / "flight.mcap"
     convert_replay("sim:?duration=20", path)
     passes: list[object] = []

@@ -389,17 +389,16 @@ def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: p
 
 
 NAME = "expected a recording: a file that ends with .mcap"
-TABLE = '; for a table: nedbus.read("{0}", dataframe="pandas").to_csv("{1}")'
 
 
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "reason"),
     [
-        ("convert a.ulg x.csv", 2, f"x.csv: {NAME}{TABLE.format('a.ulg', 'x.csv')}\n"),
-        ("convert a.ulg b.png", 2, f"b.png: {NAME}; for a picture: nedbus plot a.ulg -o b.png\n"),
+        ("convert a.ulg x.csv", 2, f"x.csv: {NAME}\n"),
+        ("convert a.ulg b.png", 2, f"b.png: {NAME}\n"),
         ("convert a.ulg b", 2, f"b: {NAME}\n"),
         ("record -o a.txt", 2, f"a.txt: {NAME}\n"),
-        ("record -o a.csv", 2, f"a.csv: {NAME}{TABLE.format('flight.mcap', 'a.csv')}\n"),
+        ("record -o a.csv", 2, f"a.csv: {NAME}\n"),
         ("convert flight.txt a.mcap", 2, "a file that ends with .ulg or .mcap"),
         ("convert flight.ulg a.mcap", 1, "no such file"),
     ],

@@ -30,7 +30,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk, ChunkIndex, Footer
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, Writer
+from mcap.writer import Writer
 
 import nedbus
 from nedbus.errors import SourceError
@@ -128,7 +128,7 @@ def test_damaged_recordings_are_read_in_part_and_never_wrong(tmp_path: Path, tri
         assert bool(run.damage) == reader.damaged, where
         assert run.total == sum(read.values()), where
         # Where the index is lost as well, nobody knows whether there was anything in what cannot be read.
-        assert lost or not reader.damaged or reader._file.summary is None, f"{where}: nothing lost: {reader.warnings}"
+        assert lost or not reader.damaged or not reader._file.summary, f"{where}: nothing lost: {reader.warnings}"
         outcomes["lost" if lost else "whole"] += 1
         if number % 20 == 0:
             assert sum(1 for _ in run.messages) == run.total, where
@@ -329,15 +329,7 @@ def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
     assert reader.warnings[-1] == "there is more damage"
 
 
-def test_word_at_the_beginning_is_no_chunk(tmp_path: Path) -> None:
-    """The name of a compression right behind the magic is no chunk that begins before the file."""
-    path = tmp_path / "a.mcap"
-    path.write_bytes(MCAP0_MAGIC + bytes(3) + b"\x04\x00\x00\x00zstd" + bytes(100))
-    with pytest.raises(SourceError, match="no message can be read: cut or damaged: everything from byte 8 of 119 on"):
-        RecordingReader(path, vehicle="1")
-
-
-CHUNK = r"chunk 3 \(10\.\d to 10\.\d s\) at byte \d+ is damaged: its {} messages are left out"
+CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are left out"
 
 
 def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
@@ -347,7 +339,7 @@ def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
         total = sum(reader.counts.values())
     assert (lost := damage_chunk(path, 3)) == 80
     [warning] = open_replay(f"mcap:{path}").warnings
-    assert re.fullmatch(CHUNK.format(80), warning)
+    assert re.fullmatch(CHUNK, warning)
     said = []
     for arguments in (
         ["convert", str(path), "b.mcap"],
@@ -356,7 +348,7 @@ def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
     ):
         ended = run_command(*arguments)
         assert ended.exit_code == 1, ended.err
-        assert re.search(CHUNK.format(r"\d\d"), ended.err)
+        assert re.search(CHUNK, ended.err)
         said.append(ended.err)
     assert f"{total - lost} messages" in said[0]
     assert f"{total - lost} published" in said[2]

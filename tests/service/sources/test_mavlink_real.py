@@ -73,7 +73,7 @@ def test_all_topics_of_mavlink_say_what_was_logged() -> None:
         for message in parser.parse_buffer(datagram) or []:
             if not message.get_srcSystem():
                 continue  # none of the dialect
-            vehicle.track_sequence(message.get_srcComponent(), message.get_seq(), time_ns / 1e9)
+            vehicle.track_sequence(message.get_seq(), time_ns / 1e9)
             said = vehicle.handle(message, time_ns / 1e9)
             if said is None:
                 continue

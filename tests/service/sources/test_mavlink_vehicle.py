@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any, cast
 
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources import Rejection, SourceMessage
-from nedbus.sources.mavlink.fields import SAID
+from nedbus.sources.mavlink.fields import CONVERSIONS
 from nedbus.sources.mavlink.vehicle import ORIGIN, STREAMS, Vehicle, request_rates
 from nedbus.sources.options import MavlinkOptions
 from nedbus_msgs import TOPICS, quaternion_to_euler
@@ -98,7 +99,7 @@ def test_only_what_is_needed_is_requested_and_as_the_link_carries(topics: list[s
 def test_each_topic_of_mavlink_has_a_message_that_is_requested() -> None:
     """A topic that a MAVLink vehicle says has a row in STREAMS, with the topic's name as it is."""
     needed = {topic for _, _, topics in STREAMS.values() for topic in topics.split()}
-    assert needed == {topic for topic, _ in SAID.values()} <= TOPICS.keys()
+    assert needed == {topic for topic, _ in CONVERSIONS.values()} <= TOPICS.keys()
 
 
 def test_euler_angles_replace_a_quaternion_that_is_not_sent() -> None:
@@ -123,64 +124,58 @@ def test_each_topic_has_an_order_of_its_own() -> None:
     assert estimate(vehicle, 2000, 100.0)["timestamp"] == 2_000_000
 
 
-def test_requests_are_repeated_five_times(vehicle: Vehicle) -> None:
-    """Each stream is requested up to five times, 1 s apart, then the next; the origin until it is known."""
-    requested: list[int] = []
-    for tick in range(200):
-        now = 100.0 + tick / 2
-        vehicle.track_sequence(1, tick % 256, now)
-        requested += [number for number, _ in vehicle.requests(now)]
-    for number in NEEDED:
-        assert requested.count(number) == 5
-    assert requested.count(ORIGIN) > 10
+def requests_of(vehicle: Vehicle, seconds: range) -> list[tuple[int, float]]:
+    """Return the requests to a vehicle that sends some message each half a second."""
+    requests = []
+    for second in seconds:
+        for now in (second, second + 0.5):
+            vehicle.track_sequence(round(2 * now) % 256, now)
+            requests.append(vehicle.next_request(now))
+    return [each for each in requests if each]
 
 
-def test_answer_ends_a_request(vehicle: Vehicle) -> None:
-    """After any answer the next stream is requested; once all are and the origin is known, nothing is requested."""
-    requested: list[tuple[int, float]] = []
-    for tick in range(20):
-        now = 100.0 + tick
-        vehicle.track_sequence(1, tick, now)
-        estimate(vehicle, 1000 * tick, now)
-        for request in list(vehicle.requests(now)):
-            requested.append(request)
-            assert vehicle.acknowledge(now) == request[0]
-        if tick == 10:
-            origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
-            assert vehicle.handle(origin, now) is None
-    assert [number for number, _ in requested[:6]] == [*NEEDED, ORIGIN]
+def test_requests_are_repeated_while_nothing_arrives(vehicle: Vehicle, caplog: pytest.LogCaptureFixture) -> None:
+    """Each message is requested three times, then every few seconds; each but the origin is logged once."""
+    caplog.set_level("INFO")
+    requested = [number for number, _ in requests_of(vehicle, range(100, 200))]
+    assert requested[:12] == [*NEEDED, ORIGIN] * 2
+    for number in (*NEEDED, ORIGIN):
+        assert 10 < requested.count(number) < 30
+    assert caplog.text.count("does not send") == len(NEEDED)
+    assert "9/vehicle_local_position: does not send ODOMETRY when it is requested" in caplog.text
+
+
+def test_messages_that_arrive_are_requested_three_times(vehicle: Vehicle) -> None:
+    """A link loses some requests; after three rounds nothing is requested that arrives, nor an origin that is known."""
+    origin = dialect.MAVLink_gps_global_origin_message(1, 2, 3, 4)
+    assert vehicle.next_request(99.0) is None  # it was never heard
+    requested = []
+    for second in range(100, 130):
+        requested += requests_of(vehicle, range(second, second + 1))
+        estimate(vehicle, 1000 * second, second)
+        if second == 101:
+            assert vehicle.handle(origin, second) is None
     assert requested[0] == (32, 30.0)
-    assert len(requested) < 9
-    assert vehicle.acknowledge(1000.0) is None
+    counts = Counter(number for number, _ in requested)
+    assert counts[32] == counts[ORIGIN] == 3
+    assert counts[331] > 3
 
 
 def test_reordered_and_duplicate_messages_are_not_lost(vehicle: Vehicle) -> None:
     """Datagrams that arrive out of order, or twice, do not count as lost."""
     for sequence in (10, 12, 11, 13, 13, 14, 100, 200, 0):
-        vehicle.track_sequence(1, sequence, 100.0)
+        vehicle.track_sequence(sequence, 100.0)
     assert vehicle.lost == 85 + 99 + 55
 
 
 def test_positions_that_stop_are_requested_again(vehicle: Vehicle) -> None:
     """The streams of a vehicle that sends messages, but no positions, are requested again."""
-    requested: list[int] = []
-    for tick in range(400):
-        now = 100.0 + tick / 10
-        vehicle.track_sequence(1, tick % 256, now)
-        if now < 110:
-            estimate(vehicle, tick * 100, now)
-        for number, _ in list(vehicle.requests(now)):
-            vehicle.acknowledge(now)
-            if now >= 110:
-                requested.append(number)
-    assert requested.count(32) >= 3
-
-
-def test_time_goes_on_when_its_counter_wraps(vehicle: Vehicle) -> None:
-    """time_boot_ms overflows after 49.7 days; the timestamp does not."""
-    for ms in range(2**32 - 500, 2**32 + 500, 100):
-        said = handle(vehicle, position(ms % 2**32), 100.0)
-        assert (said.fields["timestamp"], said.rebooted) == (1000 * ms, False)
+    requested = []
+    for second in range(100, 140):
+        if second < 120:
+            estimate(vehicle, 1000 * second, second)
+        requested += [(second, number) for number, _ in requests_of(vehicle, range(second, second + 1))]
+    assert [second // 10 for second, number in requested if number == 32][3:] == [12, 12, 13, 13]
 
 
 def test_expired_values_are_not_provided(vehicle: Vehicle) -> None:

@@ -30,7 +30,7 @@ from nedbus.web.fleet import Fleet, Line, Picture, Row
 from nedbus.web.stream import Stream
 from nedbus.web.viewer import Viewer
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Provenance, Selection
-from nedbus_msgs.codecs.arrays import arrays_of
+from nedbus_msgs.arrays import arrays_of
 from tests.flights.messages import VALID, VLP, message
 from tests.waits import DEADLINE, repeating
 

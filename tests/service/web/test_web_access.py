@@ -78,8 +78,16 @@ def test_foreign_pages_get_nothing(url: str) -> None:
         assert status_of(url + path) == 200
         assert status_of(url + path, Host="ground.example:8420") == 200
         assert status_of(url + path, Host="evil.example:8420") == 403
-        assert status_of(url + path, Host=host, Origin="http://evil.example") == 403
-    for origin in ("http://evil.example", f"http://evil.example@{host}", "null", f"http://{host}.evil.example"):
+        for origin in ("http://evil.example", "http://192.0.2.1"):
+            assert status_of(url + path, Host=host, Origin=origin) == 403
+        assert status_of(url + path, Host="localhost:9000", Origin="http://localhost:9000") == 200, "a forwarded port"
+    for origin in (
+        "http://evil.example",
+        f"http://evil.example@{host}",
+        "null",
+        f"http://{host}.evil.example",
+        "http://192.0.2.1",
+    ):
         assert not answers(url, origin)
     assert answers(url, url)
     assert answers(url, "http://ground.example:8420")

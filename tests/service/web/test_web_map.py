@@ -91,10 +91,10 @@ def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
     [
         (None, "no such file"),
         ("no JSON", HINT),
-        ("[]", HINT),
+        ("[]", "it has no lines, polygons or points"),
         ('{"type": "Nonsense"}', f"'coordinates' is missing): {HINT}"),
         ('{"type": "Topology", "objects": {}}', HINT),
-        ('{"type": "LineString", "coordinates": []}', HINT),
+        ('{"type": "LineString", "coordinates": []}', "it has no lines, polygons or points"),
         ('{"type": "LineString", "coordinates": [["a", "b"]]}', HINT),
         ('{"type": "Point", "coordinates": [2600000, 1200000]}', "is no longitude and latitude"),
         ('{"type": "Point", "coordinates": [NaN, 1]}', "is no longitude and latitude"),

@@ -6,20 +6,19 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
-from http.client import HTTPConnection, HTTPException
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from nedbus import __version__, bridges
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import InstanceOption, TopicOption, VehicleOption, on_bus, selecting
+from nedbus.cli.options import ALL, FileArgument, InstanceOption, TopicOption, VehicleOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
-from nedbus.errors import ConfigError, ConnectError, ListenError, NedbusError
+from nedbus.errors import ConfigError, ConnectError, NedbusError
 from nedbus.log_event import about
 from nedbus.settings import is_loopback, split_http
 from nedbus_msgs import ANY, RELEASES, Selection
@@ -29,17 +28,20 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("nedbus")
 
-_ANSWER_TIMEOUT: Final = 1.0  # s
+MapOption = Annotated[
+    Path | None,
+    typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help="GeoJSON, or a picture with a world file"),
+]
+NamespaceOption = Annotated[
+    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics as /NAMESPACE/fmu/out/...; repeatable")
+]
 HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
 
 
-@on_bus
+@command
 def web(
     open_bus: Callable[[], Bus],
-    file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording to look at, instead of live vehicles"),
-    ] = None,
+    file: FileArgument = None,
     *,
     topic_option: TopicOption = ANY,
     vehicle: VehicleOption = ANY,
@@ -49,18 +51,9 @@ def web(
         list[str] | None,
         typer.Option(metavar="HOST:PORT", help="Another name that browsers call this page by; repeatable"),
     ] = None,
-    background: Annotated[
-        Path | None,
-        typer.Option(
-            "--map",
-            exists=True,
-            dir_okay=False,
-            metavar="FILE",
-            help="GeoJSON, or a picture with a world file, under the tracks",
-        ),
-    ] = None,
+    background: MapOption = None,
 ) -> None:
-    """Show all vehicles in a browser: a map, what is wrong with whom, and plots; live, or of a recording."""
+    """Show all vehicles in a browser: a map, their faults, and plots; live, or of a recording."""
     host, port = _split("--http", http)
     for name in origin or ():
         _split("--origin", name)
@@ -70,23 +63,19 @@ def web(
     def tell(url: str) -> None:
         write_stderr(f"open {url} in a browser; Ctrl-C ends it")
         if not is_loopback(host):
-            write_stderr(
-                f"any client that reaches {http} can see all vehicles, without a password; nothing can be changed there"
-            )
+            write_stderr(f"any client that reaches {http} can see all vehicles, without a password, and change nothing")
 
     if file is not None:
         run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
         return
+    serve_live = partial(page.serve_live, version=__version__, tell=tell)
     with open_bus() as bus:
-        run_until_stopped(
-            lambda stop: page.serve_live(bus, selection, where, version=__version__, stop=stop, tell=tell)
-        )
+        run_until_stopped(lambda stop: serve_live(bus, selection, where, stop=stop))
 
 
-@on_bus
-@selecting(ANY)
-def export(open_bus: Callable[[], Bus], selection: Selection, *, http: HttpOption = "127.0.0.1:9464") -> None:
-    """Serve metrics for Prometheus of what a reader sees, until Ctrl-C: for routers without a service of ours."""
+@command
+def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
+    """Serve a reader's metrics for Prometheus, until Ctrl-C: for routers without a nedbus service."""
     from nedbus.monitoring import Exporter
 
     _split("--http", http)
@@ -96,7 +85,7 @@ def export(open_bus: Callable[[], Bus], selection: Selection, *, http: HttpOptio
             run_until_stopped(exporter.run)
 
 
-@on_bus
+@command
 def foxglove(
     open_bus: Callable[[], Bus], *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
 ) -> None:
@@ -107,21 +96,17 @@ def foxglove(
         run_until_stopped(partial(server.run, selection=Selection(vehicle=vehicle)))
 
 
-@on_bus
-@selecting(ANY)
+@command
 def ros2(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
     layout: Annotated[
         str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
     ] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
-    namespace: Annotated[
-        list[str] | None,
-        typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics of a vehicle, as /NAMESPACE/fmu/out/...; repeatable"),
-    ] = None,
+    namespace: NamespaceOption = None,
     to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
 ) -> None:
     """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""
@@ -152,34 +137,12 @@ def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator
     """Serve pages on HOST:PORT for as long as this is entered."""
     from nedbus.monitoring import HttpServer
 
-    try:
-        server = HttpServer(where, pages)
-    except ListenError as exc:
-        if not _is_nedbus(where):
-            raise
-        hint = "end it, or choose another address with --http"
-        raise ListenError([f"http://{where}"], "a nedbus runs there already", hint=hint) from exc
-    _log.info(
-        "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status", where, extra=about("http")
-    )
-    if not is_loopback(split_http(where)[0]):
-        _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
-    try:
+    with closing(HttpServer(where, pages)):
+        text = "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status"
+        _log.info(text, where, extra=about("http"))
+        if not is_loopback(split_http(where)[0]):
+            _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
         yield
-    finally:
-        server.close()
-
-
-def _is_nedbus(where: str) -> bool:
-    """Return whether a command of ours serves pages on HOST:PORT."""
-    connection = HTTPConnection(*split_http(where), timeout=_ANSWER_TIMEOUT)
-    try:
-        connection.request("HEAD", "/")
-        return connection.getresponse().getheader("Server", "").startswith("nedbus")
-    except (OSError, HTTPException):
-        return False
-    finally:
-        connection.close()
 
 
 def _split(option: str, where: str) -> tuple[str, int]:

@@ -1,62 +1,43 @@
-"""The command for when nothing arrives: doctor."""
+"""Commands that look for faults: doctor, of a system in which nothing arrives; check, of configuration files."""
 
 from __future__ import annotations
 
 import json
-import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
-from typing import Annotated, Final
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from nedbus import __version__
-from nedbus.cli.options import (
-    ConfigOption,
-    ConnectOption,
-    JsonOption,
-    PrefixOption,
-    TlsCaOption,
-    TlsCertificateOption,
-    TlsKeyOption,
-    command,
-)
-from nedbus.cli.output.streams import MAX_TEXT, to_text, write
-from nedbus.cli.output.table import terminal_width
-from nedbus.doctor import Finding, examine, worst_state
-from nedbus.settings import load_settings
+from nedbus.cli.options import JsonOption, command
+from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
+from nedbus.cli.output.table import fold
+from nedbus.doctor import Finding, check_router_file, check_service, examine, worst_state
+from nedbus.errors import ConfigError
+from nedbus.settings import Settings
 from nedbus_msgs import check_vehicle
-
-_MAX_WIDTH: Final = 80  # columns
 
 
 @command
 def doctor(
+    read_settings: Callable[[], Settings],
     *,
     vehicle: Annotated[
         str | None, typer.Option("--vehicle", "-v", help="Look at this vehicle, and whether this client may write it")
     ] = None,
-    mavlink: Annotated[
-        str | None, typer.Option("--mavlink", metavar="LINK", help="Listen here too, such as udpin:0.0.0.0:14550")
-    ] = None,
-    connect: ConnectOption = None,
-    prefix: PrefixOption = None,
-    tls_ca: TlsCaOption = None,
-    tls_certificate: TlsCertificateOption = None,
-    tls_key: TlsKeyOption = None,
-    config: ConfigOption = None,
+    mavlink: Annotated[str | None, typer.Option(metavar="LINK", help="Listen there too: udpin:0.0.0.0:14550")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Say why nothing arrives: router, certificates, permissions, clocks, vehicles, MAVLink; what is worst comes last.
+    """Find out why nothing arrives: router, certificates, permissions, clocks, vehicles, MAVLink; the worst comes last.
 
     Exit 0 when nothing is wrong, 1 otherwise. It takes a few seconds, and changes nothing.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    own_files = {"tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key}
-    settings = load_settings(config, connect=connect and tuple(connect), prefix=prefix, **own_files)
-    findings = examine(settings, version=__version__, vehicle=vehicle, mavlink=mavlink)
+    findings = examine(read_settings(), version=__version__, vehicle=vehicle, mavlink=mavlink)
     state = worst_state(findings)
     if json_output:
         write(json.dumps({"state": state, "findings": [asdict(each) for each in findings]}))
@@ -68,13 +49,38 @@ def doctor(
 
 def _to_report(findings: Sequence[Finding]) -> str:
     """Return the findings as lines, and the number of each state."""
-    width = min(terminal_width() or _MAX_WIDTH, _MAX_WIDTH)
     lines = []
     for each in findings:
         name = f"{each.check} {each.subject}".strip()
-        texts = {f"{each.state:<8} ": f"{name}: {each.seen}", f"{'':<8} -> ": each.advice}
-        for head, text in texts.items():
-            indent, line = " " * len(head), to_text(text, MAX_TEXT)
-            lines += textwrap.wrap(line, width, initial_indent=head, subsequent_indent=indent, break_on_hyphens=False)
+        lines.append(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
+        if each.advice:
+            lines.append(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))
     counts = Counter(each.state for each in findings)
     return "\n".join([*lines, "", ", ".join(f"{count} {state}" for state, count in counts.items())])
+
+
+@command
+def check(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="CONFIG...", help="Settings (.toml) and router files (.json5)", show_default=False),
+    ] = None,
+    *,
+    offline: Annotated[bool, typer.Option("--offline", help="Check the text only, not this host")] = False,
+) -> None:
+    """Report all mistakes in settings and router files, with file, line and column; exit with 2 if there is one."""
+    mistakes = [] if files else check_service(offline=offline)
+    for file in files or ():
+        is_toml = file.suffix == ".toml"
+        mistakes += check_service(file, offline=offline) if is_toml else check_router_file(file, offline=offline)
+    report_mistakes(mistakes)
+
+
+def report_mistakes(mistakes: Iterable[ConfigError]) -> None:
+    """Write each mistake to stderr, once, and exit with 2 if there is one."""
+    lines = dict.fromkeys(map(str, mistakes))
+    for line in lines:
+        write_stderr(f"nedbus: {line}")
+    if lines:
+        raise typer.Exit(2)
+    write("nothing is wrong")

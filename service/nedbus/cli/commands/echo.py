@@ -5,54 +5,43 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 
 from nedbus.cli.follow import follow
 from nedbus.cli.options import (
+    POSITIONS,
     CountOption,
     CsvOption,
     DurationOption,
     FieldOption,
     JsonOption,
-    on_bus,
+    command,
     parse_fields,
     require_one,
-    selecting,
 )
-from nedbus.cli.output.samples import Lines, to_fields, to_json, to_row
-from nedbus.cli.output.streams import csv_line, write, write_stderr
+from nedbus.cli.output.samples import CsvLines, Lines, to_fields, to_json
+from nedbus.cli.output.streams import write, write_stderr
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
-from nedbus.errors import ConfigError
-from nedbus_msgs import DEFAULT_TOPIC, Address, Selection
+from nedbus_msgs import Address, Selection
+
+_EVERY: Final = "Every message, in order; a replay at speed=max then waits for this terminal or pipe"
 
 
-@on_bus
-@selecting(DEFAULT_TOPIC)
+@command
 def echo(
     open_bus: Callable[[], Bus],
-    selection: Selection,
+    selection: Selection = POSITIONS,
     *,
     field: FieldOption = None,
     full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
-    every: Annotated[
-        bool,
-        typer.Option(
-            "--every",
-            help="Print every message, in order; a replay at speed=max then waits for this terminal or pipe",
-        ),
-    ] = False,
+    every: Annotated[bool, typer.Option("--every", help=_EVERY)] = False,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
     max_rate: Annotated[
-        float | None,
-        typer.Option(
-            "--max-rate",
-            metavar="HZ",
-            help="Messages a second of each stream, downsampled by its publisher: for links that carry no more",
-        ),
+        float | None, typer.Option(metavar="HZ", help="Messages a second of each stream, downsampled by its publisher")
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,
     count: CountOption = None,
@@ -64,9 +53,8 @@ def echo(
     if max_rate is not None:
         check_max_rate(max_rate)
     fields = parse_fields(field, selection)
-    form = to_json if json_output else to_fields if full else Lines(selection)
+    form = to_json if json_output else to_fields if full else CsvLines() if csv_output else Lines()
     due: dict[Address, float] = {}
-    csv_head: list[str] = []
 
     def print_one(sample: Sample[Any]) -> bool:
         if interval:
@@ -74,17 +62,7 @@ def echo(
             if now < due.get(sample.address, 0.0):
                 return False
             due[sample.address] = now + interval
-        if not csv_output:
-            write(form(sample, fields))
-            return True
-        head, cells = zip(*to_row(sample, fields), strict=True)
-        if not csv_head:
-            csv_head.extend(head)
-            write(csv_line(head))
-        elif csv_head != list(head):
-            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
-            raise ConfigError("--csv", text)
-        write(csv_line(cells))
+        write(form(sample, fields))
         return True
 
     mode: Mode = "every" if every else "latest"
@@ -92,7 +70,7 @@ def echo(
         try:
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
-            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has what it wanted
+            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has its lines
                 _write_counts(subscription)
 
 

@@ -1,9 +1,9 @@
-"""The commands that say what happened, and why: events, why."""
+"""Commands for events of vehicles and their causes: events, why."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,42 +12,37 @@ from typing import Annotated, Any, Final
 import typer
 
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, JsonOption, VehicleOption, on_bus, require_one
+from nedbus.cli.options import CsvOption, DurationOption, FileArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
-from nedbus.client import Bus, Monitor, Sample, to_age
+from nedbus.client import Bus, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import SEVERITIES, WINDOW, Account, AccountReport, Event, Story, Times, by_vehicle, tell
+from nedbus.events import SEVERITIES, WINDOW, AccountReport, Event, Story, Times, Vehicle, by_vehicle, tell
 from nedbus.monitoring import Observer
-from nedbus.sources import read_account
+from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
 
 _HEAD: Final = (
     "time", "clock", "boot", "vehicle", "severity", "kind", "change", "text", "topic", "lasted", "evidence", "numbers",
 )  # fmt: skip
-_MAX_TEXT: Final = 400  # characters of what a peer may have written
+_MAX_TEXT: Final = 400  # characters of a peer's text
 _DAY: Final = 86_400.0
-FileArgument = Annotated[
-    Path | None, typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording, instead of live vehicles")
-]
 
 
-@on_bus
+@command
 def events(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
     *,
     vehicle: VehicleOption = ANY,
     within: Annotated[
-        float | None, typer.Option("--within", metavar="SECONDS", min=0.0, help="First what services remember of these")
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Start with the last SECONDS")
     ] = None,
-    severity: Annotated[
-        str, typer.Option("--severity", metavar="bad|watch|info", help="Only these, and worse ones")
-    ] = "info",
+    severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Only these, and worse ones")] = "info",
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     duration: DurationOption = None,
 ) -> None:
-    """Show what happens to vehicles, each event with what precedes it; live until Ctrl-C, or of a file.
+    """Show events of vehicles, each with its evidence; live until Ctrl-C, or of a file.
 
     Events: validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode, arming, landing, battery, reboot,
     silence, loss, rejected messages, and the link; of each the events of the ten seconds before that may explain it.
@@ -57,10 +52,9 @@ def events(
         raise ConfigError("--severity", f"{severity!r}: expected {' or '.join(SEVERITIES)}")
     severities = SEVERITIES[: SEVERITIES.index(severity) + 1]
     form = _to_json if json_output else _to_csv if csv_output else to_line
-    times = Times(is_live=True)
 
-    def show(new: Iterable[Event]) -> None:
-        for event in new:
+    def show(found: Iterable[Event], times: Times) -> None:
+        for event in found:
             if event.severity in severities and (ANY in (vehicle, event.vehicle) or event.vehicle == vehicle):
                 write(form(event, times))
 
@@ -68,79 +62,65 @@ def events(
         if csv_output:
             write(csv_line(_HEAD))
         with open_bus() as bus:
+            times = Times(is_live=True)
             if within is not None:
-                show(_merge(bus.accounts(within=within)))
-            _follow(bus, Selection(ANY, vehicle), show, duration)
+                show(_merge(bus.accounts(within=within)), times)
+            _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "is for live vehicles, not for a file")
-    read = read_account(file)
-    times, vehicles = read.times, read.account.vehicles
-    found = [event for event in read.account.take(0)[0] if vehicle in (ANY, event.vehicle)]
-    for warning in read.warnings:
-        write_stderr(f"{file}: {warning}")
+    read, found = _read(file)
     if vehicle != ANY:
-        _choose_vehicle(file, vehicles, vehicle)
-    _write_kept(file, read.account)
+        _choose_vehicle(file, read.account.vehicles, vehicle)
+        found = [event for event in found if event.vehicle == vehicle]
     if csv_output:
         write(csv_line(_HEAD))
     elif not json_output:
-        _write_clock(found, times)
-    show(sorted(found, key=lambda event: event.time))
-    initial = [
-        f"{name}: {condition.text}"
-        for name, each in sorted(vehicles.items())
-        for condition in each.conditions.values()
-        if condition.initial and vehicle in (ANY, name)
-    ]
-    if initial:
-        write_stderr(f"from the first message to the end: {', '.join(dict.fromkeys(initial))}")
+        _write_clock(found, read.times)
+    show(found, read.times)
+    initial = {name: _held_from_start(each) for name, each in sorted(read.account.vehicles.items())}
+    texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
+    if texts:
+        write_stderr(f"from the first message to the end: {'; '.join(texts)}")
     elif not found:
         write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
 
 
-@on_bus
+@command
 def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
     *,
-    vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="The vehicle; needed where there are several")
-    ] = None,
-    at: Annotated[
-        str | None, typer.Option("--at", metavar="TIME", help="What was wrong then: 14:05:12 (UTC), or s since boot")
-    ] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed where there are several")] = None,
+    at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC), or seconds since boot")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Say what was wrong with a vehicle, since when, for how long, and why; live as services remember it, or of a file.
+    """Explain the faults of a vehicle: begin, duration and causes; live as services remember it, or of a file.
 
-    Evidence is what precedes it within ten seconds, or goes on since before; where the messages that would tell are
-    not there it says which, and how to get them. Exit 0 with or without anything wrong.
+    Evidence is an event of the ten seconds before, or a condition that goes on since before; topics that are needed
+    and missing are named, with a hint. Exit 0 with or without anything wrong.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
     if file is not None:
-        read = read_account(file)
+        read, found = _read(file)
         name = _choose_vehicle(file, read.account.vehicles, vehicle)
-        _write_kept(file, read.account)
         followed = read.account.vehicles[name]
-        found = [event for event in read.account.take(0)[0] if event.vehicle == name]
+        found = [event for event in found if event.vehicle == name]
         conditions = [each for each in followed.conditions.values() if each.severity != "info"]
-        topics, times = list(followed.messages.values()), read.times
+        topics, times = list(followed.topics), read.times
         until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
-        initial = ", ".join(dict.fromkeys(each.text for each in followed.conditions.values() if each.initial))
-        others = f"; from the first message to the end: {initial}" if initial else ""
-        nothing = f"nothing was wrong in {read.end:.0f} s{others}"
+        nothing = f"nothing was wrong in {read.end:.0f} s"
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
             where = " or ".join(bus.routers)
-        known = by_vehicle(reports)
-        if not known:
+        reporting = by_vehicle(reports)
+        if not reporting:
             raise NedbusError(f"no nedbus service at {where} knows a vehicle: 'nedbus serve' remembers what happens")
-        name = _choose_vehicle("the network", known, vehicle)
+        name = _choose_vehicle("the network", reporting, vehicle)
         found = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
-        state = known[name].vehicles[name]
+        state = reporting[name].vehicles[name]
         conditions, topics, times = list(state.held), list(state.topics), Times(is_live=True)
         until, advice, nothing = "until now", _LIVE_ADVICE, "nothing was wrong, as far as services remember"
     moment = None
@@ -149,7 +129,7 @@ def why(
             moment = times.find(at, found[-1]) if found else None
         except ValueError as exc:
             raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
-    stories = tell(sorted(found, key=lambda event: event.time), conditions, topics=topics, at=moment)
+    stories = tell(found, conditions, topics=topics, at=moment)
     if json_output:
         for story in stories:
             write(_story_json(story, times))
@@ -163,25 +143,25 @@ def why(
     write("\n\n".join("\n".join(_describe(name, story, times, advice, until)) for story in stories))
 
 
-def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> list[str]:
-    since = "from the first message on" if story.begin is None else f"from {times.text(story.begin)}"
+def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
+    """Yield the lines of a story."""
+    since = "the first message on" if story.begin is None else times.text(story.begin)
     lasted = until if story.until is None else f"for {to_age(story.until - story.since)}"
-    is_once = story.until == story.since
-    when = f"at {times.text(story.begin)}" if is_once and story.begin is not None else f"{since}, {lasted}"
-    lines = [f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"]
+    when = f"at {since}" if story.begin and story.until == story.since else f"from {since}, {lasted}"
+    yield f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"
     if story.before:
-        lines.append("  before it")
-        lines += [f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before]
+        yield "  before it"
+        yield from (f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before)
     if story.meanwhile:
-        lines += ["  meanwhile"] + [f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile]
+        yield "  meanwhile"
+        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile)
     if story.end is not None:
-        lines += [f"  it ended at {times.text(story.end)}" + (" with" if story.after else "")]
-        lines += [f"    {times.text(each)}  {_shown(each)}" for each in story.after]
+        yield f"  it ended at {times.text(story.end)}" + (" with" if story.after else "")
+        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.after)
     if not story.before and story.begin is not None:
-        lines.append(f"  no evidence in the {WINDOW:.0f} s before")
+        yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
-        lines.append(f"  not in the data: {', '.join(story.lacking)}, which may tell why: {advice}")
-    return lines
+        yield f"  not in the data: {', '.join(story.lacking)}, which may tell why: {advice}"
 
 
 _LIVE_ADVICE: Final = (
@@ -194,7 +174,7 @@ _ADVICE: Final = {
 
 
 def to_line(event: Event, times: Times) -> str:
-    """Return an event for a person: time, vehicle, severity, what, and the evidence."""
+    """Return an event as a line: time, vehicle, severity, text and evidence."""
     evidence = ", ".join(_before(each, event.time) for each in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
@@ -210,39 +190,46 @@ def _before(event: Event, time: float) -> str:
 
 
 def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], object], duration: float | None) -> None:
-    observer, monitor, seen = Observer(bus, selection), Monitor(), 0
+    observer, seen = Observer(bus, selection), 0
     known: set[str] = set()
 
     def show_new() -> None:
         nonlocal seen
-        observer.look(monitor.snapshot(), dropped=subscription.counts.dropped, waiting=subscription.waiting)
+        observer.look()
         new, seen = observer.account.take(seen)
         show(new)
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
-                initial = [held for held in each.conditions.values() if held.initial and held.severity != "info"]
-                if initial:
-                    texts = ", ".join(dict.fromkeys(held.text for held in initial))
-                    write_stderr(f"{name}: {texts}, since before this began")
+                if initial := _held_from_start(each):
+                    write_stderr(f"{name}: {initial}, since before this began")
 
     def handle(sample: Sample[Any]) -> bool:
-        monitor.add(sample)
         observer.add(sample)
         return True
 
-    with bus.subscribe_to(selection, mode="every") as subscription:
+    with observer.subscription as subscription:
         follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
+
+
+def _read(file: Path) -> tuple[FileAccount, list[Event]]:
+    """Return the account of a file and its events in order; write its warnings to stderr."""
+    read = read_account(file)
+    found, told = read.account.take(0)
+    warnings = [*read.warnings, *([f"of {told} events only the last {len(found)}"] if told > len(found) else [])]
+    for warning in warnings:
+        write_stderr(f"{file}: {warning}")
+    return read, sorted(found, key=lambda event: event.time)
 
 
 def _merge(reports: Iterable[AccountReport]) -> list[Event]:
     return sorted((event for report in reports for event in report.events), key=lambda event: event.time)
 
 
-def _write_kept(file: Path, account: Account) -> None:
-    kept = len(account.events)
-    if account.told > kept:
-        write_stderr(f"{file}: of {account.told} events only the last {kept}")
+def _held_from_start(vehicle: Vehicle) -> str:
+    """Return the faults that held at the first message already, and never ended."""
+    held = [each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"]
+    return ", ".join(dict.fromkeys(held))
 
 
 def _write_clock(found: Sequence[Event], times: Times) -> None:
@@ -278,14 +265,15 @@ def _to_csv(event: Event, times: Times) -> str:
 
 
 def _story_json(story: Story, times: Times) -> str:
-    fields: dict[str, object] = {
+    events = {name: getattr(story, name) for name in ("before", "meanwhile", "after")}
+    fields = {
         "what": story.what,
         "begin": None if story.begin is None else _to_fields(story.begin, times),
         "lasted": None if story.until is None else story.until - story.since,
+        **{name: [_to_fields(event, times) for event in each] for name, each in events.items()},
+        "lacking": story.lacking,
     }
-    for name in ("before", "meanwhile", "after"):
-        fields[name] = [_to_fields(event, times) for event in getattr(story, name)]
-    return json.dumps({**fields, "lacking": story.lacking})
+    return json.dumps(fields)
 
 
 def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) -> str:

@@ -12,7 +12,7 @@ import typer
 
 from nedbus import recording
 from nedbus.cli.follow import SILENCE_TIMEOUT, write_notice
-from nedbus.cli.options import DurationOption, InstanceOption, VehicleOption, command, on_bus, selecting
+from nedbus.cli.options import ALL, DurationOption, InstanceOption, VehicleOption, command
 from nedbus.cli.output.progress import show_progress
 from nedbus.cli.output.streams import write, write_stderr
 from nedbus.cli.run import run_until_stopped
@@ -26,11 +26,10 @@ from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
 
 
-@on_bus
-@selecting(ANY)
+@command
 def record(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")],
     duration: DurationOption = None,
@@ -62,10 +61,7 @@ def convert(
     output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording to write", show_default=False)],
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of a log of one vehicle")] = None,
-    topics: Annotated[
-        str | None,
-        typer.Option("--topics", "-t", help='Topics or messages, separated by commas; "*" is all in the log'),
-    ] = None,
+    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Separated by commas; "*" for all')] = None,
 ) -> None:
     """Convert a flight log to a recording, validated, with all topics whose messages nedbus knows."""
     spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))
@@ -80,7 +76,6 @@ def convert(
             run.messages,
             output,
             source=spec.kind,
-            flight=str(source),
             on_progress=lambda done: show(f"{output}", done, run.total),
         )
     write_stderr(f"{output}: {report}")
@@ -125,7 +120,7 @@ def plot(
 
 
 def _read_events(path: Path) -> list[Event]:
-    """Return what happened in a file, and the begin of what held from the first message to the end."""
+    """Return the events of a file, and the begin of conditions that held from the first message to the end."""
     account = read_account(path).account
     held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
     return [*dict.fromkeys(each.begin for each in held), *account.take(0)[0]]

@@ -4,50 +4,39 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator
 from typing import Annotated, Final
 
 import typer
 
-from nedbus.cli.options import JsonOption, on_bus
-from nedbus.cli.output.streams import MAX_TEXT, to_text, write, write_stderr
-from nedbus.client import Bus, SourceStatus, to_age
+from nedbus.cli.options import JsonOption, command
+from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
+from nedbus.client import Bus, Sample, SourceStatus, to_age
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.events import VALID, Expectation, faults_of
-from nedbus_msgs import ANY, DEFAULT_TOPIC, check_vehicle
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
-_DENIED: Final = (
+_HOST: Final = socket.gethostname()
+_REFUSED: Final = (
     ", though its service reports that it is: does the router let that service write this vehicle, and this client"
     " read? (docs/security.md)"
 )
 
 
-@on_bus
+@command
 def health(
     bus: Bus,
     *,
     vehicle: Annotated[
         str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, of any publisher, by an answer")
     ] = None,
-    services: Annotated[
-        int | None, typer.Option("--services", metavar="N", min=1, help="Expect N services, on all hosts together")
-    ] = None,
-    max_age: Annotated[
-        float, typer.Option("--max-age", metavar="SECONDS", min=0.0, help="Age of the newest message at most")
-    ] = 3.0,
-    expect: Annotated[
-        str | None, typer.Option("--expect", metavar="1,2,7", help="Vehicles that must be heard, on all hosts together")
-    ] = None,
-    vehicles: Annotated[
-        int | None, typer.Option("--vehicles", metavar="N", min=1, help="Expect N vehicles, on all hosts together")
-    ] = None,
-    valid: Annotated[
-        str | None, typer.Option("--valid", metavar="xy,z", help="What must be valid: xy, z, vxy, vz")
-    ] = None,
+    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="N services answer, on all hosts")] = None,
+    max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Age of the newest message at most")] = 3.0,
+    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="These vehicles are heard, on all hosts")] = None,
+    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="N vehicles are heard, on all hosts")] = None,
+    valid: Annotated[str | None, typer.Option(metavar="xy,z", help="These are valid: xy, z, vxy, vz")] = None,
     within: Annotated[
-        float | None,
-        typer.Option("--within", metavar="SECONDS", min=0.0, help="Nothing bad, or to be watched, happened in these"),
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="No bad or watch event in these")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -60,125 +49,104 @@ def health(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    expected = _parse(vehicle, expect, vehicles, valid, within)
-    report = _examine(bus, vehicle, services, max_age, expected)
-    report.faults = [
-        *([report.reason] if report.reason else []),
-        *_vehicle_faults(bus, vehicle, services, expected, max_age),
-    ]
-    report.reason = report.faults[0] if report.faults else None
-    if json_output:
-        write(json.dumps({"healthy": report.reason is None, **asdict(report)}))
-    if report.faults:
-        for fault in report.faults[:-1]:
-            write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
-        raise NedbusError(report.faults[-1])
-    if not json_output:
-        write(report.summary)
-
-
-def _parse(
-    vehicle: str | None, expect: str | None, vehicles: int | None, valid: str | None, within: float | None
-) -> Expectation:
-    for option, given in (("--expect", expect), ("--valid", valid)):
-        if given is not None and not given.strip(" ,"):
-            raise ConfigError(option, "names nothing: is a variable of the shell not set?")
-    names = tuple(name.strip() for name in (expect or "").split(",") if name.strip())
+    names = _parse_names("--expect", expect)
     for name in names:
         check_vehicle(name)
-    asked = tuple(name.strip() for name in (valid or "").split(",") if name.strip())
-    for each in asked:
-        if each not in VALID:
-            raise ConfigError("--valid", f"{each!r}: expected some of {', '.join(VALID)}")
-    return Expectation(
-        (*names, *([vehicle] if vehicle is not None and vehicle not in names else [])), vehicles, asked, within
-    )
+    asked = _parse_names("--valid", valid)
+    if unknown := [each for each in asked if each not in VALID]:
+        raise ConfigError("--valid", f"{unknown[0]!r}: expected some of {', '.join(VALID)}")
+    judged = tuple(dict.fromkeys([*names, *([vehicle] if vehicle is not None else [])]))
+    check = _Check(bus, vehicle, services, max_age, Expectation(judged, vehicles, asked, within))
+    faults = [*check.service_faults(), *check.vehicle_faults()]
+    if json_output:
+        counts = {"services": len(check.services), "sources": len(check.sources), "vehicles": check.ages}
+        write(json.dumps({"healthy": not faults, "reason": faults[0] if faults else None, **counts, "faults": faults}))
+    if faults:
+        for fault in faults[:-1]:
+            write_stderr(to_text(f"nedbus: {fault}", MAX_TEXT))
+        raise NedbusError(faults[-1])
+    if not json_output:
+        newest = to_age(min(check.ages.values())) if check.ages else "an unknown time"
+        found = f"{counted(len(check.services), 'service')}, {counted(len(check.sources), 'source')}"
+        write(f"{found}, {counted(len(check.ages), 'vehicle')}, newest message {newest} old")
 
 
-def _vehicle_faults(
-    bus: Bus, vehicle: str | None, services: int | None, expected: Expectation, max_age: float
-) -> list[str]:
-    """Return the faults of vehicles, as services remember them, and others answer."""
-    reports = bus.accounts(within=expected.within or 0.0)
-    anywhere = bool(expected.expect) or expected.vehicles is not None or services is not None
-    known = {name for report in reports for name in report.vehicles}
-    heard: set[str] = set()
-    doubtful: list[str] = []
-    if set(expected.expect) - known or expected.vehicles is not None or (vehicle is not None and expected.valid):
-        for sample in bus.latest(ANY):
-            is_fresh = sample.latency is None or sample.latency <= max_age
-            if sample.stored or not is_fresh or sample.vehicle in known:
-                continue
-            heard.add(sample.vehicle)
+def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
+    if text is not None and not names:
+        raise ConfigError(option, "names nothing: is a variable of the shell not set?")
+    return names
+
+
+class _Check:
+    """The answers of services and publishers, and their faults; `ages`: of each vehicle's newest message [s]."""
+
+    def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
+        self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
+        self._routers = " or ".join(bus.routers)
+        self._is_local = count is None and not expected.expect and expected.vehicles is None
+        self.services = [each for each in bus.services() if not self._is_local or each.host == _HOST]
+        self.sources = [source for service in self.services for source in service.sources]
+        self.ages = _ages(self.sources)
+        self._reports = bus.accounts(within=expected.within or 0.0)
+        self._known = {name for report in self._reports for name in report.vehicles}
+        self._answers: list[Sample[Message]] = []
+        if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
+            only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
+            self._answers = [sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored]
+        # A status lists published streams, also those that the router's access rules drop.
+        self._is_refused = False
+        if vehicle is not None:
+            latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
+            self._is_refused = vehicle in self.ages and not latencies
+            age = self.ages.get(vehicle, min((max(0.0, each) for each in latencies if each is not None), default=None))
+            self.ages = {vehicle: age} if latencies and age is not None else {}
+
+    def service_faults(self) -> Iterator[str]:
+        """Yield the first fault of services, their sources, and the age of the newest message."""
+        refused = sorted({to_text(name, 64) for service in self.services for name in service.refused})
+        failed = [source for source in self.sources if source.state in {"retrying", "failed"}]
+        if self._count is not None and len(self.services) < self._count:
+            yield f"{len(self.services)} of {self._count} services answer at {self._routers}"
+        elif not self.services and self._is_local:
+            yield f"no service of {_HOST} answers at {self._routers}: --services 1 accepts those of other hosts"
+        elif refused and self._vehicle is None:
+            yield f"the router refuses vehicle {', '.join(refused)[:300]}: do its access rules name it?"
+        elif failed and self._vehicle is None:
+            source = failed[0]
+            yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
+        elif not self.ages and (self._vehicle is not None or not (self._expected.expect or self._expected.vehicles)):
+            states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in self.sources)
+            what = "no vehicle is published" if self._vehicle is None else f"vehicle {self._vehicle} is not published"
+            yield f"{what}{_REFUSED if self._is_refused else f': {states[:300]}' if states else ''}"
+        elif self.ages and min(self.ages.values()) > self._max_age:
+            name = min(self.ages, key=lambda each: self.ages[each])
+            age = to_age(self.ages[name])
+            yield f"the newest message is {age} old, from vehicle {name}: at most {self._max_age:g} s"
+
+    def vehicle_faults(self) -> Iterator[str]:
+        """Yield the faults of vehicles, as services remember them, and as others answer that no service knows."""
+        expected = self._expected
+        others = [
+            sample
+            for sample in self._answers
+            if sample.vehicle not in self._known and (sample.latency is None or sample.latency <= self._max_age)
+        ]
+        heard = {sample.vehicle for sample in others}
+        for fault in faults_of(self._reports, expected, heard=heard, only=_HOST if self._is_local else None):
+            if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # said already
+                yield fault
+        if expected.valid or expected.within is not None:
+            remembering = {report.service for report in self._reports}
+            for service in self.services:
+                if service.service not in remembering:
+                    name = to_text(service.service, 64)
+                    yield f"service {name} does not say what happens to its vehicles: update nedbus there"
+        for sample in others:
             if sample.topic == DEFAULT_TOPIC and (not expected.expect or sample.vehicle in expected.expect):
                 invalid = [each for each in expected.valid if not getattr(sample.message, VALID[each])]
-                doubtful += [f"vehicle {sample.vehicle}: {', '.join(invalid)} not valid"] if invalid else []
-    found = faults_of(reports, expected, heard=heard, only=None if anywhere else socket.gethostname())
-    if vehicle is not None:  # that it is not published is said already
-        found = [fault for fault in found if not fault.startswith(f"vehicle {vehicle} is missing")]
-    if expected.valid or expected.within is not None:
-        told = {report.service for report in reports}
-        silent = [
-            to_text(each.service, 64)
-            for each in bus.services()
-            if each.service not in told and (anywhere or each.host == socket.gethostname())
-        ]
-        found += [f"service {each} does not say what happens to its vehicles: update nedbus there" for each in silent]
-    return [*found, *doubtful]
-
-
-@dataclass(slots=True)
-class _Report:
-    """The findings; `vehicles` has the age of the newest message of each [s], `faults` all that is not well."""
-
-    reason: str | None
-    services: int
-    sources: int
-    vehicles: dict[str, float]
-    faults: list[str] = field(default_factory=list)
-
-    @property
-    def summary(self) -> str:
-        newest = to_age(min(self.vehicles.values())) if self.vehicles else "unknown, no service tells how"
-        counts = {"service": self.services, "source": self.sources, "vehicle": len(self.vehicles)}
-        shown = ", ".join(f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items())
-        return f"{shown}, newest message {newest} old"
-
-
-def _examine(bus: Bus, vehicle: str | None, expected: int | None, max_age: float, wanted: Expectation) -> _Report:
-    host = socket.gethostname()
-    anywhere = vehicle is not None or expected is not None or bool(wanted.expect) or wanted.vehicles is not None
-    found = [each for each in bus.services() if anywhere or each.host == host]
-    sources = [source for service in found for source in service.sources]
-    ages = _ages(sources)
-    denied = ""
-    if vehicle is not None:
-        # A status says what a service publishes, and not what a router lets through.
-        answers = [sample.latency for sample in bus.latest(ANY, vehicle=vehicle) if not sample.stored]
-        denied = _DENIED if vehicle in ages and not answers else ""
-        known = [ages[vehicle]] if vehicle in ages else [max(0.0, each) for each in answers if each is not None]
-        ages = {vehicle: min(known)} if answers and known else {}
-    report = _Report(None, len(found), len(sources), ages)
-    at = " or ".join(bus.routers)
-    refused = sorted({to_text(name, 64) for service in found for name in service.refused})
-    failed = [source for source in sources if source.state in {"retrying", "failed"}]
-    if expected is not None and len(found) < expected:
-        report.reason = f"{len(found)} of {expected} services answer at {at}"
-    elif not found and not anywhere:
-        report.reason = f"no service of {host} answers at {at}: --services 1 accepts those of other hosts"
-    elif refused and vehicle is None:
-        report.reason = f"the router refuses vehicle {', '.join(refused)[:300]}: do its access rules name it?"
-    elif failed and vehicle is None:
-        source = failed[0]
-        report.reason = f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
-    elif not ages and (vehicle is not None or not (wanted.expect or wanted.vehicles)):
-        states = ", ".join(f"{to_text(each.source, 60)} is {to_text(each.state, 20)}" for each in sources)
-        what = "no vehicle is published" if vehicle is None else f"vehicle {vehicle} is not published"
-        report.reason = f"{what}{denied or (f': {states[:300]}' if states else '')}"
-    elif ages and min(ages.values()) > max_age:
-        name = min(ages, key=lambda each: ages[each])
-        report.reason = f"the newest message is {to_age(ages[name])} old, from vehicle {name}: at most {max_age:g} s"
-    return report
+                if invalid:
+                    yield f"vehicle {sample.vehicle}: {', '.join(invalid)} not valid"
 
 
 def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:

@@ -9,11 +9,11 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CountOption, CsvOption, DurationOption, JsonOption, on_bus, require_one, selecting
+from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, command, require_one
 from nedbus.cli.output.streams import csv_line, write
-from nedbus.cli.output.table import LiveTable
+from nedbus.cli.output.table import live_table
 from nedbus.client import Bus, Health, Monitor, StreamState, describe_stream, stream_state, to_age
-from nedbus_msgs import ANY, DOUBT_FLAGS, Address, Selection
+from nedbus_msgs import DOUBT_FLAGS, Address, Selection
 
 _HEAD: Final = ("VEHICLE/TOPIC", "HZ", "JITTER", "LATENCY", "MAX", "LOST", "STATE")
 _OPTIONAL: Final = ("JITTER", "MAX", "LATENCY", "LOST")
@@ -26,11 +26,10 @@ _FORGET_AFTER: Final = 60.0  # s after which a stream that is gone is not shown 
 Stream = tuple[Address, Health, StreamState]
 
 
-@on_bus
-@selecting(ANY)
+@command
 def hz(
     bus: Bus,
-    selection: Selection,
+    selection: Selection = ALL,
     *,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
@@ -44,26 +43,25 @@ def hz(
     require_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
     written: dict[Address, tuple[int, str]] = {}
-    with bus.subscribe_to(selection, mode="every") as subscription, LiveTable(_HEAD, _OPTIONAL) as table:
+    with bus.subscribe_to(selection, mode="every") as subscription, live_table(_HEAD, _OPTIONAL) as show_table:
         if csv_output:
             write(csv_line(_CSV_HEAD))
 
         def show() -> None:
             streams = sorted(_states(bus, monitor), key=_severity)
             if not (json_output or csv_output):
-                table.show([_to_row(*each) for each in streams])
+                show_table([_to_row(*each) for each in streams])
                 return
             for address, health, state in streams:
-                if written.get(address) != (health.messages, state.name):
+                before, written[address] = written.get(address), (health.messages, state.name)
+                if before != written[address]:
                     write((_to_csv if csv_output else json.dumps)(_to_fields(address, health, state)))
-            written.clear()
-            written.update({address: (health.messages, state.name) for address, health, state in streams})
 
         follow(bus, subscription, monitor.add, count=count, duration=duration, each_second=show)
 
 
 def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
-    """Yield all streams with their states; forget what has been gone for a minute."""
+    """Yield all streams with their states; forget those that have been gone for a minute."""
     alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
     for address, health in monitor.snapshot().items():
         state = stream_state(health, alive=address in alive, connected=bus.connected)

@@ -13,61 +13,50 @@ import typer
 
 from nedbus import pki as certificates
 from nedbus.cli.options import JsonOption, command, require_one
-from nedbus.cli.output.streams import write, write_stderr
+from nedbus.cli.output.streams import counted, write, write_stderr
+from nedbus.cli.output.table import to_table
 from nedbus.errors import ConfigError, PkiError
 from nedbus.pki import CERTIFICATE_PREFIX, RENEW_WITHIN, certificate_name
 
 pki = typer.Typer(help="Make keys and certificates for tls/ endpoints.", no_args_is_help=True)
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the keys and certificates")]
-WithinOption = Annotated[int, typer.Option(min=0, help="What expires within these days is due")]
+WithinOption = Annotated[int, typer.Option(min=0, help="Certificates that expire within these days are due")]
 DaysOption = Annotated[int | None, typer.Option(min=1, help=f"Days until it expires (default: {certificates.DAYS})")]
 
 
-@pki.command()
 @command
 def ca(folder: FolderArgument) -> None:
     """Make the authority that signs everything else: ca.key, to be kept in private, and ca.crt, which all need."""
     _write_pair(certificates.make_authority(folder))
 
 
-@pki.command()
 @command
 def cert(
     folder: FolderArgument,
     name: Annotated[str, typer.Argument(metavar="NAME", help="router, vehicle-1, reader, operator, ...")],
     *,
-    host: Annotated[
-        list[str] | None,
-        typer.Option("--host", help="For a router: a name or address that clients connect to; repeatable"),
-    ] = None,
+    host: Annotated[list[str] | None, typer.Option(help="Name or address of a router; repeatable")] = None,
     days: DaysOption = None,
 ) -> None:
-    """Make NAME.key and NAME.crt; config/router-secure.json5 defines what each name may do."""
+    """Make NAME.key and NAME.crt; config/router-secure.json5 has the permissions of each name."""
     _write_pair(certificates.make_certificate(folder, name, hosts=host or (), days=days))
 
 
-@pki.command()
 @command
 def enroll(
     folder: FolderArgument,
     vehicle: Annotated[str, typer.Argument(metavar="VEHICLE", help="Its id, the second part of its keys")],
     *,
-    router: Annotated[
-        list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="Router to join; repeatable")
-    ],
+    router: Annotated[list[str], typer.Option("--router", "-r", metavar="tls/HOST:PORT", help="To join; repeatable")],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder to make (default: vehicle-VEHICLE)")
     ] = None,
-    source: Annotated[
-        list[str] | None, typer.Option("--source", "-s", help="What it publishes (default: to be filled in)")
-    ] = None,
-    target: Annotated[
-        Path | None, typer.Option("--target", help="Folder of these files on the vehicle (default: /etc/nedbus)")
-    ] = None,
+    source: Annotated[list[str] | None, typer.Option("--source", "-s", help="Default: to be filled in")] = None,
+    target: Annotated[Path | None, typer.Option(help="Folder on the vehicle (default: /etc/nedbus)")] = None,
     days: DaysOption = None,
 ) -> None:
-    """Make a bundle for a vehicle: certificate, key, nedbus.toml, compose.yml, and what to copy where."""
+    """Make a bundle for a vehicle: certificate, key, nedbus.toml, compose.yml, and a README.txt."""
     output = output or Path(certificate_name(vehicle))
     _write_paths(
         certificates.make_bundle(
@@ -77,7 +66,6 @@ def enroll(
     write_stderr(f"{output} has the vehicle's only key: copy it there, as its README.txt says, and remove it here")
 
 
-@pki.command("list")
 @command
 def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False) -> None:
     """Show all certificates of a folder, and their expiry."""
@@ -97,20 +85,17 @@ def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_jso
     if as_json:
         write(json.dumps(rows, indent=2))
         return
-    width = max(len("NAME"), *(len(row["name"]) for row in rows))
-    write(f"{'NAME':{width}}  {'USE':9}  {'UNTIL':10}  {'DAYS':>5}  STATE")
-    for row in rows:
-        hosts = f" ({', '.join(row['hosts'])})" if row["hosts"] else ""
-        write(f"{row['name']:{width}}  {row['use']:9}  {row['until']:.10}  {row['days_left']:5}  {row['state']}{hosts}")
+    cells = [
+        [row["name"], row["use"], row["until"][:10], str(row["days_left"]), ", ".join([row["state"], *row["hosts"]])]
+        for row in rows
+    ]
+    write(to_table(("NAME", "USE", "UNTIL", "DAYS", "STATE, HOSTS"), cells))
 
 
-@pki.command()
 @command
 def renew(
     folder: FolderArgument,
-    names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="These, due or not (default: all that are due)")
-    ] = None,
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Default: all that are due")] = None,
     *,
     within: WithinOption = RENEW_WITHIN,
     new_key: Annotated[bool, typer.Option("--new-key", help="With new keys, to be copied as well")] = False,
@@ -128,21 +113,15 @@ def renew(
     if chosen:
         write_stderr("copy these over the old ones; a router reads its certificate when it starts")
     else:
-        first = min(entries, key=lambda entry: entry.certificate.ends)
-        end = f"{first.name}, on {first.certificate.ends:%Y-%m-%d}"
-        write_stderr(f"nothing expires within {within} days; the first is {end}")
+        write_stderr(f"nothing expires within {within} days: 'nedbus pki list' shows all")
 
 
-@pki.command()
 @command
 def rules(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A router's file, such as config/router-secure.json5")],
     vehicles: Annotated[list[str] | None, typer.Argument(metavar="[VEHICLE]...", help="Ids of vehicles")] = None,
     *,
-    source: Annotated[
-        Path | None,
-        typer.Option("--from", help="A file with an id a line, - for standard input, or the folder of certificates"),
-    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="A file of ids, - for stdin, or a folder")] = None,
     add: Annotated[bool, typer.Option("--add", help="Keep the vehicles that the file names already")] = False,
     remove: Annotated[bool, typer.Option("--remove", help="Remove these, and keep the others")] = False,
     prefix: Annotated[str, typer.Option("--prefix", help="First chunks of every key")] = "nedbus",
@@ -158,11 +137,14 @@ def rules(
     if unknown := sorted(given - set(before)) if remove else []:
         raise ConfigError(str(file), f"it does not name vehicle {unknown[0]!r}")
     wanted = {*before, *given} if add else set(before) - given if remove else given
-    added, removed = certificates.write_access_rules(file, wanted, prefix=prefix)
-    for line in [*(f"+ {name}" for name in added), *(f"- {name}" for name in removed)]:
+    certificates.write_access_rules(file, wanted, prefix=prefix)
+    changes = [f"+ {name}" for name in sorted(wanted - {*before})] + [
+        f"- {name}" for name in sorted({*before} - wanted)
+    ]
+    for line in changes:
         write(line)
-    changed = "the router takes it when it starts again" if added or removed else "no change"
-    write_stderr(f"{file} names {len(wanted)} vehicle{'s' * (len(wanted) != 1)}: {changed}")
+    changed = "the router takes it when it starts again" if changes else "no change"
+    write_stderr(f"{file} names {counted(len(wanted), 'vehicle')}: {changed}")
 
 
 def _read_names(source: Path) -> list[str]:
@@ -189,3 +171,7 @@ def _write_paths(paths: list[Path]) -> None:
 def _write_pair(paths: list[Path]) -> None:
     _write_paths(paths)
     write_stderr(f"{paths[0]} is secret: only its owner can read it; do not copy it elsewhere")
+
+
+for _command in (ca, cert, enroll, list_, renew, rules):
+    pki.command(_command.__name__.rstrip("_"))(_command)

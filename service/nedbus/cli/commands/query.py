@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -11,10 +10,10 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from nedbus.cli.options import FieldOption, JsonOption, VehicleOption, on_bus, parse_fields, selecting
+from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption, command, parse_fields
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
-from nedbus.cli.output.table import terminal_width, to_table
+from nedbus.cli.output.table import fold, to_table
 from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
@@ -42,7 +41,7 @@ _MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a s
 _MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
 
 
-@on_bus
+@command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List the vehicles and topics that are published now, how old their last message is, and their state."""
     selection = Selection(ANY, vehicle)
@@ -62,23 +61,21 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         text = describe_stream(health, state) if health and state else "no answer"
         rows.append([str(address), "-" if age is None else to_age(age), f"stored, {text}" if is_stored else text])
     if rows and not json_output:
-        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows, width=terminal_width()))
+        write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = (
-            "a service answers, so see 'nedbus info'; with certificates, may it write, and may this client read?"
-            if bus.services()
-            else "start a source with 'nedbus serve'"
-        )
+        hint = "see 'nedbus info'; with certificates, may it write, and may this client read?"
+        hint = f"a service answers, so {hint}" if bus.services() else "start a source with 'nedbus serve'"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
 
 
-@on_bus
-@selecting(DEFAULT_TOPIC)
-def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_output: JsonOption = False) -> None:
+@command
+def get(
+    bus: Bus, selection: Selection = POSITIONS, *, field: FieldOption = None, json_output: JsonOption = False
+) -> None:
     """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
 
-    What only a storage kept is shown as such.
+    Messages that only a storage kept are marked.
     """
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
@@ -92,9 +89,9 @@ def get(bus: Bus, selection: Selection, *, field: FieldOption = None, json_outpu
         raise typer.Exit(1)
 
 
-@on_bus
+@command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services on this network: the state of their sources and streams, and what was rejected."""
+    """Show the services on this network: the state of their sources and streams, and rejected messages."""
     services = bus.services()
     vehicles = bus.vehicles()
     if json_output:
@@ -103,21 +100,20 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         return
     write(f"router    {' or '.join(bus.routers)}")
     write(f"vehicles  {to_text(', '.join(vehicles) or 'none', _MAX_VEHICLES)}")
-    width = terminal_width()
     for service in services[:_MAX_ROWS]:
         name, version, role = map(to_text, (service.service, service.version, service.role))
         write(f"\nservice {name}, nedbus {version}, as {role}")
         rows = [_source_row(source) for source in service.sources]
         if rows:
-            write(to_table(_SOURCE_HEAD, rows, width=width, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
+            write(to_table(_SOURCE_HEAD, rows, optional=_SOURCE_OPTIONAL, max_rows=_MAX_ROWS))
         for what, head in _ABSENT.items():
             if absent := [each for source in service.sources for each in getattr(source, what)]:
-                write(_fold_list(head, to_text(", ".join(absent), _MAX_VEHICLES), width))
+                write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
         if refused := service.refused:
-            write(_fold_list("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES), width))
+            write(fold("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]
         if streams:
-            table = to_table(_STREAM_HEAD, streams, width=width, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
+            table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
     if len(services) > _MAX_ROWS:
         write(f"{len(services) - _MAX_ROWS} services more")
@@ -125,18 +121,16 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         write_stderr("no nedbus service answers here")
 
 
-@on_bus
+@command
 def schema(
     open_bus: Callable[[], Bus],
-    message: Annotated[
-        str, typer.Argument(help="A message, such as VehicleAttitude, or one of its topics")
-    ] = DEFAULT_TOPIC,
+    message: Annotated[str, typer.Argument(help="A message, such as VehicleAttitude, or a topic")] = DEFAULT_TOPIC,
     *,
     layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False,
 ) -> None:
     """Print the JSON Schema of a message, or the layouts that can be read.
 
-    Of a topic whose message has no file here it is what its publisher says.
+    For a topic of an undeclared message, the publisher is asked.
     """
     try:
         definition: Definition[Any] = definition_of(message)
@@ -167,12 +161,6 @@ def _source_row(source: SourceStatus) -> list[str]:
     gone = len(source.stale)
     remark = source.error or (f"{gone} gone" if gone else "-")
     return [*map(to_text, (source.source, source.state, *numbers, remark))]
-
-
-def _fold_list(head: str, text: str, width: int | None) -> str:
-    if width is None:
-        return head + text
-    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +13,7 @@ import typer
 
 from nedbus import __version__
 from nedbus.cli.options import ConfigOption, PrefixOption, TlsCaOption, TlsCertificateOption, TlsKeyOption, command
-from nedbus.cli.output.progress import Display
+from nedbus.cli.output.progress import ProgressLog
 from nedbus.cli.run import run_until_stopped
 from nedbus.cli.systemd import Notifier
 from nedbus.daemon import Daemon
@@ -26,28 +26,22 @@ from nedbus.sources import SOURCE_KINDS
 from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
-from .check import report_mistakes
+from .doctor import report_mistakes
 
 _log = logging.getLogger("nedbus")
-_SOURCES = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
+_KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
+_SOURCES = f"{_KINDS}, with ?OPTION=VALUE&...; repeatable"
 
-ListenOption = Annotated[
-    list[str] | None,
-    typer.Option("--listen", "-l", metavar="ENDPOINT", help=f"Where the router listens (default: {DEFAULT_ENDPOINT})"),
-]
+_LISTEN = f"Address of the router (default: {DEFAULT_ENDPOINT})"
+ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
+JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join")]
 
 
 @command
 def serve(
     *,
-    source: Annotated[
-        list[str] | None,
-        typer.Option("--source", "-s", metavar="SOURCE", help=f"{_SOURCES}, with ?OPTION=VALUE&...; repeatable"),
-    ] = None,
-    connect: Annotated[
-        list[str] | None,
-        typer.Option("--connect", "-c", metavar="ENDPOINT", help="Join this router instead of being one"),
-    ] = None,
+    source: Annotated[list[str] | None, typer.Option("--source", "-s", metavar="SOURCE", help=_SOURCES)] = None,
+    connect: JoinOption = None,
     listen: ListenOption = None,
     router_config: Annotated[Path | None, typer.Option(help="JSON5 configuration of the embedded router")] = None,
     tls_ca: TlsCaOption = None,
@@ -56,37 +50,30 @@ def serve(
     prefix: PrefixOption = None,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
     http: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Serve /metrics, /healthz, /readyz, /vehicles and /status there"),
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status there")
     ] = None,
     until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
     config: ConfigOption = None,
-    check: Annotated[bool, typer.Option("--check", help="Only say all that is wrong with the settings")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Only report all mistakes in the settings")] = False,
 ) -> None:
     """Publish sources, validated; the service is a router itself unless it is to join one (--connect).
 
     SIGHUP reads the settings again: new sources start, those that are gone end, all others go on.
     """
-    given: dict[str, object] = {
-        "source": source, "connect": connect, "listen": listen,
-        "router_config": router_config, "tls_ca": tls_ca, "tls_certificate": tls_certificate, "tls_key": tls_key,
-        "prefix": prefix, "vehicle": vehicle, "http": http, "until_done": until_done,
-    }  # fmt: skip
+    given = {name: value for name, value in locals().items() if name not in {"config", "check"}}
     if check:
         report_mistakes(check_service(config, given))
         return
     settings = load_settings(config, **given)
     daemon = Daemon(settings, version=__version__)
-    if daemon.role == "router":
-        _log_refusals(daemon.endpoints)
-    with ExitStack() as closing:
-        if settings.http is not None:
-            closing.enter_context(serve_pages(settings.http, service_pages(daemon)))
-        notifier = closing.enter_context(Notifier(daemon))
-        display = closing.enter_context(Display(daemon))
+    if daemon.role == "router" and any(each.startswith("tls/") for each in daemon.endpoints):
+        log_refusals()
+    pages = serve_pages(settings.http, service_pages(daemon)) if settings.http is not None else nullcontext()
+    progress = ProgressLog(daemon)
+    with pages, Notifier(daemon) as notifier:
 
         def tick() -> None:
-            display.update()
+            progress.update()
             notifier.tick()
 
         def stop() -> None:
@@ -101,14 +88,8 @@ def serve(
         )
 
 
-def _log_refusals(endpoints: Sequence[str]) -> None:
-    """Log the clients that a router here refuses, if any of these endpoints asks for certificates."""
-    if any(endpoint.startswith("tls/") for endpoint in endpoints):
-        log_refusals()
-
-
 def _reload(daemon: Daemon, notifier: Notifier, config: Path | None, given: Mapping[str, object]) -> None:
-    """Read the settings again; what is wrong with them changes nothing."""
+    """Read the settings again; invalid ones change nothing."""
     try:
         with notifier.reloading():
             done = daemon.reload(load_settings(config, **given))
@@ -125,9 +106,7 @@ def router(
     ] = None,
     *,
     listen: ListenOption = None,
-    connect: Annotated[
-        list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Another router to join")
-    ] = None,
+    connect: JoinOption = None,
     tls_ca: TlsCaOption = None,
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
@@ -143,7 +122,8 @@ def router(
 
     def run(stop: threading.Event) -> None:
         where = router_endpoints(endpoints, config_file)
-        _log_refusals(where)
+        if any(each.startswith("tls/") for each in where):
+            log_refusals()
         session = open_router(listen=endpoints, connect=routers, config_file=config_file, tls=tls)
         joining = f", joining {', '.join(routers)}" if routers else ""
         _log.info("router on %s%s", ", ".join(where), joining, extra=about("router"))

@@ -19,25 +19,20 @@ BURST: Final = 50
 PER_MINUTE: Final = 6
 """Lines of one kind that are logged in each minute after that."""
 
-_MAX_KINDS: Final = 1000  # that are told apart; nedbus itself has about 40
-_LEFT_OUT: Final = "%d more lines like this one were left out: %s"
+_MAX_KINDS: Final = 1000  # nedbus itself has about 40
 
 Kind = tuple[str, str | None, str]
 """A logger, an event, and the text before the values were put in."""
 
-_OTHERS: Final[Kind] = ("", None, "")  # all kinds beyond the limit
-
 
 @dataclass(slots=True, eq=False)
 class _TokenBucket:
-    """The number of lines of one kind that may be logged now, the number left out, and what is kept of the first."""
+    """The number of lines of one kind that may be logged now, and the number left out since the last report."""
 
     filled: float
     tokens: float = BURST
     left_out: int = 0
-    first: Mapping[str, object] = field(default_factory=dict)  # no record: it may keep a traceback alive
-    first_text: str = ""
-    event: str | None = None
+    report: Mapping[str, object] = field(default_factory=dict)  # no record: it may keep a traceback alive
 
     def fill(self, now: float) -> bool:
         """Add the tokens of the time since the last call; return whether there is one."""
@@ -46,24 +41,23 @@ class _TokenBucket:
         return self.tokens >= 1
 
     def leave_out(self, record: logging.LogRecord) -> None:
-        """Count a line that is not logged."""
         if not self.left_out:
-            self.first = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname}
-            self.first_text, self.event = record.getMessage()[:MAX_TEXT], _event_of(record)
+            text = f"%d more lines like this one were left out: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+            self.report = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
         self.left_out += 1
 
-    def take_report(self) -> logging.LogRecord:
-        """Return a record with the number of lines that were left out; they count no more."""
+    def take_report(self, event: str | None) -> logging.LogRecord:
         count, self.left_out = self.left_out, 0
-        about = About("left-out", count=count, of=self.event)
-        return logging.makeLogRecord({**self.first, "msg": _LEFT_OUT, "args": (count, self.first_text), "about": about})
+        return logging.makeLogRecord(
+            {**self.report, "args": (count,), "about": About("left-out", count=count, of=event)}
+        )
 
 
 class RateLimit(logging.Filter):
     """Let a burst of each kind of record pass, then a few a minute.
 
     `handle` is the handler's: it gets a record with the number of lines left out, as soon as one could be logged again.
-    Records of events that are not limited pass always.
+    Records of events that are not limited always pass.
     """
 
     def __init__(
@@ -77,44 +71,36 @@ class RateLimit(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to log a record; before, log the number left out of each kind that may be logged again."""
+        now = self._now()
+        self._report(lambda bucket: bucket.fill(now))
+        about = about_of(record)
+        event = about.event if about else None
+        if event is not None and not EVENTS[event].limited:
+            return True
+        kind = record.name, event, str(record.msg)
         with self._lock:
-            now = self._now()
-            reports = [each.take_report() for each in self._buckets.values() if each.left_out and each.fill(now)]
-            passes = not _is_limited(record) or self._take_token(record, now)
-        for report in reports:
-            self._handle(report)
-        return passes
+            if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
+                kind = "", None, ""  # all others
+            bucket = self._buckets.setdefault(kind, _TokenBucket(now))
+            if not bucket.fill(now):
+                bucket.leave_out(record)
+                return False
+            bucket.tokens -= 1
+            return True
 
     def flush(self) -> None:
         """Log the numbers of lines left out so far."""
+        self._report(lambda _: True)
+
+    def _report(self, is_due: Callable[[_TokenBucket], bool]) -> None:
         with self._lock:
-            reports = [each.take_report() for each in self._buckets.values() if each.left_out]
+            due = [(kind, each) for kind, each in self._buckets.items() if each.left_out and is_due(each)]
+            reports = [bucket.take_report(event) for (_, event, _), bucket in due]
         for report in reports:
             self._handle(report)
 
-    def _take_token(self, record: logging.LogRecord, now: float) -> bool:
-        kind = record.name, _event_of(record), str(record.msg)
-        if kind not in self._buckets and len(self._buckets) >= _MAX_KINDS:
-            kind = _OTHERS
-        bucket = self._buckets.setdefault(kind, _TokenBucket(now))
-        if not bucket.fill(now):
-            bucket.leave_out(record)
-            return False
-        bucket.tokens -= 1
-        return True
-
 
 def about_of(record: logging.LogRecord) -> About | None:
-    """Return what a log call says besides its text; None for those of other packages."""
+    """Return the facts of a log call besides its text; None for those of other packages."""
     about = getattr(record, "about", None)
     return about if isinstance(about, About) else None
-
-
-def _event_of(record: logging.LogRecord) -> str | None:
-    about = about_of(record)
-    return about.event if about else None
-
-
-def _is_limited(record: logging.LogRecord) -> bool:
-    event = EVENTS.get(_event_of(record) or "")
-    return event is None or event.limited

@@ -1,4 +1,4 @@
-"""The log on stderr: text for people, priorities for the journal, JSON for programs, or above a live display."""
+"""The log on stderr: text for people, priorities for the journal, JSON for programs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,13 @@ import sys
 import threading
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal, TextIO
 
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
 from .log_limit import RateLimit, about_of
 from .streams import FOR_PROGRAMS, MAX_TEXT, printable, to_text
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
@@ -53,7 +50,7 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(TextFormatter):
-    """Format a record as one JSON object on one line; what is not known has no key."""
+    """Format a record as one JSON object on one line; unknown facts have no key. python-json-logger is longer."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the object."""
@@ -87,35 +84,30 @@ class JournalFormatter(logging.Formatter):
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
 
 
+class _StderrHandler(logging.StreamHandler[TextIO]):
+    """Write to `sys.stderr` as it is at the moment: a live table replaces it, to stay below the log."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.setStream(sys.stderr)
+        super().emit(record)
+
+
 def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
     """Log to stderr, a line for each record; with priorities where that is the journal."""
     is_journal, is_json = _is_journal(), log_format == "json"
     formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
-    handler = logging.StreamHandler(sys.stderr)
+    handler = _StderrHandler()
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
     if is_journal or is_json:
         handler.name = FOR_PROGRAMS
         _log_uncaught_errors()
-    _install(handler)
-    number = logging.getLevelNamesMapping()[level.upper()]
-    logging.getLogger("nedbus").setLevel(number)
-    logging.getLogger().setLevel(max(number, logging.WARNING))
-
-
-def log_to(console: Console) -> None:
-    """Log to the terminal on which something is redrawn in place, above it."""
-    from rich.logging import RichHandler
-
-    handler = RichHandler(console=console, show_path=False, log_time_format=_DATE)
-    handler.setFormatter(TextFormatter("%(message)s"))
-    _install(handler)
-
-
-def _install(handler: logging.Handler) -> None:
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
     atexit.register(limit.flush)
     logging.basicConfig(handlers=[handler], force=True)
+    number = logging.getLevelNamesMapping()[level.upper()]
+    logging.getLogger("nedbus").setLevel(number)
+    logging.getLogger().setLevel(max(number, logging.WARNING))
 
 
 def _is_journal() -> bool:

@@ -35,10 +35,15 @@ def printable(text: str) -> str:
 
 
 def to_text(value: object, limit: int = _MAX_CELL) -> str:
-    """Return what some peer sent as one line of at most `limit` characters, all of them printable."""
+    """Return a peer's text as one line of at most `limit` characters, all of them printable."""
     text = str(value)
     short = text if len(text) <= limit else f"{text[: limit - 3]}..."
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: 1 source, 2 sources."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def csv_line(cells: Iterable[object]) -> str:

@@ -1,26 +1,25 @@
-"""Tables that fit the width of a terminal, once or redrawn in place; elsewhere they are written as they are."""
+"""Tables that rich fits into a terminal, printed once or redrawn in place; elsewhere nothing is folded or left out."""
 
 from __future__ import annotations
 
+import io
 import os
-import re
 import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Sequence
-from itertools import zip_longest
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Final, Literal
 
-from .logs import log_to
 from .streams import write
-
-if TYPE_CHECKING:
-    from rich.live import Live
 
 COLUMN_GAP: Final = "  "
 _READABLE: Final = 16  # characters of the last column, for which others are left out
-_MAX_ROWS: Final = 50
+_MAX_ROWS: Final = 50  # of a table that is redrawn
+_UNLIMITED: Final = 10_000  # columns, where stdout is no terminal
+
+Rows = Sequence[Sequence[str]]
 
 
 def terminal_width() -> int | None:
@@ -29,96 +28,77 @@ def terminal_width() -> int | None:
     return shutil.get_terminal_size().columns if is_terminal else None
 
 
-class _Wrapper(textwrap.TextWrapper):
-    """Break lines at spaces, and behind slashes and underscores."""
+def fold(head: str, text: str) -> str:
+    """Return a line; on a terminal its text is folded, and its further lines are indented like the first."""
+    width = terminal_width()
+    if width is None:
+        return head + text
+    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False)
 
-    wordsep_simple_re = re.compile(r"(\s+|(?<=[/_]))")
+
+def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) -> list[str]:
+    """Return the columns that fit into a width; the others are left out in the order of `optional`."""
+    kept = list(widths)
+    for name in optional:
+        if _width_of(kept, widths) <= width:
+            break
+        if name in kept:
+            kept.remove(name)
+    return kept
 
 
-def to_table(
-    head: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    width: int | None = None,
-    optional: Sequence[str] = (),
-    max_rows: int | None = None,
-) -> str:
+def _width_of(columns: Sequence[str], widths: Mapping[str, int]) -> int:
+    return sum(widths[name] for name in columns) + len(COLUMN_GAP) * (len(columns) - 1)
+
+
+def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), max_rows: int | None = None) -> str:
     """Return rows in columns: the first and the last one are text, aligned to the left, the others numbers.
 
-    In a `width` that is too small columns are left out, in the order of `optional`, and then text is wrapped.
+    A terminal that is too narrow shows no columns that are `optional`, in this order, and then folds text.
     A last line has the number of rows beyond `max_rows`.
     """
-    more = 0 if max_rows is None else len(rows) - max_rows
-    rows = rows[:max_rows]
-    widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
-    kept = list(range(len(head)))
-    last = kept[-1]
-    if width is not None:
-        for omitted in range(len(optional) + 1):
-            kept = [column for column, name in enumerate(head) if name not in optional[:omitted]]
-            spare = width - sum(widths[column] for column in kept[1:-1]) - len(COLUMN_GAP) * (len(kept) - 1)
-            if spare >= widths[0] + min(widths[last], _READABLE):
-                break
-        widths[last] = min(widths[last], max(spare - widths[0], min(_READABLE, spare // 2)))
-        widths[0] = min(widths[0], spare - widths[last])
-    lines = []
-    for row in (head, *rows):
-        cells = [_wrap(row[column], widths[column]) for column in kept]
-        for parts in zip_longest(*cells, fillvalue=""):
-            padded = (
-                part.ljust(widths[column]) if column in {0, last} else part.rjust(widths[column])
-                for column, part in zip(kept, parts, strict=True)
-            )
-            lines.append(COLUMN_GAP.join(padded).rstrip())
-    return "\n".join([*lines, f"{more} more"] if more > 0 else lines)
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
+    first, last = head[0], head[-1]
+    widths = {name: max(len(name), *map(len, cells)) for name, *cells in zip(head, *shown, strict=True)}
+    widths[last] = min(widths[last], _READABLE)
+    kept = fit_columns(widths, optional, width)
+    folded = (last,) if _width_of(kept, widths) <= width else (first, last)
+    table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
+    for name in kept:
+        justify: Literal["left", "right"] = "left" if name in (first, last) else "right"
+        table.add_column(name, justify=justify, no_wrap=name not in folded, overflow="fold")
+    for row in shown:
+        table.add_row(*(Text(cell) for name, cell in zip(head, row, strict=True) if name in kept))
+    drawn = io.StringIO()
+    Console(file=drawn, width=width, color_system=None).print(table)
+    lines = [line.rstrip() for line in drawn.getvalue().splitlines()]
+    return "\n".join([*lines, f"{len(rows) - len(shown)} more"] if len(rows) > len(shown) else lines)
 
 
-def _wrap(text: str, width: int) -> list[str]:
-    return _Wrapper(max(1, width), break_on_hyphens=False).wrap(text) if len(text) > width else [text]
+@contextmanager
+def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
+    """Yield a function that shows the rows that fit; on a terminal in place of the last ones, below the log."""
+    if terminal_width() is None:
+        yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=_MAX_ROWS))
+        return
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
 
+    def show(rows: Rows) -> None:
+        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # beside the head and the rest's number
+        text = to_table(head, rows, optional=optional, max_rows=most)
+        live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
-class LiveTable:
-    """Show a table again and again; `optional` are the columns that a narrow terminal leaves out, in that order."""
-
-    def __init__(self, head: Sequence[str], optional: Sequence[str]) -> None:
-        self._head = head
-        self._optional = optional
-        self._live: Live | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._live is None:
-            return
-        try:
-            self._live.stop()
-        except IndexError:  # a signal came while it started
-            self._live.console.show_cursor()
-
-    def show(self, rows: Sequence[Sequence[str]]) -> None:
-        """Show these rows, the first 50 at most, and on a terminal no more than it has lines."""
-        width = terminal_width()
-        height = shutil.get_terminal_size().lines - 1
-        for count in range(_MAX_ROWS if width is None else max(1, min(_MAX_ROWS, len(rows), height)), 0, -1):
-            text = to_table(self._head, rows, width=width, optional=self._optional, max_rows=count)
-            if width is None or text.count("\n") < height:  # else with fewer: rows that are wrapped have several lines
-                break
-        if width is None:
-            write(text)
-            return
-        from rich.text import Text
-
-        self._start().update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
-
-    def _start(self) -> Live:
-        if self._live is None:
-            from rich.console import Console
-            from rich.live import Live
-
-            # The cursor is hidden from the start to the stop, which a signal must not leave out.
-            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-            self._live = Live(console=Console(), auto_refresh=False, vertical_overflow="crop")
-            log_to(self._live.console)
-            self._live.start()
-        return self._live
+    console = Console()
+    live = Live(console=console, auto_refresh=False, vertical_overflow="crop", redirect_stderr=sys.stderr.isatty())
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        with live:
+            yield show
+    finally:
+        console.show_cursor()  # also if a signal came while it was being hidden

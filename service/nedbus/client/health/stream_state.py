@@ -58,7 +58,7 @@ def stream_state(health: Health, *, alive: bool | None = None, connected: bool =
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
-    """Return what is wrong with a stream: its state, its flags, and its gaps, order and reboots; "ok" if nothing is."""
+    """Return the faults of a stream: its state, its flags, and its gaps, order and reboots; "ok" without any."""
     doubts = describe_flags(health.flags) if health.flags else "ok"
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
     events = [f"{count} {name}" for count, name in counts if count]

@@ -21,11 +21,11 @@ from nedbus_msgs import ANY, Address, get_topic
 from .writer import Heartbeats, Writer, priority_of
 
 _CACHE: Final = 20  # s of messages that are kept for readers that missed some
-_LINGER: Final = 60_000_000_000  # ns for which readers that are gone may come back, and get what they missed
+_LINGER: Final = 60_000_000_000  # ns in which readers may come back, and recover missed messages
 
 
 class MatchingListener:
-    """Follow whether a key expression has subscribers: by a publisher that publishes nothing. Thread-safe."""
+    """Follow the presence of subscribers of a key expression, with a publisher that publishes nothing. Thread-safe."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
         channel: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
@@ -37,7 +37,7 @@ class MatchingListener:
         self._take = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
-        """Return whether there are subscribers, as far as Zenoh has told."""
+        """Return whether there are subscribers, as far as Zenoh has reported."""
         with self._lock:
             try:
                 if (status := self._take()) is not None:
@@ -47,7 +47,7 @@ class MatchingListener:
             return self._matched
 
     def close(self) -> None:
-        """Follow it no more."""
+        """Stop following it."""
         with suppress(zenoh.ZError):  # closed already with the session
             self._listener.undeclare()
             self._probe.undeclare()

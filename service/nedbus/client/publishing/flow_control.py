@@ -139,7 +139,7 @@ class FlowControl:
         """Wait until readers have all messages; return False if one has not within `timeout` s; raise ClosedError."""
         with self._lock:
             if self._request is not None and self._request.read:
-                self._request, self._ask_at = None, 0.0  # what has arrived is known sooner than what is read
+                self._request, self._ask_at = None, 0.0  # arrival is acknowledged sooner than reading
             self._acknowledged[False] = 0  # which readers there are may have changed
         return not published or self._wait(published, 1, read=False, timeout=timeout)
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from .publisher_registry import PublisherRegistry
 
-FLUSH_TIMEOUT: Final = 600.0  # s that readers have to take what was sent to them
+FLUSH_TIMEOUT: Final = 600.0  # s that readers have to receive the messages sent to them
 
 
 class Publisher:
@@ -122,10 +122,10 @@ class Publisher:
             self._put(payloads[start : start + size], self._all)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
-        """Wait until all readers of mode "every" have what was published; return False if one has not in time.
+        """Wait until all readers of mode "every" have all messages; return False if one has not in time.
 
-        What is still in transit to a slow reader when a publisher's process ends is lost, and not counted anywhere.
-        A reader that was disconnected learns how much it missed, and is sent again what is still kept.
+        Messages in transit to a slow reader when a publisher's process ends are lost, and not counted anywhere.
+        A reader that was disconnected learns the number of missed messages, and recovers those still kept.
 
         Raises ClosedError once the bus is closed.
         """

@@ -7,7 +7,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from contextlib import ExitStack
 from typing import Any, Final, cast
 
 import zenoh
@@ -23,13 +23,13 @@ from nedbus_msgs import ANY, BY_TOPIC, Address, AddressError, Definition, Select
 from .downsampler import MatchingListener
 from .flow_control import SharedWindow
 from .publisher import FLUSH_TIMEOUT, Publisher
-from .query_server import JSON, Answer, QueryServer, Reply
+from .query_server import JSON, QueryServer, Reply
 from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-_TOKENS_TIMEOUT: Final = 2.0  # s for a router that is slow to say which publishers it knows; it takes milliseconds
-_FLUSH_LOOK: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
+_TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to list its publishers; it takes milliseconds
+_FLUSH_POLL: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
 
 
 class PublisherRegistry:
@@ -46,8 +46,7 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries, self._housekeeping = session, queries, housekeeping
         self._publishers: dict[Address, Publisher] = {}
-        self._vehicles: set[str] = set()  # whose queries are answered
-        self._described: set[str] = set()  # names of messages whose schema is answered
+        self._answered: set[str] = set()  # keys of schemas and of vehicles, whose queries are answered
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
         self._lock = threading.Lock()
 
@@ -71,7 +70,7 @@ class PublisherRegistry:
         """
         definition = definition or BY_TOPIC.get(address.topic)
         if definition is None:
-            expected = f"one of {', '.join(BY_TOPIC)}: nothing here says what its message is"
+            expected = f"one of {', '.join(BY_TOPIC)}: its message is not known here"
             raise AddressError("topic", address.topic, expected)
         with self._lock:
             if address in self._publishers:
@@ -84,15 +83,14 @@ class PublisherRegistry:
             publisher = self._publishers[address] = Publisher(
                 address, definition, registry=self, matched=matched, lossless=lossless, source=source, owner=owner
             )
-            if definition.name not in self._described:
-                self._described.add(definition.name)
-                key = schema_key(definition.name, prefix=self.prefix)
-                self._queries.answer_json(key, partial(schema_of, definition))
-            if not self._vehicles:
+            if not self._answered:
                 self._housekeeping.add(self.heartbeats.send_due)
-            if vehicle not in self._vehicles:
-                self._vehicles.add(vehicle)
-                self._queries.answer(f"{self.prefix}/{vehicle}/**", _weakly(self._last_messages, vehicle))
+            schema, messages = schema_key(definition.name, prefix=self.prefix), f"{self.prefix}/{vehicle}/**"
+            if schema not in self._answered:
+                self._queries.answer_json(schema, lambda _: schema_of(definition))
+            if messages not in self._answered:
+                self._queries.answer(messages, _weakly(self._reply, vehicle))
+            self._answered |= {schema, messages}
         return publisher
 
     def is_published(self, address: Address) -> bool:
@@ -100,7 +98,7 @@ class PublisherRegistry:
         return address in self._publishers
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
-        """Publish why a message of this address was rejected; what JSON cannot hold is written as text."""
+        """Report the rejection of a message of this address; values that JSON cannot hold become text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
@@ -111,20 +109,18 @@ class PublisherRegistry:
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return whether there is a subscriber for any of these addresses."""
-        probes = [self._session.declare_publisher(address.key(prefix=self.prefix)) for address in addresses]
-        try:
+        with ExitStack() as opened:
+            keys = (address.key(prefix=self.prefix) for address in addresses)
+            probes = [opened.enter_context(self._session.declare_publisher(key)) for key in keys]
             # Zenoh's stubs call the status a bool; it is an object, always true.
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
-        finally:
-            for probe in probes:
-                probe.undeclare()
 
     def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
-        """Wait until the readers of these have what was published, or `stop` is set; for 10 minutes at most."""
+        """Wait until readers have all messages of these publishers, or `stop` is set; for 10 minutes at most."""
         end = time.monotonic() + FLUSH_TIMEOUT
         for publisher in publishers:
             address, logged = publisher.address, False
-            while not publisher.flush(_FLUSH_LOOK):
+            while not publisher.flush(_FLUSH_POLL):
                 if (stop and stop.is_set()) or time.monotonic() > end:
                     _log.warning("%s: a reader does not have all of it", address, extra=about("slow-reader", address))
                     return
@@ -139,15 +135,16 @@ class PublisherRegistry:
             if not any(each.vehicle == address.vehicle for each in self._publishers):
                 self._matched.pop(address.vehicle).close()
 
-    def _last_messages(self, vehicle: str, query: zenoh.Query) -> Iterable[Answer]:
+    def _reply(self, vehicle: str, query: zenoh.Query) -> None:
+        """Reply with the last messages of a vehicle."""
         for publisher in self.publishers:
             is_asked = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
             if is_asked and publisher.last is not None:
                 payload, stamp, encoding = publisher.last
-                yield Answer(publisher.key, payload, encoding, stamp, LIVE)
+                query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
 
 
-def _weakly(last_messages: Callable[[str, zenoh.Query], Iterable[Answer]], vehicle: str) -> Reply:
-    """Return an answer that does not keep the registry, its publishers and their bus alive."""
-    method = weakref.WeakMethod(last_messages)
-    return lambda query: alive(vehicle, query) if (alive := method()) is not None else ()
+def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:
+    """Return a reply that does not keep the registry, its publishers and their bus alive."""
+    method = weakref.WeakMethod(reply)
+    return lambda query: alive(vehicle, query) if (alive := method()) is not None else None

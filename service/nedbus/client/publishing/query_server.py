@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -25,19 +24,8 @@ _BUSY: Final = 1.0  # s
 JSON: Final = "application/json"
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """One reply to a query."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    stamp: zenoh.Timestamp | None = None
-    attachment: bytes | None = None
-
-
-Reply = Callable[[zenoh.Query], Iterable[Answer]]
-"""Answer a query; it must not refer to the owner of the server, which may be dropped without a close."""
+Reply = Callable[[zenoh.Query], object]
+"""Reply to a query; it must not refer to the owner of the server, which may be dropped without a close."""
 
 
 class QueryServer:
@@ -49,7 +37,7 @@ class QueryServer:
         self._thread = Housekeeping(name="nedbus-queries")
 
     def answer(self, key_expr: str, reply: Reply) -> None:
-        """Answer queries on a key expression with what `reply` returns; raise ClosedError once it is closed."""
+        """Call `reply` for each query on a key expression; raise ClosedError once it is closed."""
         channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
             queryable = self._session.declare_queryable(key_expr, channel)
@@ -68,22 +56,9 @@ class QueryServer:
 
         self._thread.add(poll)
 
-    def answer_json(
-        self, key: str, content: Callable[[], Mapping[str, object]],
-        **instead: Callable[[str], Mapping[str, object]],
-    ) -> None:  # fmt: skip
-        """Answer queries on a key with a JSON document, made anew for each.
-
-        `instead`: what is answered to a query with this parameter, given its value.
-        """
-
-        def reply(query: zenoh.Query) -> list[Answer]:
-            given = query.parameters
-            asked = next((name for name in instead if name in given), None)
-            document = content() if asked is None else instead[asked](given.get(asked) or "")
-            return [Answer(key, json.dumps(document).encode(), JSON)]
-
-        self.answer(key, reply)
+    def answer_json(self, key: str, content: Callable[[Callable[[str], str | None]], Mapping[str, object]]) -> None:
+        """Answer queries on a key with a JSON document, made for each; `content` gets its parameters by name."""
+        self.answer(key, lambda query: query.reply(key, json.dumps(content(query.parameters.get)), encoding=JSON))
 
     def close(self) -> None:
         """Stop answering."""
@@ -97,10 +72,7 @@ def _answer(query: zenoh.Query, reply: Reply) -> None:
     key_expr = str(query.key_expr)  # a query that has ended does not tell it any more
     try:
         with query:
-            for each in reply(query):
-                query.reply(
-                    each.key, each.payload, encoding=each.encoding, timestamp=each.stamp, attachment=each.attachment
-                )
+            reply(query)
     except zenoh.ZError as exc:
         _log.debug("a query on %s could not be answered: %s", key_expr, exc)
     except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without

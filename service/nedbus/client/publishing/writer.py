@@ -15,9 +15,9 @@ from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payl
 from nedbus_msgs import Topic
 
 _PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and before those that follow it
-_LOOK, _IDLE = 0.1, 0.5  # s between two looks: while messages are published, and otherwise
+_POLL, _IDLE = 0.1, 0.5  # s between two polls: while messages are published, and otherwise
 _TURN: Final = 256  # heartbeats at once, as a job of housekeeping must not hold up the others
-HEARTBEAT: Final = _PAUSES[0] + _LOOK
+HEARTBEAT: Final = _PAUSES[0] + _POLL
 """Seconds after which a reader learns that it missed the newest message, of a stream that went on until then."""
 
 
@@ -93,7 +93,7 @@ class Heartbeats:
         self._silences.pop(writer, None)
 
     def send_due(self, now: float) -> float:
-        """Send what is due at this time, in monotonic seconds; return the seconds until the next look."""
+        """Send the heartbeats that are due at this monotonic time [s]; return the seconds until the next call."""
         pause, left = _IDLE, _TURN
         for writer, silence in tuple(self._silences.items()):
             if silence.published != writer.published:
@@ -104,7 +104,7 @@ class Heartbeats:
                     silence.publisher.put(heartbeat_payload(silence.published))
                 silence.sent += 1
                 silence.due = now + _PAUSES[min(silence.sent, len(_PAUSES) - 1)]
-            pause = min(pause, silence.due - now, _IDLE if silence.sent else _LOOK)
+            pause = min(pause, silence.due - now, _IDLE if silence.sent else _POLL)
         return pause
 
 

@@ -93,7 +93,7 @@ class Decoder:
         self._counting = threading.Lock()  # the receiving and the reading thread both reject
 
     def stream(self, key: str) -> KeyState:
-        """Return the state of a key; raise AddressError for one that is none of ours."""
+        """Return the state of a key; raise AddressError for one without an address."""
         stream = self._streams.get(key)
         if stream is None:
             from_key = Address.from_rate_key if "/@" in key else Address.from_key  # only with a max_rate
@@ -109,9 +109,7 @@ class Decoder:
         """Ask for unknown messages and layouts of these, and wait for the answer: not for a thread that receives."""
         for raw in batch:
             with suppress(AddressError, DecodeError):
-                stream, payload = self.stream(str(raw.key_expr)), raw.payload.to_bytes()
-                if len(payload) != stream.size:
-                    self._inspect(stream, payload, raw)
+                self._inspect(self.stream(str(raw.key_expr)), raw.payload.to_bytes(), raw)
         self._layouts.wait()
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
@@ -165,10 +163,11 @@ class Decoder:
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
         """Return the sample of what arrived, with a Row as its message if `rows`; None if it is invalid."""
         stream, payload, raw, _ = arrival
+        if not payload:
+            return None
         codec = stream.codec or self.resolve(stream)
-        if codec is None or not payload:
-            if payload:
-                self.reject(stream.key, DecodeError("no publisher has said what it is", stream.message))
+        if codec is None:
+            self.reject(stream.key, DecodeError("no publisher has described it", stream.message))
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -220,7 +219,7 @@ class Decoder:
         if stream.codec is None:
             stream.message = message_name_of(str(raw.encoding)) or ""
             if not stream.message:
-                raise DecodeError(f"nothing says which message it is: its encoding is {str(raw.encoding)!r:.100}")
+                raise DecodeError(f"it does not name its message: its encoding is {str(raw.encoding)!r:.100}")
             with suppress(DecodeError):  # it is decoded when it is read: by then it may be known
                 stream.carry(codec_of(self._layouts.definition(stream.message)))
         if len(payload) != stream.size and stream.codec:

@@ -56,7 +56,7 @@ class LayoutLookup:
         found = MESSAGES.get(name) or self._defined.get(name)
         if found is None:
             self._ask(name, None)
-            raise DecodeError(f"no publisher has said so far what a {name} is", name)
+            raise DecodeError(f"no publisher has described a {name} so far", name)
         return found
 
     def check(self, codec: Codec[Any], payload: bytes) -> None:

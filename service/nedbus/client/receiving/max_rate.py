@@ -1,8 +1,6 @@
-"""A subscription with a maximum rate: downsampled streams, and at full rate those whose publishers do not downsample.
+"""A subscription with a maximum rate: streams that their publishers downsample, begun with their last messages.
 
-A stream from which nothing downsampled has come for 3 s (its publisher cannot, or access rules forbid it) is read at
-full rate by its exact key, and downsampled here, until something downsampled comes. Such a stream has no account: what
-is missing of it is neither lost nor recovered.
+A stream whose publisher does not downsample is never read at full rate, as the link may not carry it: the log names it.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 import zenoh
@@ -23,32 +20,21 @@ from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
-from nedbus.transport import AliveTokens, RawSample, Session, ask, while_open
-from nedbus_msgs import ANY, AddressError, Selection, address_of_alive_key
+from nedbus.transport import AliveTokens, RawSample, Session, ask
+from nedbus_msgs import AddressError, Selection, address_of_alive_key, get_topic
 
 from .decoder import MAX_KEYS, Arrival, Decoder
 from .pending_queue import PendingQueue
-from .receiver import Receiver, drain
+from .receiver import Receiver
 
 _log = logging.getLogger(__name__)
 
-DOWNSAMPLED_TIMEOUT: Final = 3.0
-"""Seconds from the liveliness token of a stream on, after which it is read at full rate."""
+DOWNSAMPLED_TIMEOUT: Final = 10.0
+"""Seconds from the liveliness token of a stream on, after which it is named if nothing downsampled has come of it."""
 
 _TIMEOUT: Final = 2.0  # s for the last messages, and for all liveliness tokens
-_FULL_RATE_POLL: Final = 0.02  # s between two looks at streams that are read at full rate
-_FULL_RATE_RING: Final = 4096  # samples of one of these that may arrive until then
-_OVERTAKEN: Final = 2_000_000_000  # ns by which a downsampled message is older than one at full rate that overtook it
-
-
-@dataclass(slots=True, eq=False)
-class _StreamRate:
-    """State of one stream. `full_rate_sent`: when the last message that passed at full rate was sent [ns]."""
-
-    gate: RateGate
-    alive_since: float = math.inf  # s
-    is_downsampled: bool = False  # by its publisher
-    full_rate_sent: float = -math.inf
+_LAST_POLL: Final = 0.02  # s between two polls for last messages
+_OVERTAKEN: Final = 2_000_000_000  # ns by which a downsampled message is older than a last message that overtook it
 
 
 class MaxRateQueue(PendingQueue):
@@ -61,50 +47,39 @@ class MaxRateQueue(PendingQueue):
         super().__init__(mode, decoder, name=name)
         check_max_rate(max_rate)
         self.rate = rate_step(max_rate)  # requested of publishers
+        self.downsampled: dict[str, RateGate] = {}
+        """By key, the streams of which a downsampled message has come."""
         self._max_rate = max_rate
-        self._rates: dict[str, _StreamRate] = {}  # by key
+        self._last_sent: dict[str, float] = {}  # when the last message was sent [ns], by key
 
-    def put_full_rate(self, batch: Sequence[RawSample]) -> None:
-        """Queue messages of streams that do not come downsampled, as far as they are due."""
+    def put_last(self, batch: Sequence[RawSample]) -> None:
+        """Queue the last message of each stream of which nothing has come so far."""
         arrivals = self._decoder.admit(batch)
-        now = time.monotonic_ns()
         with self._lock:
             for arrival in arrivals:
-                rate = self._rate(arrival[0].key)
-                if arrival[1] and not rate.is_downsampled and rate.gate.passes(now):
-                    rate.full_rate_sent = _sent(arrival)
+                key = arrival[0].key
+                if arrival[1] and not (key in self.downsampled or key in self._last_sent):
+                    if len(self._last_sent) < MAX_KEYS:
+                        self._last_sent[key] = _sent(arrival)
                     super()._queue([arrival])
         self.wake()
-
-    def on_token(self, key: str, now: float, *, alive: bool) -> None:
-        """Note that a stream has a publisher, or forget it: the next one may downsample, or not."""
-        if not alive:
-            self._rates.pop(key, None)
-        elif (rate := self._rate(key)).alive_since > now:
-            rate.alive_since = now
-
-    def full_rate_keys(self, now: float) -> set[str]:
-        """Return the keys of streams to be read at full rate: alive for a while, and not downsampled."""
-        known = list(self._rates.items())  # at once: another thread adds to them
-        return {key for key, each in known if not each.is_downsampled and now - each.alive_since >= DOWNSAMPLED_TIMEOUT}
 
     def _queue(self, arrivals: Sequence[Arrival]) -> None:
         super()._queue([arrival for arrival in arrivals if self._passes(arrival)])
 
     def _passes(self, arrival: Arrival) -> bool:
-        """Return whether a downsampled message passes; one at full rate, such as the last one, may be newer."""
-        rate = self._rate(arrival[0].key)
-        rate.is_downsampled = True
-        passes = not 0 <= rate.full_rate_sent - _sent(arrival) <= _OVERTAKEN
+        stream = arrival[0]
+        gate = self.downsampled.get(stream.key)
+        if gate is None:
+            gate = RateGate(self._max_rate)
+            if len(self.downsampled) < MAX_KEYS:
+                self.downsampled[stream.key] = gate
+        passes = not 0 <= self._last_sent.get(stream.key, -math.inf) - _sent(arrival) <= _OVERTAKEN
         if self.rate > self._max_rate:  # below the least rate of publishers
-            passes = passes and rate.gate.passes(time.monotonic_ns())
+            passes = passes and gate.passes(time.monotonic_ns())
         if not passes:
-            arrival[0].unreported += arrival[3]
+            stream.unreported += arrival[3]
         return passes
-
-    def _rate(self, key: str) -> _StreamRate:
-        known = self._rates.get(key) or _StreamRate(RateGate(self._max_rate))
-        return self._rates.setdefault(key, known) if len(self._rates) < MAX_KEYS else known
 
 
 class MaxRateReceiver(Receiver):
@@ -113,13 +88,14 @@ class MaxRateReceiver(Receiver):
     def __init__(
         self, session: Session, selection: Selection, queue: MaxRateQueue, *, prefix: str, housekeeping: Housekeeping
     ) -> None:
-        self._prefix, self._rate_queue, self._warned = prefix, queue, False
-        self._full_rate: dict[str, zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]] = {}
-        self._key_expr = selection.key_expr(prefix=prefix)
+        self._prefix, self._rate_queue = prefix, queue
+        self._unheard: dict[str, float] = {}  # when liveliness tokens appeared [s], by key
         self._tokens = AliveTokens(session, selection.alive_key_expr(prefix=prefix))
-        self._last = ask(session, self._key_expr, timeout=_TIMEOUT)  # downsampling begins with the next message
+        self._last = ask(session, selection.key_expr(prefix=prefix), timeout=_TIMEOUT)
         rate_key_expr = selection.rate_key_expr(queue.rate, prefix=prefix)
-        super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, downsampled=True)
+        super().__init__(session, rate_key_expr, queue, housekeeping=housekeeping, history=False)
+        self._undeclares.append(self._tokens.undeclare)
+        self.pump()  # last messages pass by the ring, for which a reader would wait
 
     def _keep_house(self, now: float) -> float:
         pause = super()._keep_house(now)
@@ -127,39 +103,26 @@ class MaxRateReceiver(Receiver):
             found = [reply.ok for reply in self._last.take() if reply.ok is not None]
             # Without those of a storage: their vehicles are gone.
             if live := [raw for raw in found if raw.attachment is not None and raw.attachment.to_bytes() == LIVE]:
-                self._rate_queue.put_full_rate(live)
-            self._follow_tokens(now)
-            self._read_full_rate(self._rate_queue.full_rate_keys(now))
-        return min(pause, _FULL_RATE_POLL) if self._full_rate or not self._last.ended else pause
+                self._rate_queue.put_last(live)
+            self._check_publishers(now)
+        return pause if self._last.ended else min(pause, _LAST_POLL)
 
-    def _follow_tokens(self, now: float) -> None:
+    def _check_publishers(self, now: float) -> None:
+        """Log the streams that are alive, and of which nothing downsampled has come."""
         for token, alive in self._tokens.take(timeout=_TIMEOUT):
             with suppress(AddressError):  # not one of nedbus
-                key = address_of_alive_key(token, prefix=self._prefix).key(prefix=self._prefix)
-                self._rate_queue.on_token(key, now, alive=alive)
-        if ANY not in self._key_expr:  # one stream: perhaps of a plain Zenoh publisher, which has no token
-            self._rate_queue.on_token(self._key_expr, now, alive=True)
-
-    def _read_full_rate(self, keys: set[str]) -> None:
-        for key in self._full_rate.keys() - keys:
-            self._full_rate.pop(key).undeclare()
-        for key in keys - self._full_rate.keys():
-            ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_FULL_RATE_RING)
-            with while_open():
-                self._full_rate[key] = self._session.declare_subscriber(key, ring)
-        for key, subscriber in self._full_rate.items():
-            if batch := drain(subscriber.handler, []):
-                self._rate_queue.put_full_rate(batch)
-                if not self._warned:
-                    self._warned = True
-                    text = "%s: its publisher does not downsample (it cannot, or access rules): read at full rate"
-                    _log.warning(text, key, extra=about("unsupported"))
-
-    def _undeclare(self) -> None:
-        with suppress(zenoh.ZError):  # closed already with the session
-            self._tokens.undeclare()
-            self._read_full_rate(set())
-        super()._undeclare()
+                address = address_of_alive_key(token, prefix=self._prefix)
+                topic, key = get_topic(address.topic), address.key(prefix=self._prefix)
+                if not alive:
+                    self._unheard.pop(key, None)
+                elif topic.rate and not topic.on_change:  # others may be silent for long
+                    self._unheard.setdefault(key, now)
+        due = [key for key, since in self._unheard.items() if now - since >= DOWNSAMPLED_TIMEOUT]
+        for key in due:
+            del self._unheard[key]
+        if missing := [key for key in due if key not in self._rate_queue.downsampled]:
+            text = "%d streams that are not downsampled (by publisher, or access rules) do not arrive, such as %s"
+            _log.warning(text, len(missing), missing[0], extra=about("unsupported"))
 
 
 def _sent(arrival: Arrival) -> float:

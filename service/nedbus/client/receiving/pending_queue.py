@@ -35,8 +35,6 @@ CAPACITY: Final = 65_536
 MAX_ACK_REQUESTS: Final = 1000
 """Acknowledgement requests that wait for an answer; an honest publisher has one for each key at a time."""
 
-_MAX_HELD: Final = 2 * CAPACITY  # messages behind gaps, some 90 MB,
-_MAX_HELD_OF_KEY: Final = CAPACITY // 2  # and of these on one key, so that one key does not push out others
 _MAX_BATCH: Final = 4096  # messages of a batch
 _MAX_FRESH: Final = 1024  # samples that are queued with Zenoh's buffer; further ones are going to wait
 
@@ -63,21 +61,12 @@ class PendingQueue:
     """
 
     def __init__(
-        self,
-        mode: Mode,
-        decoder: Decoder,
-        *,
-        name: str = "",
-        clock: Callable[[], float] = time.monotonic,
+        self, mode: Mode, decoder: Decoder, *, name: str = "", clock: Callable[[], float] = time.monotonic
     ) -> None:
         if mode not in get_args(Mode):
             raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         self.newest_only = mode == "latest"
         self.ended = False
-        self.idle = False
-        """Set by the receiver, while it waits and nothing is left to receive."""
-        self.drains = 0
-        """Number of times that all that had arrived was put."""
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
         """Called, in any thread, when there may be something to read: an event loop wakes its reader with it."""
@@ -89,6 +78,7 @@ class PendingQueue:
         self._every: deque[Arrival] = deque()
         self._newest: dict[str, Arrival] = {}
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
+        self.account = self._reader.account
         self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
         self._arrived = self._dropped = self._received = 0
 
@@ -96,25 +86,13 @@ class PendingQueue:
     def counts(self) -> Counts:
         """Received, lost, dropped, invalid and discarded messages so far."""
         with self._lock:
-            account = self._reader.account
-            dropped = self._dropped + account.dropped
+            account, dropped = self.account, self._dropped + self.account.dropped
             return Counts(self._received, account.lost, dropped, self._decoder.invalid, account.discarded)
 
     @property
     def waiting(self) -> int:
         """Messages that wait to be read."""
         return len(self._every) or len(self._newest)
-
-    @property
-    def held(self) -> int:
-        """Messages that are held back behind a gap."""
-        return self._reader.account.held
-
-    @property
-    def requesting(self) -> list[WriterProxy]:
-        """Publishers of which something is missing."""
-        with self._lock:
-            return list(self._reader.requesting)
 
     def count_invalid(self, count: int) -> None:
         """Count samples that could not be queued."""
@@ -123,15 +101,14 @@ class PendingQueue:
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
         """Queue all that has arrived, in its order, wake the reader, and reject what is invalid.
 
-        `overflowed`: it comes from a ring that was full, and perhaps dropped something: nothing is asked for.
+        `overflowed`: it comes from a full ring, which perhaps dropped some: none of these are requested.
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
-            missing = len(self._reader.requesting)
+            requesting = len(self.account.requesting)
             self._queue(self._reader.on_samples(arrivals, overflowed=overflowed))
-            missing = len(self._reader.requesting) - missing
-            self.drains += not overflowed
-        if missing > 0 and self.on_gap is not None:
+            has_gap = len(self.account.requesting) > requesting
+        if has_gap and self.on_gap is not None:
             self.on_gap()
         if self._tokens.empty():  # as `wake` does
             self._tokens.put(None)
@@ -147,43 +124,36 @@ class PendingQueue:
         with self._lock:
             self._reader.on_link()
 
-    def on_heartbeat(self, key: str, publisher: str, number: int, *, begins: bool) -> None:
-        """Note that a publisher has sent a message that should have arrived by now; see StatefulReader."""
+    def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
+        """Note that a publisher has sent a message that should have arrived by now."""
         with self._lock:
-            if len(self._reader.requesting) < MAX_KEYS:
-                self._reader.on_heartbeat(key, publisher, number, begins=begins)
+            self._reader.on_heartbeat(key, publisher, number)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
         """Return the numbers to ask a publisher for now; None if nothing is due."""
         with self._lock:
             return writer.next_request(now)
 
-    def on_retransmission(self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float) -> str:
-        """Queue what was recovered, and what waited for it; return a key of which there is something to read by that.
-
-        It takes the place of nothing that is queued: where there is no room for all, the oldest of it are dropped.
-        """
+    def on_retransmission(
+        self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
+    ) -> bool:
+        """Queue what was recovered, and what waited for it; return whether there is any."""
         arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
         with self._lock:
-            return self._recover(self._reader.on_retransmission(writer, arrivals, ended=ended, now=now))
-
-    def bound(self) -> str:
-        """Give up gaps for which too many messages are held back; return as `on_retransmission`."""
-        if self.held <= _MAX_HELD_OF_KEY:
-            return ""
-        with self._lock:
-            return self._recover(self._reader.give_up(_MAX_HELD, _MAX_HELD_OF_KEY))
+            delivered = writer.on_retransmission(arrivals, ended=ended, now=now)
+            self._queue(delivered)
+        return bool(delivered)
 
     def give_up(self) -> None:
-        """Give up all that is missing: it is lost."""
+        """Count all missing messages as lost."""
         with self._lock:
-            self._recover(self._reader.give_up(-1, -1))
+            self._queue(self._reader.give_up(-1))
 
-    def add(self, request: AckRequest) -> None:
+    def add(self, request: AckRequest, *, drained: bool) -> None:
         """Answer a publisher's request as soon as it can be answered."""
         with self._lock:
             self._ack_requests.append(request)
-        self.acknowledge(drained=self.idle)
+        self.acknowledge(drained=drained)
 
     def acknowledge(self, *, drained: bool) -> None:
         """Answer the requests that can be answered now.
@@ -192,9 +162,8 @@ class PendingQueue:
         """
         with self._lock:
             ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
-            if ready:
-                waiting = (request for request in self._ack_requests if request not in ready)
-                self._ack_requests = deque(waiting, MAX_ACK_REQUESTS)
+            for request in ready:
+                self._ack_requests.remove(request)
         for request in ready:
             request.reply()
 
@@ -213,19 +182,16 @@ class PendingQueue:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
-        end = None if timeout is None else time.monotonic() + timeout
-        while not (self.waiting or self.ended):
+        if not (self.waiting or self.ended):
             try:
-                self._tokens.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
+                self._tokens.get(timeout=timeout)
             except queue.Empty:
                 return False
-            if timeout is None:
-                break
         if self.ended or self.waiting > 1:
             self.wake()  # another thread that waits: of all that is put at once only one is woken
         return True
 
-    def pop(self, *, rows: bool) -> Sample[Any] | None:
+    def pop(self, *, rows: bool = False) -> Sample[Any] | None:
         """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
         while True:
             with self._lock:  # several threads may take
@@ -254,7 +220,7 @@ class PendingQueue:
             with self._lock:
                 taken = self._take_batch()
                 lost = sum(lost for _, _, _, lost in taken)
-                for stream in {id(stream): stream for stream, _, _, _ in taken}.values():
+                for stream in {stream for stream, _, _, _ in taken}:
                     lost, stream.unreported = lost + stream.unreported, 0
             if self._ack_requests:
                 self.acknowledge(drained=False)
@@ -295,27 +261,10 @@ class PendingQueue:
         every = self._every
         every.extend(map(self._decoder.keep, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
-            self._drop(every.popleft())
-
-    def _recover(self, arrivals: list[Arrival]) -> str:
-        beyond = min(len(arrivals), max(0, len(self._every) + len(arrivals) - CAPACITY))
-        self._arrived += beyond
-        for arrival in arrivals[:beyond]:
-            self._drop(arrival)
-        self._queue(arrivals[beyond:])
-        return arrivals[-1][0].heard if arrivals else ""
-
-    def _drop(self, arrival: Arrival) -> None:
-        stream, _, _, lost = arrival
-        self._dropped += 1
-        stream.unreported += lost
-        self._warn_once()
-
-    def _warn_once(self) -> None:
-        if not self._warned and not self.newest_only:
-            self._warned = True
-            extra = about("dropped")
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
+            stream, _, _, lost = every.popleft()
+            stream.unreported += lost
+            self._dropped += 1
+            self._warn_once()
 
     def _supersede(self, arrival: Arrival) -> None:
         stream, payload, raw, lost = arrival
@@ -327,3 +276,9 @@ class PendingQueue:
             self._dropped += 1
             return
         self._newest[stream.key] = arrival
+
+    def _warn_once(self) -> None:
+        if not self._warned and not self.newest_only:
+            self._warned = True
+            extra = about("dropped")
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)

@@ -1,8 +1,8 @@
 """Zenoh's side of a subscription: the advanced subscriber, its ring, and the threads that empty it.
 
 The ring lies in Rust: Zenoh never waits for it, so that no reader holds up its session or other readers.
-A reader that waits without a timeout empties it in its own thread. For one that waits with a timeout, or in asyncio,
-the pump does, a thread that starts with the first such wait; while the reader does something else, housekeeping does.
+A reader that waits without a timeout empties it in its own thread. From the first wait with a timeout on, or in
+asyncio, the pump does, a thread of its own. While the reader does something else, housekeeping does.
 """
 
 from __future__ import annotations
@@ -10,16 +10,17 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Final, TypeVar
 
 import zenoh
 
-from nedbus.client.housekeeping import Housekeeping, Wakeup
+from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import CLOSED, read_parameters
 from nedbus.log_event import about
-from nedbus.transport import Heartbeats, Session, follow_heartbeats, while_open
+from nedbus.transport import Session, while_open
 from nedbus_msgs import ack_key
 
 from .decoder import WAKE_UP
@@ -44,7 +45,7 @@ class Receiver:
     """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
 
     A subscriber of mode `every` requests retransmissions of publishers, and acknowledges their messages on request.
-    One of `downsampled` streams does not, as these do not wait for it, and begins with what is published from now on.
+    With `history` it begins with the last message of each publisher.
     """
 
     def __init__(
@@ -54,42 +55,31 @@ class Receiver:
         pending_queue: PendingQueue,
         *,
         housekeeping: Housekeeping,
-        downsampled: bool = False,
+        history: bool = True,
     ) -> None:
-        every = not pending_queue.newest_only
         self._session = session
         self._queue = pending_queue
         self._name = key_expr
-        self._downsampled = downsampled
         self._changing = threading.Lock()
         self._closed = False
         self._receiving = threading.RLock()  # its holder empties the ring; a reader may keep it by a Ctrl-C
-        self._by_reader = False  # the reader has waited by itself since the pump looked
-        self._reader_waits = False  # for the ring
-        self._reader: int | None = None  # the thread that did so last
+        self._idle = False  # its holder waits for the ring, in which nothing is left
         self._busy = False
-        self._needed = Wakeup()  # the pump is
         self._pump: threading.Thread | None = None
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
         # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
-        history = None if downsampled else zenoh.ext.HistoryConfig(max_samples=1)
-        asked: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
-        links: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
+        last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with while_open():
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=history)
-            self._asked = session.declare_queryable(ack_key(key_expr), asked) if every and not downsampled else None
-            self._links = session.info.declare_transport_events_listener(links, history=False) if every else None
-        self._take_query = None if self._asked is None else self._asked.handler.try_recv
-        self._take_link = None if self._links is None else self._links.handler.try_recv
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
         # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
-        self._handler: zenoh.Handler[zenoh.Sample] = self._subscriber.handler
-        self._heartbeats = follow_heartbeats(session, key_expr) if every else None  # how to take, and to end them
-        self._late: Heartbeats = {}  # of the last poll
-        self._next_heartbeat_poll = 0.0
-        self._drains = 0  # of the queue, then
+        self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
+        self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
+        self._take_query: Callable[[], zenoh.Query | None] | None = None  # these three in mode `every`
+        self._take_link: Callable[[], zenoh.TransportEvent | None] | None = None
+        self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
-        self._retransmission = Retransmission(session, pending_queue)
-        pending_queue.on_gap = housekeeping.wake
+        if not pending_queue.newest_only:
+            self._declare_every(housekeeping)
         self._end_job = housekeeping.add(self._keep_house)
 
     def receive(self) -> bool:
@@ -105,29 +95,25 @@ class Receiver:
 
     def wait(self, timeout: float | None) -> bool:
         """Wait until there may be something in the queue; return False after `timeout` seconds."""
-        if timeout is not None or self._downsampled:  # what comes at full rate does not come through the ring
+        if timeout is not None or self._pump is not None:
             self.pump()
             return self._queue.wait(timeout)
-        self._by_reader = True
+        if self._busy:
+            time.sleep(_BUSY_PAUSE)
         if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # housekeeping has it for less
             return self._queue.wait(None)
         try:
-            self._reader, self._reader_waits = threading.get_ident(), True
-            if not self._queue.waiting:  # nothing was recovered since the caller looked
-                self._receive()
+            self._receive(if_empty=True)
         finally:
-            self._reader_waits = False
             self._receiving.release()
         return True
 
     def pump(self) -> None:
-        """Let a thread empty the ring from now on, until a reader waits for it by itself."""
-        self._by_reader = False
+        """Let a thread empty the ring from now on."""
         with self._changing:
             if self._pump is None and not self._closed:
                 self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
                 self._pump.start()
-        self._needed.set()
 
     def close(self) -> None:
         """End the subscription; a second call does nothing."""
@@ -137,31 +123,33 @@ class Receiver:
             self._closed = True
         self._queue.end()
         self._end_job()
-        self._retransmission.close()
+        if self._retransmission is not None:
+            self._retransmission.close()
         self._queue.give_up()
-        self._undeclare()
-        self._needed.set()
+        for undeclare in self._undeclares:
+            with suppress(zenoh.ZError):  # closed already with the session
+                undeclare()
         if self._pump is not None:  # one that is inside Zenoh when the interpreter ends aborts the process
             self._pump.join(_JOIN_TIMEOUT)
-        if self._reader != threading.get_ident() and self._receiving.acquire(timeout=_JOIN_TIMEOUT):
+        if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # nor may a reader be
             self._receiving.release()
 
-    def _undeclare(self) -> None:
-        with suppress(zenoh.ZError):  # closed already with the session
-            if self._heartbeats is not None:
-                self._heartbeats[1]()
-            if self._asked is not None:
-                self._asked.undeclare()
-            if self._links is not None:
-                self._links.undeclare()
-            self._subscriber.undeclare()
+    def _declare_every(self, housekeeping: Housekeeping) -> None:
+        requests: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(MAX_ACK_REQUESTS)
+        events: zenoh.handlers.RingChannel[zenoh.TransportEvent] = zenoh.handlers.RingChannel(1)
+        with while_open():
+            queryable = self._session.declare_queryable(ack_key(self._name), requests)
+            links = self._session.info.declare_transport_events_listener(events, history=False)
+        self._undeclares += [queryable.undeclare, links.undeclare]
+        self._take_query, self._take_link = queryable.handler.try_recv, links.handler.try_recv
+        self._retransmission = Retransmission(self._session, self._name, self._queue)
+        self._queue.on_gap = housekeeping.wake
 
     def _run(self) -> None:
         try:
-            while not self._closed:
-                if self._by_reader:
-                    self._needed.wait()
-                    continue
+            while not self._queue.ended:
+                if self._busy:
+                    time.sleep(_BUSY_PAUSE)
                 with self._receiving:
                     self._receive()
         except BaseException:
@@ -170,22 +158,26 @@ class Receiver:
         finally:
             self._queue.end()  # a reader must not wait for a pump that has ended
 
-    def _receive(self) -> None:
-        """Wait for something, and queue all that is there; the queue ends with Zenoh's side."""
-        pending, handler = self._queue, self._handler
-        if self._busy:
-            time.sleep(_BUSY_PAUSE)
-        pending.idle = True
+    def _receive(self, *, if_empty: bool = False) -> None:
+        """Wait for a sample, and queue all that have arrived; the queue ends with the subscriber.
+
+        `if_empty`: return at once if there is something in the queue already; later `_wake` ends the wait.
+        """
+        handler = self._handler
+        self._idle = True
         try:
+            if if_empty and self._queue.waiting:
+                return
             batch = [handler.recv()]
-            pending.idle = False
+            self._idle = False
             if (item := handler.try_recv()) is not None:
                 batch.append(item)
                 drain(handler, batch)
         except zenoh.ZError:
-            pending.idle = False
-            pending.end()
+            self._queue.end()
             return
+        finally:
+            self._idle = False
         self._busy = len(batch) >= _MIN_BUSY_BATCH
         self._put(batch)
 
@@ -203,28 +195,15 @@ class Receiver:
     def _keep_house(self, now: float) -> float:
         """Do what is due beside receiving; return the seconds until the next time."""
         self._take_events()
-        if drained := self.receive():
-            self._queue.acknowledge(drained=True)
-        if self._links is None:
+        drained = self.receive() or self._idle
+        if self._retransmission is None:
             return _POLL
-        if now >= self._next_heartbeat_poll:
-            self._next_heartbeat_poll = now + _POLL
-            self._take_heartbeats(drained=drained)
-        filled, pause = self._retransmission.turn(now)
-        filled = self._queue.bound() or filled
+        if drained:
+            self._queue.acknowledge(drained=True)
+        filled, pause = self._retransmission.turn(now, drained=drained)
         if filled:
             self._wake(filled)
-        return min(pause, _POLL, _ACK_POLL if now < self._ack_poll_until else _POLL)
-
-    def _take_heartbeats(self, *, drained: bool) -> None:
-        """Request the newest messages that the heartbeats of the last poll told of, if they have not come since."""
-        drained |= self._queue.idle or self._queue.drains >= self._drains + 2
-        if self._late and not drained:
-            return  # what they tell of may be in the ring still
-        for (key, publisher), number in self._late.items():
-            self._queue.on_heartbeat(key, publisher, number, begins=not self._downsampled)
-        self._late = {} if self._heartbeats is None else self._heartbeats[0]()
-        self._drains = self._queue.drains
+        return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _wake(self, key: str) -> None:
         """Wake the reader, even one that waits for the ring, by a sample on one of its keys.
@@ -232,17 +211,19 @@ class Receiver:
         Nothing else ends a wait for Zenoh's ring; only this session gets it, and no reader sees it.
         """
         self._queue.wake()
-        if self._reader_waits:
+        if self._idle:
             with suppress(zenoh.ZError):  # the session is closed
                 here = zenoh.Locality.SESSION_LOCAL
                 self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
 
     def _take_events(self) -> None:
         """Note that links broke or came back, before what arrived since is queued; take acknowledgement requests."""
+        if self._take_link is None or self._take_query is None:
+            return
         try:
-            while self._take_link is not None and self._take_link() is not None:
+            while self._take_link() is not None:
                 self._queue.on_link()
-            while self._take_query is not None and (query := self._take_query()) is not None:
+            while (query := self._take_query()) is not None:
                 self._take_request(query)
         except zenoh.ZError:  # undeclared
             pass
@@ -252,12 +233,12 @@ class Receiver:
         parameters = read_parameters(query.parameters.get)
         if parameters is not None:  # else it is dropped, and so answered: from a publisher that asks in another way
             key = str(query.key_expr)
-            reply = partial(_reply, query, key, self._queue)
-            self._queue.add(AckRequest(key.removesuffix(ack_key("")), *parameters, reply))
+            request = AckRequest(key.removesuffix(ack_key("")), *parameters, partial(_reply, query, key, self._queue))
+            self._queue.add(request, drained=self._idle)
 
 
 def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
-    """Add all that is there to a batch, up to a full ring, and return it."""
+    """Add all that has arrived to a batch, up to a full ring, and return it."""
     try:
         while len(batch) < RING_CAPACITY and (item := handler.try_recv()) is not None:
             batch.append(item)

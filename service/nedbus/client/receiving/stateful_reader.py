@@ -1,35 +1,36 @@
-"""All remote publishers that a subscription hears, and the one account of their messages. Pure, without I/O."""
+"""All remote publishers of a subscription, and the one account of their messages. Pure, without I/O."""
 
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from operator import itemgetter
 from typing import Final
 
 from nedbus.transport import SourceInfo, entity_name
 from nedbus_msgs import AddressError
 
-from .decoder import Arrival, Decoder, KeyState
+from .decoder import MAX_KEYS, Arrival, Decoder, KeyState
 from .writer_proxy import NUMBERS, Account, WriterProxy
 
+MAX_HELD: Final = 131_072
+"""Messages that are held back behind gaps, some 90 MB; beyond, gaps are given up."""
+
 _MAX_WRITERS_OF_KEY: Final = 8  # publishers that are remembered of one key; of more the first is forgotten
-_MIN_BATCH: Final = 8  # messages of one key for which a look at all of them together pays
+_MIN_BATCH: Final = 8  # messages from which on a check of all together pays
 _UNSETTLED: Final = 10.0  # s after a link broke or came back in which a new publisher may have sent something before
 _PAYLOAD: Final = itemgetter(1)
 
 
 class StatefulReader:
-    """Follow what arrives, publisher by publisher: `requesting` are those of which something is missing.
+    """Put the messages of each publisher in order, and count those that are missing. Not thread-safe.
 
-    With `recovers` what comes after a gap is held back until it is filled; else what is missing is lost.
-    Not thread-safe.
+    With `recovers`, messages after a gap are held back until it is filled; else the missing ones are lost.
     """
 
     def __init__(self, decoder: Decoder, *, recovers: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self.account = Account()
-        self.requesting: dict[WriterProxy, None] = {}
         self.recovers = recovers
         self._decoder = decoder
         self._clock = clock
@@ -37,19 +38,20 @@ class StatefulReader:
 
     @property
     def unsettled(self) -> bool:
-        """True while there may be publishers that sent something, and are not known yet."""
+        """True while unknown publishers may have sent messages."""
         return self._clock() < self._unsettled_until
 
     def on_link(self) -> None:
         """Note that a link broke or came back."""
         self._unsettled_until = self._clock() + _UNSETTLED
-        for writer in self.requesting:
+        for writer in self.account.requesting:
             writer.silent = False  # it could not answer, perhaps
 
     def on_samples(self, arrivals: list[Arrival], *, overflowed: bool) -> list[Arrival]:
         """Return what can be delivered, each with what was lost before it; `overflowed`: from a ring that was full."""
         if len(arrivals) >= _MIN_BATCH and self._in_order(arrivals):
             return arrivals
+        recovers = self.recovers and not overflowed
         delivered: list[Arrival] = []
         for arrival in arrivals:
             stream, payload, raw, _ = arrival
@@ -57,7 +59,7 @@ class StatefulReader:
             if info is not None:
                 source = info.source_id
                 if writer is None or source.eid != writer.eid or source.zid != writer.zid:  # cheaper than its name
-                    writer = self._writer_of(stream, info, asks=self.recovers and not overflowed)
+                    writer = self._writer_of(stream, info, recovers=recovers)
             if info is None or writer is None:
                 if payload:
                     delivered.append(arrival)
@@ -67,70 +69,43 @@ class StatefulReader:
                 writer.expected = (number + 1) % NUMBERS
                 delivered.append(arrival)
             else:
-                asks = self.recovers and not overflowed
-                delivered += writer.on_sample(number, arrival, asks=asks, overflowed=overflowed)
-                self._track(writer)
+                delivered += writer.on_sample(number, arrival, recovers=recovers, overflowed=overflowed)
+        if self.account.held > MAX_HELD:
+            delivered += self.give_up(MAX_HELD)
         return delivered
 
-    def on_heartbeat(self, key: str, name: str, number: int, *, begins: bool) -> bool:
-        """Note that a publisher has sent a message that should have arrived by now; return whether some are missing.
-
-        `begins`: of a publisher that is new here this one is missing.
-        """
-        try:
+    def on_heartbeat(self, key: str, name: str, number: int) -> None:
+        """Note that a publisher, perhaps an unknown one, has sent a message that should have arrived by now."""
+        with suppress(AddressError):
             stream = self._decoder.stream(key)
-        except AddressError:
-            return False
-        writer = stream.writers.get(name)
-        if writer is None:
-            if not (self.unsettled or begins):
-                return False
-            writer = self._add_writer(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
-        if writer is None:
-            return False
-        writer.on_heartbeat(number)
-        return self._track(writer)
+            writer = stream.writers.get(name)
+            if writer is None and len(self.account.requesting) < MAX_KEYS:
+                writer = self._add_writer(stream, name, 0 if self.unsettled else number, uncertain=number + 1)
+            if writer is not None:
+                writer.on_heartbeat(number)
 
-    def on_retransmission(
-        self, writer: WriterProxy, found: dict[int, Arrival], *, ended: bool, now: float
-    ) -> list[Arrival]:
-        """Return what can be delivered after an answer to a publisher's retransmission request."""
-        delivered = writer.on_retransmission(found, ended=ended, now=now)
-        self.requesting.pop(writer, None)  # others come first
-        self._track(writer)
-        return delivered
-
-    def give_up(self, total: int, of_key: int) -> list[Arrival]:
-        """Give up gaps until no more messages are held back, in all and of one key; return what can be delivered."""
+    def give_up(self, max_held: int) -> list[Arrival]:
+        """Give up gaps, those with most messages behind them first, until `max_held` are held back; -1 for all gaps."""
         delivered: list[Arrival] = []
-        if self.account.held <= min(total, of_key):
-            return delivered
-        by_key: Counter[str] = Counter()
-        for writer in self.requesting:
-            by_key[writer.stream.heard] += len(writer.held)
-        for writer in sorted(self.requesting, key=lambda writer: -len(writer.held)):
-            if self.account.held > total or by_key[writer.stream.heard] > of_key:
-                by_key[writer.stream.heard] -= len(writer.held)
+        for writer in sorted(self.account.requesting, key=lambda writer: -len(writer.held)):
+            if self.account.held > max_held:
                 delivered += writer.give_up()
-                self._track(writer)
         return delivered
 
     def has(self, key: str, name: str, number: int) -> bool | None:
         """Return whether a message has arrived, or is known to be lost; None if its publisher is not known."""
-        try:
-            writer = self._decoder.stream(key).writers.get(name)
-        except AddressError:
-            return None
-        return None if writer is None else writer.has(number)
+        with suppress(AddressError):
+            if (writer := self._decoder.stream(key).writers.get(name)) is not None:
+                return writer.has(number)
+        return None
 
-    def _writer_of(self, stream: KeyState, info: SourceInfo, *, asks: bool) -> WriterProxy | None:
+    def _writer_of(self, stream: KeyState, info: SourceInfo, *, recovers: bool) -> WriterProxy | None:
         """Return the publisher of a sample; None if it is not remembered."""
         name = entity_name(info.source_id)
         writer = stream.writers.get(name)
         if writer is None:
-            writer = self._add_writer(
-                stream, name, 0 if asks and self.unsettled else info.source_sn, uncertain=info.source_sn
-            )
+            first = 0 if recovers and self.unsettled else info.source_sn
+            writer = self._add_writer(stream, name, first, uncertain=info.source_sn)
         stream.writer = writer
         if writer is not None:
             writer.zid, writer.eid = info.source_id.zid, info.source_id.eid
@@ -162,10 +137,3 @@ class StatefulReader:
             del stream.writers[first.name]
         writer = stream.writers[name] = WriterProxy(stream, name, expected, self.account, uncertain=uncertain)
         return writer
-
-    def _track(self, writer: WriterProxy) -> bool:
-        if writer.request is None:
-            self.requesting.pop(writer, None)
-            return False
-        self.requesting[writer] = None
-        return True

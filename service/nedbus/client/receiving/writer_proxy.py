@@ -27,25 +27,27 @@ _RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """Counts of the messages of all publishers of a reader that it did not receive.
+    """The messages of all publishers of a reader that it did not receive.
 
     `dropped`: by a ring that overflowed. `held`: that wait for those before them. `discarded`: duplicates, and late.
+    `requesting`: the publishers of which something is missing; the one that was asked last comes last.
     """
 
     lost: int = 0
     dropped: int = 0
     discarded: int = 0
     held: int = 0
+    requesting: dict[WriterProxy, None] = field(default_factory=dict)
 
 
 @dataclass(slots=True, eq=False)
 class Request:
     """The retransmission request for what is missing of one publisher; times in monotonic seconds.
 
-    `stop`: one more than the newest number that is known to be sent. `asked`: what an open query is for.
+    `stop`: one more than the newest number that is known to be sent. `asked`: the numbers of the open query.
     `until`: when it is given up, unless something is delivered meanwhile. `kept_from`: the lowest number that was
-    answered; a publisher keeps all from there on. `answered`: it has sent the last of what was asked for. `witness`:
-    what it has to send once more, so that the lowest that was answered before, `confirmed`, is the lowest indeed.
+    answered; a publisher keeps all from there on. `answered`: the last of the numbers was answered. `witness`: the
+    number that it has to answer once more, to prove that `confirmed` is the lowest that it keeps.
     """
 
     stop: int
@@ -63,9 +65,9 @@ class Request:
 class WriterProxy:
     """One publisher on one key. Each `on_` method returns what can be delivered now, in order.
 
-    `name`: `zid` and `eid` in one, which are known from its first message on. `expected`: the number that comes next.
-    `uncertain`: below it numbers were perhaps not sent for this reader, until one is delivered. `silent`: it was asked
-    in vain, and is asked only once from then on. Not thread-safe.
+    `name`: `zid` and `eid` in one, which are known from its first message on. `expected`: the next number.
+    `uncertain`: until one is delivered, numbers below this were perhaps sent before this reader subscribed. `silent`:
+    it has not answered a request; it is asked only once from then on. Not thread-safe.
     """
 
     stream: KeyState
@@ -79,8 +81,8 @@ class WriterProxy:
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
-    def on_sample(self, number: int, arrival: Arrival, *, asks: bool, overflowed: bool = False) -> list[Arrival]:
-        """Take a message; with `asks` those that come after a gap are held back until it is filled.
+    def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> list[Arrival]:
+        """Take a message; with `recovers` those that come after a gap are held back until it is filled.
 
         `overflowed`: it comes from a ring that was full: what is absent was dropped there.
         """
@@ -91,7 +93,7 @@ class WriterProxy:
                 return []
             delivered = self.give_up()
             self.expected = number
-        elif step and (self.request is not None or asks) and self.expected + step < _LAST_NUMBER:
+        elif step and (self.request is not None or recovers) and self.expected + step < _LAST_NUMBER:
             self._hold(number, arrival)
             self._extend_request(number + 1)
             return []
@@ -119,6 +121,7 @@ class WriterProxy:
         if request.until is None:
             request.until = now if self.silent else now + RETRANSMIT_TIMEOUT
         request.tries += 1
+        self.account.requesting[self] = self.account.requesting.pop(self)
         request.asked = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
         return request.asked
 
@@ -178,6 +181,7 @@ class WriterProxy:
     def _extend_request(self, stop: int) -> None:
         if self.request is None:
             self.request = Request(stop)
+            self.account.requesting[self] = None
         self.request.stop = max(self.request.stop, stop)
 
     def _count_missing(self, number: int, *, overflowed: bool = False) -> None:
@@ -216,4 +220,5 @@ class WriterProxy:
             request.until, request.tries = None, 0
         if self.expected >= request.stop:
             self.request = None
+            del self.account.requesting[self]
         return delivered

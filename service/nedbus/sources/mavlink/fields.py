@@ -30,7 +30,7 @@ def _global_position(message: Any) -> dict[str, object]:
 
 
 def _home(message: Any) -> dict[str, object]:
-    """Return home, which is known on the globe if it is sent at all."""
+    """Return home; its global position is valid whenever it is sent."""
     angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
     return {
         "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": message.altitude / 1e3,
@@ -45,7 +45,7 @@ def _gps(message: Any) -> dict[str, object]:
     course = _number(message.cog, 100, _U16)
     heading = _number(message.yaw, 100, 0, _U16)
     return {
-        "fix_type": message.fix_type if message.fix_type <= 6 else None,  # then MAVLink's are others than PX4's
+        "fix_type": message.fix_type if message.fix_type <= 6 else None,  # above 6 MAVLink and PX4 differ
         "latitude_deg": message.lat / 1e7, "longitude_deg": message.lon / 1e7, "altitude_msl_m": message.alt / 1e3,
         "altitude_ellipsoid_m": _number(message.alt_ellipsoid, 1e3, 0),
         "eph": _number(message.h_acc, 1e3, 0), "epv": _number(message.v_acc, 1e3, 0),
@@ -58,7 +58,7 @@ def _gps(message: Any) -> dict[str, object]:
 
 
 def _status(message: Any) -> dict[str, object]:
-    """Return what a heartbeat says: its custom mode is not PX4's nav_state."""
+    """Return the state in a heartbeat; its custom mode is not PX4's nav_state."""
     model = MESSAGES["VehicleStatus"].model
     is_armed = message.base_mode & _ARMED
     return {
@@ -70,12 +70,12 @@ def _status(message: Any) -> dict[str, object]:
 
 
 def sensors_of(message: Any) -> dict[str, object]:
-    """Return what SYS_STATUS says for VehicleStatus."""
+    """Return the fields of VehicleStatus in SYS_STATUS."""
     return {name: getattr(message, name) for name in _SENSORS}
 
 
 def _battery(message: Any) -> dict[str, object]:
-    """Return its voltage, but none of cells: the first one is the whole battery's where those are not measured."""
+    """Return its voltage, but none of cells: where they are not measured, the first one is the whole battery."""
     cells = [each for each in message.voltages if each != _U16] + [each for each in message.voltages_ext if each]
     return {
         "voltage_v": sum(cells) / 1e3 if cells else None, "current_a": _number(message.current_battery, 100, -1),
@@ -87,7 +87,7 @@ def _battery(message: Any) -> dict[str, object]:
 
 
 def _odometry(message: Any) -> dict[str, object]:
-    """Return pose and velocity where their frames are some of PX4's."""
+    """Return pose and velocity if PX4 has their frames."""
     pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
         "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),
@@ -105,7 +105,7 @@ def _odometry(message: Any) -> dict[str, object]:
     }  # fmt: skip
 
 
-SAID: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
+CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
     "LOCAL_POSITION_NED": ("vehicle_local_position", _local_position),
     "GLOBAL_POSITION_INT": ("vehicle_global_position", _global_position),
     "ATTITUDE_QUATERNION": ("vehicle_attitude", lambda each: {"q": (each.q1, each.q2, each.q3, each.q4)}),
@@ -120,4 +120,4 @@ SAID: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]] = {
     "HEARTBEAT": ("vehicle_status", _status),
     "BATTERY_STATUS": ("battery_status", _battery),
 }
-"""The topic of each message, and the function that returns the fields that it has of it; None is not known."""
+"""By MAVLink message: the topic, and a function that returns its fields; None stands for unknown."""

@@ -6,7 +6,7 @@ import os
 import re
 import select
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from nedbus.errors import ConfigError, SourceError
 _MAX_DATAGRAMS: Final = 100  # that one read returns
 _MAX_READ: Final = 65535  # bytes
 _CONNECT_TIMEOUT: Final = 3.0  # s
-_LINK = re.compile(r"(udpin|udp|udpout|tcp):(.+):(\d{1,5})|serial:(/.+)|(/dev/.+)")
+_LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
 Peer = Any  # the address of the other side, in the form that its socket uses
@@ -43,7 +43,7 @@ class _UdpLink:
         """Yield the datagrams that have arrived and their senders; wait up to `timeout` seconds for the first."""
         if not _is_ready(self._socket, timeout):
             return
-        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen, yet
+        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen yet
             for _ in range(_MAX_DATAGRAMS):
                 yield self._socket.recvfrom(_MAX_READ)
 
@@ -62,57 +62,48 @@ class _StreamLink:
         self.peer = peer
         self.close = file.close
         self._file = file
-        self._is_socket = isinstance(file, socket.socket)
-        self._receive: Callable[[int], bytes] = file.recv if self._is_socket else file.read
-        self._send: Callable[[bytes], object] = file.sendall if self._is_socket else file.write
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield what has arrived and its sender; wait up to `timeout` seconds for it."""
+        """Yield the bytes that have arrived and their sender; wait up to `timeout` seconds for them."""
         if _is_ready(self._file, timeout):
-            data = self._receive(_MAX_READ)
-            if not data and self._is_socket:
+            data = self._file.read(_MAX_READ)
+            if not data:
                 raise ConnectionResetError(None, "the other side closed the connection")
             yield data, self.peer
 
     def send(self, data: bytes, _: Peer) -> None:
         """Send now, or raise OSError."""
-        self._send(data)
+        self._file.write(data)
 
 
 Link = _UdpLink | _StreamLink
-"""An open connection to one or several vehicles; what fails raises OSError."""
+"""An open connection to one or several vehicles; its methods raise OSError."""
 
 
-def check_link(text: str) -> None:
-    """Raise ConfigError for an invalid link."""
-    _parse(text)
+def parse_link(text: str) -> tuple[str, str, int]:
+    """Return the kind of a link, its host or device, and its port; raise ConfigError for an invalid link."""
+    found = _LINK.fullmatch(text)
+    if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
+        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
+    return (found[1], found[2].strip("[]"), int(found[3])) if found[1] else (found[4], found[5], 0)
 
 
 def open_link(text: str, *, baud: int) -> Link:
     """Open a link; raise SourceError when that fails, ConfigError for an invalid one."""
-    kind, host, port = _parse(text)
+    kind, host, port = parse_link(text)
     try:
         if kind == "serial":
             from serial import Serial
 
             return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
         if kind == "tcp":
-            return _StreamLink(socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT), (host, port))
-        return _UdpLink(host, port, listens=kind != "udpout")
+            with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
+                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # it stays open with this
+        return _UdpLink(host, port, listens=kind == "udpin")
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
         reason = os.strerror(number).lower() if number and number > 0 else str(exc)
         raise SourceError(f"mavlink:{text}", f"cannot be opened ({reason})") from exc
-
-
-def _parse(text: str) -> tuple[str, str, int]:
-    """Return the kind of a link, its host or device, and its port."""
-    found = _LINK.fullmatch(text)
-    if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
-        raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
-    if found[1]:
-        return found[1], found[2].strip("[]"), int(found[3])
-    return "serial", found[4] or found[5], 0
 
 
 def _is_ready(file: Any, timeout: float) -> bool:

@@ -5,41 +5,41 @@ Times are monotonic seconds of the caller's clock, if not stated otherwise.
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import Any, Final, cast
 
+from pymavlink.dialects.v20 import common as dialect
+
+from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus_msgs import DEFAULT_TOPIC, FLAGS, TOPICS, Address
+from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address
 
-from .fields import SAID, sensors_of
+from .fields import CONVERSIONS, sensors_of
 
-_WRAP: Final = 2**32  # ms of time_boot_ms, 49.7 days
+_log = logging.getLogger(__name__)
+
 _MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
 _VALUE_TIMEOUT: Final = 2.0  # s after which a value is no longer part of the estimate
 _STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second without a request
 _SILENCE_TIMEOUT: Final = 3.0  # s after which all state is reset
-_ACK_TIMEOUT: Final = 1.0  # s until a request is repeated
-_MAX_TRIES: Final = 5
-_RETRY_INTERVAL: Final = 5.0  # s until an unknown origin, or positions that do not arrive, are requested again
+_FIRST_ROUNDS: Final = 3  # of all requests: a link loses some
+_REQUEST_INTERVAL: Final = 5.0  # s between two rounds of requests for messages that do not arrive
 _FULL_TURN: Final = 36000  # 0.01 deg, of `hdg`
-_LONG_AGO: Final = 2**48  # us, 9 years: what is more is Unix time, not the time since boot
+_LONG_AGO: Final = 2**48  # us, 9 years: a later time is Unix time, not the time since boot
 _UNKNOWN_HEADING: Final = 65535
-# Bits of ESTIMATOR_STATUS.flags.
-_VELOCITY_HORIZ, _VELOCITY_VERT = 2, 4
-_POS_HORIZ_REL, _POS_HORIZ_ABS, _POS_VERT_ABS = 8, 16, 32
-_CONST_POS_MODE: Final = 128
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
-_POSITION, _STATUS = 32, 230
+_POSITION, _STATUS, _QUATERNION = 32, 230, 31
 STREAMS: Final = {
     _POSITION: (40, 0.0, "vehicle_local_position"),
     _STATUS: (54, 0.0, "vehicle_local_position vehicle_global_position"),
     33: (40, 10.0, "vehicle_local_position vehicle_global_position"),
     141: (44, 10.0, "vehicle_local_position"),
     331: (244, 10.0, "vehicle_local_position vehicle_odometry"),
-    31: (44, 0.0, "vehicle_attitude"),
+    _QUATERNION: (44, 0.0, "vehicle_attitude"),
     24: (64, 5.0, "sensor_gps"),
     2: (24, 1.0, "sensor_gps"),
     1: (55, 1.0, "vehicle_status"),
@@ -55,9 +55,9 @@ _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop
 
 
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
-    """Return the rates to request [Hz] for these topics: positions at `rate`, and each other message as often.
+    """Return the rates to request [Hz] for these topics: positions at `rate`, each other message at its own rate.
 
-    That is, up to the rate that it wants; on a link that does not carry it all, up to one that is the same for all.
+    On a link that does not carry all of them, the other messages have a common upper limit.
     """
     wanted = {
         number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
@@ -74,78 +74,74 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
 
 
 class Vehicle:
-    """The state of one vehicle: pass messages to `handle`, and send what `requests` yields."""
+    """The state of one vehicle: pass messages to `handle`, and send what `next_request` returns."""
 
     def __init__(self, name: str, options: MavlinkOptions) -> None:
         self._name = name
         self._topics = options.chosen_topics or TOPICS
         self._rates = request_rates(options.rate, options.baud, self._topics)
-        self._sequences: dict[int, int] = {}  # by component
-        self._newest: int | None = None  # ms since boot, without the wraps of its counter
+        if _POSITION in self._rates:
+            self._rates[ORIGIN] = 0.0
+        self._newest: int | None = None  # ms since boot
         self._last_message = 0.0
-        self._last_position = 0.0
         self.lost = 0
         self._rebooted = False
+        self._reported: set[int] = set()  # messages that did not arrive, and were logged
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
-        """Discard what was received, and request everything again: it was silent, or rebooted."""
+        """Discard all state and request everything again: the vehicle was silent, or rebooted."""
         self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and until when
-        self._quaternion_until = now + _VALUE_TIMEOUT
-        self._is_global = False
         self._last: dict[Address, int] = {}  # timestamps
-        self._pending = [*self._rates, ORIGIN] if _POSITION in self._rates else [*self._rates]
-        self._tries = 0
-        self._next_request = now
-        self._sequences.clear()
+        self._sequence: int | None = None
+        self._started = now
+        self._arrivals: dict[int, float] = {}  # of requested messages
+        self._pending = [*self._rates] * _FIRST_ROUNDS
+        self._next_round = now + _REQUEST_INTERVAL
 
-    def track_sequence(self, component: int, sequence: int, now: float) -> None:
+    def track_sequence(self, sequence: int, now: float) -> None:
         """Count the messages that were lost before this one, whatever its type."""
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
-        last = self._sequences.get(component)
-        step = 1 if last is None else (sequence - last) % 256
+        step = 1 if self._sequence is None else (sequence - self._sequence) % 256
         if step > 128:  # out of order: it was counted as lost
             self.lost = max(0, self.lost - 1)
         elif step:  # else a duplicate
             self.lost += step - 1
-            self._sequences[component] = sequence
+            self._sequence = sequence
 
-    def requests(self, now: float) -> Iterator[tuple[int, float]]:
-        """Yield what to request now: the number of a message, and its rate [Hz], 0 for once."""
-        if now < self._next_request or now - self._last_message > _SILENCE_TIMEOUT:
-            return
-        if not self._pending and now - self._last_position > _SILENCE_TIMEOUT:
-            self._pending, self._tries = [*self._rates], 0  # it sends messages, but no positions
-        if self._tries >= _MAX_TRIES:
-            self._pending, self._tries = self._pending[1:], 0
-        if self._pending:
-            self._tries += 1
-            self._next_request = now + _ACK_TIMEOUT
-            yield self._pending[0], self._rates.get(self._pending[0], 0.0)
-        elif "origin" not in self._kept and _POSITION in self._rates:
-            self._pending, self._next_request = [ORIGIN], now + _RETRY_INTERVAL
+    def next_request(self, now: float) -> tuple[int, float] | None:
+        """Return the number of a message to request now and its rate [Hz], 0 for once; None for no request.
 
-    def acknowledge(self, now: float) -> int | None:
-        """Go on after an answer to the last request, whatever its result; return the message that was requested."""
-        if not self._pending or not self._tries:
+        Each is requested three times at first, and later for as long as it does not arrive.
+        """
+        if now - self._last_message > _SILENCE_TIMEOUT:
             return None
-        number, *self._pending = self._pending
-        self._tries = 0
-        self._next_request = now if self._pending else now + _RETRY_INTERVAL
-        return number
+        if not self._pending and now >= self._next_round:
+            self._next_round = now + _REQUEST_INTERVAL
+            self._pending = [each for each in self._rates if now - self._arrivals.get(each, 0.0) > _SILENCE_TIMEOUT]
+            self._log_missing()
+        if not self._pending:
+            return None
+        number = self._pending.pop(0)
+        return number, self._rates[number]
 
-    def has(self, number: int) -> bool:
-        """Return whether it should be able to send this message now: without a global position there is no origin."""
-        return number != ORIGIN or self._is_global
+    def _log_missing(self) -> None:
+        """Log once each message that was requested, and never arrived; an origin needs a global position first."""
+        for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
+            self._reported.add(number)
+            name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
+            _log.info("%s: does not send %s when it is requested", address, name, extra=about("unsupported", address))
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
         """Return the message of a chosen topic that this one holds, if any; late ones are rejected."""
         kind = message.get_type()
-        topic, fields_of = SAID.get(kind, ("", None))
+        topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
-        is_double = kind == "ATTITUDE" and now <= self._quaternion_until
+        if (number := message.get_msgId()) in self._rates:
+            self._arrivals[number] = now
+        is_double = kind == "ATTITUDE" and now <= self._arrivals.get(_QUATERNION, self._started) + _VALUE_TIMEOUT
         self._remember(kind, message, timestamp, now)
         if fields_of is None or topic not in self._topics or is_double or timestamp is None:
             return None
@@ -158,8 +154,6 @@ class Vehicle:
             reason = f"out of order: {timestamp // 1000} ms since boot, after {last // 1000} ms"
             return Rejection(str(address), reason, address)
         self._last[address] = timestamp
-        if topic == DEFAULT_TOPIC or DEFAULT_TOPIC not in self._topics:
-            self._last_position = now
         fields = {"timestamp": timestamp, **fields}
         self._complete(topic, fields, timestamp, now)
         lost, rebooted, self.lost, self._rebooted = self.lost, self._rebooted, 0, False
@@ -173,13 +167,12 @@ class Vehicle:
                 self._keep("heading", now + _VALUE_TIMEOUT, heading=math.remainder(heading, math.tau))
             case "ATTITUDE" if math.isfinite(message.yaw):
                 self._keep("yaw", now + _VALUE_TIMEOUT, heading=math.remainder(message.yaw, math.tau))
-            case "ATTITUDE_QUATERNION":
-                self._quaternion_until = now + _VALUE_TIMEOUT
             case "GPS_GLOBAL_ORIGIN" if abs(message.latitude) <= 90e7 and abs(message.longitude) <= 180e7:
                 known = {"ref_timestamp": message.time_usec} if message.time_usec else {}
                 latitude, longitude, altitude = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
                 known |= {"ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude}
                 self._keep("origin", math.inf, xy_global=True, z_global=True, **known)
+                self._arrivals[ORIGIN] = math.inf  # it is sent once for each request
             case "ALTITUDE":
                 is_known = math.isfinite(message.bottom_clearance)
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
@@ -189,10 +182,10 @@ class Vehicle:
             case "ESTIMATOR_STATUS":
                 deviations = {"eph": message.pos_horiz_accuracy, "epv": message.pos_vert_accuracy}
                 known = {name: value for name, value in deviations.items() if math.isfinite(value)}
-                self._is_global = bool(message.flags & _POS_HORIZ_ABS)
                 valid = _validity(message.flags)
                 self._keep("status", now + _STATUS_TIMEOUT, **valid, **known)
-                on_globe = {"lat_lon_valid": valid["xy_valid"] and self._is_global, "alt_valid": valid["z_valid"]}
+                is_global = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_ABS)
+                on_globe = {"lat_lon_valid": valid["xy_valid"] and is_global, "alt_valid": valid["z_valid"]}
                 self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
                 self._keep("sensors", now + _STATUS_TIMEOUT, **sensors_of(message))
@@ -214,7 +207,7 @@ class Vehicle:
                     fields |= self._recall(name, now)
                 # The flags are from an earlier message: these fields may have become NaN since.
                 for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
-                    values = cast("Iterator[float]", (fields[name] for name in FLAGS[flag].fields))
+                    values = cast("list[float]", [fields[name] for name in FLAG_FIELDS[flag]])
                     if fields.get(flag) and not all(map(math.isfinite, values)):
                         fields[flag] = False
             case "vehicle_global_position":
@@ -232,15 +225,11 @@ class Vehicle:
         ms: int | None = getattr(message, "time_boot_ms", self._newest)
         if ms is None:
             return None
-        if self._newest is not None:
-            step = (ms - self._newest + _WRAP // 2) % _WRAP - _WRAP // 2
-            if step < -_MAX_DELAY:
-                self._rebooted = True
-                self.lost = 0  # the sequence restarted too, so the count is wrong
-                self._newest = None
-                self._reset(now)
-            else:
-                ms = self._newest + step
+        if self._newest is not None and ms < self._newest - _MAX_DELAY:
+            self._rebooted = True
+            self.lost = 0  # the sequence restarted too, so the count is wrong
+            self._newest = None
+            self._reset(now)
         self._newest = max(ms, self._newest or 0)
         return ms * 1000
 
@@ -251,12 +240,13 @@ def _validity(bits: int) -> dict[str, object]:
     The constant position mode was the opposite of a horizontal velocity up to PX4 1.15; since PX4's commit 48f1687d3a
     it is set for every vehicle at rest too, whose velocity and position are valid.
     """
-    is_constant = bits & _CONST_POS_MODE and not bits & _VELOCITY_HORIZ
+    has_velocity = bool(bits & dialect.ESTIMATOR_VELOCITY_HORIZ)
+    has_position = bool(bits & (dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS))
     return {
-        "xy_valid": bool(bits & (_POS_HORIZ_REL | _POS_HORIZ_ABS)) and not is_constant,
-        "z_valid": bool(bits & _POS_VERT_ABS),
-        "v_xy_valid": bool(bits & _VELOCITY_HORIZ),
-        "v_z_valid": bool(bits & _VELOCITY_VERT),
+        "xy_valid": has_position and (has_velocity or not bits & dialect.ESTIMATOR_CONST_POS_MODE),
+        "z_valid": bool(bits & dialect.ESTIMATOR_POS_VERT_ABS),
+        "v_xy_valid": has_velocity,
+        "v_z_valid": bool(bits & dialect.ESTIMATOR_VELOCITY_VERT),
     }
 
 

@@ -1,22 +1,29 @@
-"""The node as which a source appears in ROS 2: what arrives there, and a subscription to each published topic."""
+"""The node of a source in ROS 2: received messages, and a subscription to each published topic."""
 
 from __future__ import annotations
 
+import logging
 import os
 import queue
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
-from nedbus.errors import SourceError
-from nedbus.sources.source import Rejection
+from nedbus.errors import AddressError, DecodeError
+from nedbus.log_event import about
+from nedbus.sources.source import Absence, Rejection, SourceMessage
 from nedbus.transport import (
+    BRIDGED_ENCODING,
     LONGEST_TOKEN,
     PX4_TYPES,
+    AliveTokens,
+    Attachment,
+    PublisherToken,
     Session,
     TopicKey,
     node_token,
@@ -24,11 +31,18 @@ from nedbus.transport import (
     subscription_token,
     while_open,
 )
+from nedbus_msgs import Address, decode_with
 
+from .streams import Form, NotAcceptedError, NotCarriedError, Px4Stream, StreamRegistry
+
+_log = logging.getLogger(__name__)
+
+_TICK: Final = 0.25  # s
+_REPORT_INTERVAL: Final = 1.0  # s between two reports of absent topics
+_TOKENS_TIMEOUT: Final = 3.0  # s that a router has to list the publishers again, where too many changed at once
 _MAX_PENDING: Final = 4096  # samples that wait to be decoded
 _MAX_PENDING_BYTES: Final = 4096  # of the payload of each
 _RING_SIZE: Final = 16_384  # samples that arrive until the thread takes them
-_MAX_PENDING_TOKENS: Final = 65536  # of publishers that come and go; none of these may be left out
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
@@ -36,16 +50,16 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohNode:
-    """Messages of all publishers in order in `pending`, and their liveliness tokens; a context manager.
+    """Receive from all publishers, turn samples into messages and rejections, and appear in ROS 2; a context manager.
 
-    Zenoh puts them into channels in Rust, which a thread of ours empties: a callback would wait for the interpreter's
-    lock. Tokens of its own make ROS 2 list this source, and a publisher in ROS 2 see a subscriber.
+    Zenoh puts messages into a channel in Rust, which a thread of ours empties: a callback would wait for the
+    interpreter's lock. Tokens of its own make ROS 2 list this source, and a publisher in ROS 2 see a subscriber.
     """
 
-    def __init__(self, name: str, session: Session, *, domain: int | None) -> None:
-        self.pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
-        self._name = name
-        self._session = session
+    def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
+        self._session, self._streams = session, streams
+        self._pending: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+        self._tokens = AliveTokens(session, px4_publishers_key_expr(domain))
         self._zid, self._node = str(session.info.zid()), f"nedbus_px4_zenoh_{os.getpid()}"
         self._nodes: dict[int, zenoh.LivelinessToken] = {}  # by domain
         self._subscriptions: dict[TopicKey, zenoh.LivelinessToken] = {}
@@ -53,33 +67,103 @@ class Px4ZenohNode:
         self._dropped = Counter({_TOO_FAST: 0, _TOO_LARGE: 0})
         self._reported = Counter[tuple[str, str]]()
         key_expr = f"{'*' if domain is None else domain}/**/{PX4_TYPES}/*"
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_PENDING_TOKENS)
         with while_open():
-            tokens = session.liveliness().declare_subscriber(px4_publishers_key_expr(domain), ring, history=True)
-            messages = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
-        self._subscribers = tokens, messages
-        self._tokens: zenoh.Handler[zenoh.Sample] = tokens.handler
-        self._thread = threading.Thread(target=self._receive, args=[messages.handler], name="nedbus-px4", daemon=True)
+            self._subscriber = session.declare_subscriber(key_expr, zenoh.handlers.RingChannel(_RING_SIZE))
+        handler = self._subscriber.handler
+        self._thread = threading.Thread(target=self._receive, args=[handler], name="nedbus-px4", daemon=True)
         self._thread.start()
 
-    def tokens(self) -> Iterator[zenoh.Sample]:
-        """Yield the liveliness tokens that changed; raise SourceError if some were dropped."""
-        with while_open():
-            for _ in range(_MAX_PENDING_TOKENS):
-                token = self._tokens.try_recv()
-                if token is None:
-                    return
-                yield token
-        raise SourceError(self._name, "publishers come and go faster than they can be followed")
+    def run(self) -> Iterator[SourceMessage | Rejection | Absence | None]:
+        """Yield events until the iterator is closed."""
+        yield None
+        last: Absence | None = None
+        next_report = 0.0
+        while True:
+            yield from self._dropped_messages()
+            sample: zenoh.Sample | None = None
+            with suppress(queue.Empty):
+                sample = self._pending.get(timeout=_TICK)
+            for token, alive in self._tokens.take(timeout=_TOKENS_TIMEOUT):  # those before the message are here
+                self._on_token(token, alive=alive)
+            yield None if sample is None else self._decode(sample)
+            if (now := time.monotonic()) >= next_report:
+                next_report = now + _REPORT_INTERVAL
+                if (absence := self._streams.report(now)) != last:
+                    yield (last := absence)
 
-    def dropped(self) -> Iterator[Rejection]:
+    def __enter__(self) -> Px4ZenohNode:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        with suppress(zenoh.ZError):  # its session may be closed already
+            for token in (*self._subscriptions.values(), *self._nodes.values()):
+                token.undeclare()
+            self._tokens.undeclare()
+            self._subscriber.undeclare()
+        self._thread.join(_JOIN_TIMEOUT)
+
+    def _decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return None
+        key, now = str(sample.key_expr), time.monotonic()
+        is_bridged = str(sample.encoding) == BRIDGED_ENCODING
+        address: Address | None = None
+        try:
+            stream = self._streams.hear(key, now)
+            if stream.not_carried is not None:
+                return None
+            definition, layout, unknown = stream.form or self._find_form(stream)
+            address = stream.address
+            attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
+            if is_bridged:
+                if not stream.is_bridged:
+                    extra = about("looped", source="px4-zenoh")
+                    _log.info("%s comes from nedbus ros2: ignored, as it would loop", key, extra=extra)
+                stream.is_bridged = True
+                return None
+            fields = decode_with(definition, sample.payload.to_bytes(), layout)
+            lost, rebooted = self._streams.accept(stream, attachment, now)
+        except NotCarriedError as exc:
+            return Rejection(key, f"{exc}: not asked for by topics= or msg=") if str(exc) and not is_bridged else None
+        except (AddressError, DecodeError, NotAcceptedError) as exc:
+            return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
+        for name in unknown:
+            del fields[name]
+        if rebooted:
+            extra = about("rebooted", address, source="px4-zenoh")
+            _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
+
+    def _find_form(self, stream: Px4Stream) -> Form:
+        form = self._streams.form_of(stream)
+        if form.unknown:
+            extra = about("newer-layout", stream.address, source="px4-zenoh")
+            _log.warning("%s: unknown here, and left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+        return form
+
+    def _on_token(self, text: str, *, alive: bool) -> None:
+        """Add the publisher of a liveliness token, or remove it."""
+        now = time.monotonic()
+        try:
+            token = PublisherToken.parse(text)
+            if alive:
+                self._streams.add_publisher(token, now)
+        except (AddressError, DecodeError, NotAcceptedError):
+            return  # its messages are rejected
+        if alive and not token.node.startswith("nedbus_"):
+            self._subscribe(token.key)
+        elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
+            with suppress(zenoh.ZError):  # its session may be closed already
+                self._subscriptions.pop(token.key).undeclare()
+
+    def _dropped_messages(self) -> Iterator[Rejection]:
         """Yield a rejection for the messages of each reason that were dropped since the last call."""
         new = self._dropped - self._reported
         for (where, reason), count in new.items():
             yield Rejection(where, reason, count=count)
         self._reported += new
 
-    def subscribe(self, key: TopicKey) -> None:
+    def _subscribe(self, key: TopicKey) -> None:
         """Appear as a subscription to a topic."""
         if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
             return
@@ -87,19 +171,6 @@ class Px4ZenohNode:
             self._nodes[key.domain] = self._declare(node_token(key.domain, self._zid, self._node))
         self._entities += 1
         self._subscriptions[key] = self._declare(subscription_token(key, self._zid, self._node, self._entities))
-
-    def unsubscribe(self, key: TopicKey) -> None:
-        """Withdraw the subscription to a topic that has no publisher any more."""
-        if key in self._subscriptions:
-            _undeclare(self._subscriptions.pop(key))
-
-    def __enter__(self) -> Px4ZenohNode:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        for declared in (*self._subscriptions.values(), *self._nodes.values(), *self._subscribers):
-            _undeclare(declared)
-        self._thread.join(_JOIN_TIMEOUT)
 
     def _declare(self, text: str) -> zenoh.LivelinessToken:
         with while_open():
@@ -109,14 +180,9 @@ class Px4ZenohNode:
         with suppress(zenoh.ZError):  # undeclared
             while True:
                 sample = handler.recv()
-                if self.pending.qsize() >= _MAX_PENDING:
+                if self._pending.qsize() >= _MAX_PENDING:
                     self._dropped[_TOO_FAST] += 1
                 elif len(sample.payload) > _MAX_PENDING_BYTES or len(str(sample.key_expr)) > LONGEST_TOKEN:
                     self._dropped[_TOO_LARGE] += 1
                 else:
-                    self.pending.put(sample)
-
-
-def _undeclare(declared: Any) -> None:
-    with suppress(zenoh.ZError):  # its session may be closed already
-        declared.undeclare()
+                    self._pending.put(sample)

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import logging
-import queue
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
-from typing import Final
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
 
-import zenoh
-
-from nedbus.errors import AddressError, ConnectError, DecodeError, SourceError
+from nedbus.errors import ConfigError, ConnectError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import Px4ZenohOptions
 from nedbus.sources.source import Absence, Rejection, SourceContext, SourceMessage
-from nedbus.transport import (
-    BRIDGED_ENCODING,
-    Attachment,
-    PublisherToken,
-    Session,
-    TopicKey,
-    check_endpoints,
-    open_client,
-)
-from nedbus_msgs import decode_with
+from nedbus.transport import Session, check_endpoints, open_client
+from nedbus_msgs import Definition, bases_of_msg, dds_type, define_msg, hash_of_msg, ros2_type
 
-from .definitions import read_definitions
 from .node import Px4ZenohNode
-from .streams import NotAcceptedError, NotCarriedError, StreamRegistry, track_sequence
+from .streams import Definitions, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
-_TICK: Final = 0.25  # s
-_REPORT_INTERVAL: Final = 1.0  # s between two looks at what does not arrive
 _CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
 
 
@@ -47,7 +33,7 @@ class Px4ZenohSource:
         self._is_own = not endpoint or endpoint in context.routers
         self._tls = context.tls
         self._options = options
-        self._given = read_definitions(options.msg)
+        self._given = _read_definitions(options.msg)
         self._vehicle = options.vehicle or context.vehicle
         self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
 
@@ -55,29 +41,14 @@ class Px4ZenohSource:
         """Receive; raise SourceError when no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
-                # A link between the router and a client of its own would drop what does not fit its queue.
+                # A link between the router and a client of its own would drop messages beyond its queue.
                 session = router
             else:
                 session = self._open_session()
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
-            node = closing.enter_context(Px4ZenohNode(self._name, session, domain=self._options.domain))
-            decoder = _Decoder(streams, node)
-            yield None
-            last: Absence | None = None
-            next_report = 0.0
-            while True:  # until this iterator is closed: a session that lost its router connects again by itself
-                yield from node.dropped()
-                sample: zenoh.Sample | None = None
-                with suppress(queue.Empty):
-                    sample = node.pending.get(timeout=_TICK)
-                for token in node.tokens():  # those that came before the message are here by now
-                    decoder.on_token(token)
-                yield None if sample is None else decoder.decode(sample)
-                if (now := time.monotonic()) >= next_report:
-                    next_report = now + _REPORT_INTERVAL
-                    if (absence := streams.publishers.report(now)) != last:
-                        yield (last := absence)
+            node = closing.enter_context(Px4ZenohNode(session, streams, domain=self._options.domain))
+            yield from node.run()  # a session that lost its router connects again by itself
 
     def _open_session(self) -> Session:
         try:
@@ -87,66 +58,43 @@ class Px4ZenohSource:
             raise SourceError(self._name, reason) from exc
 
 
-class _Decoder:
-    """Turn samples into messages and rejections, and log what vehicles do."""
+def _read_definitions(paths: str) -> Definitions:
+    """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
 
-    def __init__(self, streams: StreamRegistry, node: Px4ZenohNode) -> None:
-        self._streams = streams
-        self._node = node
-        self._bridged: set[str] = set()  # keys on which messages of `nedbus ros2` arrived
+    Messages of a folder that cannot be carried are left out, and named in the log.
 
-    def decode(self, sample: zenoh.Sample) -> SourceMessage | Rejection | None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return None
-        key, now = str(sample.key_expr), time.monotonic()
-        is_bridged = str(sample.encoding) == BRIDGED_ENCODING
-        stream = self._streams.find(key)
-        try:
-            if self._streams.publishers.hear(stream.key if stream else TopicKey.parse(key), now):
-                return None
-            if stream is None:
-                stream = self._streams.register(key)
-                if stream.unknown:
-                    extra = about("newer-layout", stream.address, source="px4-zenoh")
-                    _log.warning("%s: unknown here, and left out: %s", key, ", ".join(stream.unknown), extra=extra)
-            attachment = None if sample.attachment is None else Attachment.parse(sample.attachment.to_bytes())
-            if is_bridged:
-                self._log_bridged(key)
-                return None
-            self._streams.claim(stream, attachment, now)
-            fields = decode_with(stream.definition, sample.payload.to_bytes(), stream.layout)
-            for name in stream.unknown:
-                del fields[name]
-            lost, restarted = track_sequence(stream, attachment, now)
-        except NotCarriedError as exc:
-            return Rejection(key, f"{exc}: not asked for by topics= or msg=") if str(exc) and not is_bridged else None
-        except (AddressError, DecodeError, NotAcceptedError) as exc:
-            reason = exc.reason if isinstance(exc, DecodeError) else str(exc)
-            return Rejection(key, reason, stream.address if stream else None)
-        rebooted = restarted and self._streams.is_reboot(stream)
-        if rebooted:
-            extra = about("rebooted", stream.address, source="px4-zenoh")
-            _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=stream.definition)
+    Raises ConfigError, with line and column, for a file that is not a message, or cannot be read.
+    """
+    found: dict[str, dict[str, Definition[Any]]] = {}
+    left_out: list[str] = []
+    for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
+        files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
+        if not files and path.is_dir():
+            reason = "no .msg file is in this folder, nor in those within it: name PX4's folder msg"
+            raise ConfigError(str(path), reason, key="msg")
+        for file in files or [path]:
+            try:
+                text = _with_messages_within(file)
+                definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
+            except (OSError, UnicodeDecodeError) as exc:
+                raise ConfigError(str(file), getattr(exc, "strerror", None) or "no UTF-8 text", key="msg") from None
+            except ValueError as exc:  # MsgError, and its like
+                if file == path:
+                    raise ConfigError(str(file), str(exc), key="msg") from None
+                left_out.append(f"{file.stem} ({exc})")
+                continue
+            found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
+    if left_out:
+        extra = about("damaged", source="px4-zenoh")
+        _log.info("px4-zenoh: not carried, of %s: %.2000s", paths, ", ".join(left_out), extra=extra)
+    return found
 
-    def on_token(self, sample: zenoh.Sample) -> None:
-        """Add the publisher of a liveliness token, or remove it."""
-        publishers, now = self._streams.publishers, time.monotonic()
-        try:
-            token = PublisherToken.parse(str(sample.key_expr))
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._streams.add_publisher(token, now)
-        except (AddressError, DecodeError):
-            return  # what it publishes is rejected
-        if sample.kind != zenoh.SampleKind.PUT:
-            publishers.remove(token, now)
-            if not publishers.has(token.key):
-                self._node.unsubscribe(token.key)
-        elif not token.node.startswith("nedbus_"):
-            self._node.subscribe(token.key)
 
-    def _log_bridged(self, key: str) -> None:
-        if key not in self._bridged:
-            self._bridged.add(key)
-            extra = about("looped", source="px4-zenoh")
-            _log.info("%s comes from nedbus ros2: ignored, as it would loop", key, extra=extra)
+def _with_messages_within(file: Path) -> str:
+    """Return a .msg file followed by those beside it that it contains, in the form of ROS 2."""
+    text, added = file.read_text(), set[str]()
+    while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
+        added |= missing
+        for base in sorted(missing):
+            text += f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{file.with_name(f'{base}.msg').read_text()}"
+    return text

@@ -1,4 +1,4 @@
-"""Decide which messages of rmw_zenoh publishers belong to which address; no I/O, no clock.
+"""Assign the messages of rmw_zenoh publishers to addresses, and find absent topics; no I/O, no clock.
 
 Times are monotonic seconds of the caller's clock.
 """
@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from nedbus.sources.options import Px4ZenohOptions
+from nedbus.sources.source import Absence
 from nedbus.transport import NO_HASH, Attachment, PublisherToken, TopicKey
 from nedbus_msgs import (
     BY_TOPIC,
@@ -19,18 +20,24 @@ from nedbus_msgs import (
     Definition,
     Layout,
     dds_type,
+    get_topic,
     message_of_type_hash,
     ros2_types,
     split_ros2_topic,
 )
 
-from .definitions import Definitions
-from .publishers import PublisherTable
-
-_MAX_STREAMS: Final = 1000  # keys; a vehicle has a handful
+_MAX_STREAMS: Final = 10_000  # keys; a vehicle has some dozens
+_MAX_PUBLISHERS: Final = 64  # of a key that are followed
 _MAX_LOSS: Final = 1_000_000  # messages that can be lost at once; a larger step is not a gap
 _TIMEOUT: Final = 3.0  # s without messages after which another publisher may have the address
+_SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publisher whose token is gone
+_SILENCE: Final = 5.0  # s, or messages at the nominal rate if that is slower, of which none came
+_MAX_NAMES: Final = 100  # in a report
 _HINT: Final = "give each a namespace or a domain of its own"
+
+
+Definitions = Mapping[str, Mapping[str, Definition[Any]]]
+"""PX4's own definitions that a user gives, by the DDS type of the message, and the hash of its ROS 2 type."""
 
 
 class NotAcceptedError(Exception):
@@ -38,37 +45,68 @@ class NotAcceptedError(Exception):
 
 
 class NotCarriedError(Exception):
-    """Raised for a key that no option asks for; its text is the message, empty for what `topics=` leaves out."""
+    """Raised for a key that no option asks for; its text is the message, or empty if `topics=` leaves it out."""
+
+
+class Form(NamedTuple):
+    """The form of a stream's messages; `unknown`: fields of a newer layout, whose names or types are not known here."""
+
+    definition: Definition[Any]
+    layout: Layout
+    unknown: tuple[str, ...]
 
 
 @dataclass(slots=True, eq=False)
 class Px4Stream:
-    """One key: the address and layout of its messages, its publisher, and the last sequence number.
+    """One key: the address and form of its messages, its publishers, and the last sequence number.
 
-    `unknown`: fields of a layout newer than this version, whose names or types it does not know.
+    `not_carried`: None if they are carried, else the name of the message, "" if no option asks for it.
+    `form`: None until a message was received.
+    `tokens`: publishers that are announced, by the text of their tokens, `since` the first of them.
+    `alike_until`: until then two of them may not be told apart.
+    `heard`, `received`: when the last message arrived, and the last one that was accepted.
     `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
     `reboots`: the number of reboots of its vehicle that it took part in.
+    `is_bridged`: messages of `nedbus ros2` arrived on it.
     """
 
     key: TopicKey
     address: Address
-    definition: Definition[Any]
-    layout: Layout
-    unknown: tuple[str, ...]
-    reboots: int
+    not_carried: str | None
+    form: Form | None = None
+    tokens: dict[str, PublisherToken] = field(default_factory=dict)
+    since: float = -math.inf
+    alike_until: float = -math.inf
+    heard: float = -math.inf
+    received: float = -math.inf
     publisher: PublisherToken | None = None
     gid: bytes | None = None
     sequence: int | None = None
     restarted: bool = False
-    last_received: float = -math.inf
-    last_reboot: float = -math.inf
+    rebooted: float = -math.inf
+    reboots: int = 0
+    is_bridged: bool = False
+
+    def has_alike(self) -> bool:
+        """Return whether publishers of several sessions have the same gid: their messages cannot be told apart."""
+        sessions = {(token.gid, token.session) for token in self.tokens.values() if token.gid is not None}
+        return len({gid for gid, _ in sessions}) < len(sessions)
+
+    def nodes(self) -> set[tuple[str, str]]:
+        """Return the nodes that publish on it; those of nedbus are bridges of several vehicles."""
+        every = {(token.session, token.node) for token in self.tokens.values()}
+        return {(session, node) for session, node in every if not node.startswith("nedbus_")}
+
+    def is_silent(self, now: float) -> bool:
+        """Return whether nothing came for longer than its rate explains; a topic without a rate comes on events."""
+        rate = get_topic(self.address.topic).rate if self.not_carried is None else 0.0
+        return rate > 0 and now - max(self.since, self.heard) >= max(_SILENCE, _SILENCE / rate)
 
 
 class StreamRegistry:
-    """All keys that messages arrived on, and the one stream that owns each address."""
+    """All keys that are announced, or that messages arrived on, and the one stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
-        self.publishers = PublisherTable()
         self._options = options
         self._given = given or {}
         self._vehicle = vehicle
@@ -77,78 +115,128 @@ class StreamRegistry:
         self._reboots: dict[str, int] = {}  # by vehicle
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
-        """Add the publisher of a liveliness token that appeared; AddressError for a key without an address."""
-        stream = self._streams.get(str(token.key))
-        if stream is not None and _TIMEOUT <= now - stream.last_received < math.inf:
+        """Add the publisher of a liveliness token that appeared; raise as `hear` for a key without an address."""
+        stream = self._find(token.key)
+        if _TIMEOUT <= now - stream.received < math.inf:
             # The publisher before is silent: it lost its connection, and a router takes longer to notice.
-            self.publishers.forget(token.key)
-        try:
-            self.publishers.add(token, self._address_of(token.key), now)
-        except NotCarriedError as exc:
-            self.publishers.add(token, str(exc), now)
+            stream.tokens.clear()
+            stream.alike_until = -math.inf
+        if not stream.tokens:
+            stream.since = now
+        if len(stream.tokens) < _MAX_PUBLISHERS:
+            stream.tokens[token.text] = token
+            stream.alike_until = math.inf if stream.has_alike() else stream.alike_until
 
-    def find(self, key: str) -> Px4Stream | None:
-        """Return the stream of a key that was registered."""
-        return self._streams.get(key)
+    def remove_publisher(self, token: PublisherToken, now: float) -> bool:
+        """Remove a publisher that is gone; return whether its key has no other one."""
+        stream = self._streams.get(str(token.key))
+        if stream is None:
+            return True
+        stream.tokens.pop(token.text, None)
+        if stream.alike_until == math.inf and not stream.has_alike():
+            stream.alike_until = now + _SETTLE_TIME
+        return not stream.tokens
 
-    def register(self, key: str) -> Px4Stream:
-        """Return a new stream for a key.
+    def hear(self, key: str, now: float) -> Px4Stream:
+        """Return the stream of a key on which a message arrived.
 
-        Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one whose
-        layout is unknown, and for one key too many, NotCarriedError for one that no option asks for.
+        Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one key too
+        many, NotCarriedError for one that no option asks for, and that is not announced.
         """
-        parsed = TopicKey.parse(key)
-        address = self._address_of(parsed)
-        definition, layout = self._layout_of(parsed, address.topic)
-        known = definition.known_types
-        unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
-        stream = Px4Stream(parsed, address, definition, layout, unknown, self._reboots.get(address.vehicle, 0))
-        if len(self._streams) >= _MAX_STREAMS:
-            raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
-        self._streams[key] = stream
+        stream = self._streams.get(key) or self._find(TopicKey.parse(key))
+        stream.heard = now
+        if stream.not_carried is not None and not stream.tokens:
+            raise NotCarriedError(stream.not_carried)
         return stream
 
-    def claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:
-        """Make a stream and a publisher the owner of their address.
+    def form_of(self, stream: Px4Stream) -> Form:
+        """Return the form of a stream's messages; raise NotAcceptedError for one that is unknown."""
+        definition, layout = self._layout_of(stream.key, stream.address.topic)
+        known = definition.known_types
+        unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
+        stream.form = Form(definition, layout, unknown)
+        stream.reboots = self._reboots.get(stream.address.vehicle, 0)
+        return stream.form
 
-        Raises NotAcceptedError while another key, or another publisher on the same key, owns it, and while two
-        publishers are alike.
+    def accept(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
+        """Account for a message; return the number lost just before it, and whether its vehicle rebooted.
+
+        Its stream and its publisher become the owner of their address. Raises NotAcceptedError while another key, or
+        another publisher on the same key, owns it, while two publishers are alike, for a duplicate, and for a sequence
+        that goes back repeatedly: two vehicles with one gid.
         """
-        if self.publishers.are_alike(stream.key, now):
+        self._claim(stream, attachment, now)
+        lost, restarted = 0, stream.restarted
+        if attachment is not None:
+            step = 1 if stream.sequence is None else attachment.sequence - stream.sequence
+            if step == 0:
+                raise NotAcceptedError(f"sequence number {attachment.sequence} is a duplicate")
+            if step < 0:
+                is_repeated, stream.rebooted, restarted = now - stream.rebooted < _TIMEOUT, now, True
+                if is_repeated:
+                    reason = f"its sequence goes back and forth, as if two vehicles shared this key: {_HINT}"
+                    raise NotAcceptedError(reason)
+            elif step <= _MAX_LOSS:
+                lost = step - 1
+            stream.sequence = attachment.sequence
+        stream.received, stream.restarted = now, False
+        return lost, restarted and self._is_first_to_reboot(stream)
+
+    def report(self, now: float) -> Absence:
+        """Return messages that are not carried, and topics that are silent while others of their node arrive."""
+        self._streams = {
+            key: each for key, each in self._streams.items() if each.tokens or each.form or now < each.alike_until
+        }
+        nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
+        # A link that is down silences no topic.
+        sending = {node for stream, own in nodes if now - stream.heard < _TIMEOUT for node in own}
+        silent = {str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)}
+        not_carried = {stream.not_carried for stream, own in nodes if own and stream.not_carried}
+        return Absence(tuple(sorted(not_carried)[:_MAX_NAMES]), tuple(sorted(silent)[:_MAX_NAMES]))
+
+    def _find(self, key: TopicKey) -> Px4Stream:
+        stream = self._streams.get(str(key))
+        if stream is None:
+            if len(self._streams) >= _MAX_STREAMS:
+                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
+            namespace, topic, instance = split_ros2_topic(key.topic)
+            address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
+            stream = self._streams[str(key)] = Px4Stream(key, address, self._why_not_carried(key, topic))
+        return stream
+
+    def _claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:
+        if now < stream.alike_until:
             stream.publisher = stream.gid = stream.sequence = None
-            stream.last_received = now
+            stream.received = now
             raise NotAcceptedError(f"two vehicles are alike, with one key and one gid: {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
         if owner is not stream:
-            if now - owner.last_received < _TIMEOUT:
+            if now - owner.received < _TIMEOUT:
                 raise NotAcceptedError(f"{owner.key} is {stream.address} already: name one of them with vehicles=")
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
-            stream.restarted = stream.publisher is not None and not self.publishers.is_alive(stream.publisher)
-            if stream.gid is not None and not stream.restarted and now - stream.last_received < _TIMEOUT:
+            stream.restarted = stream.publisher is not None and stream.publisher.text not in stream.tokens
+            if stream.gid is not None and not stream.restarted and now - stream.received < _TIMEOUT:
                 raise NotAcceptedError(f"two publishers share this key: {_HINT}")
             stream.gid, stream.sequence = attachment.gid, None
-            stream.publisher = self.publishers.only(stream.key)
+            stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
 
-    def is_reboot(self, stream: Px4Stream) -> bool:
+    def _is_first_to_reboot(self, stream: Px4Stream) -> bool:
         """Count the restart of a stream; return whether it is the first one of its vehicle to restart."""
-        vehicle = stream.address.vehicle
-        known = self._reboots.get(vehicle, 0)
+        known = self._reboots.get(stream.address.vehicle, 0)
         is_first = stream.reboots == known
-        self._reboots[vehicle] = stream.reboots = known + is_first
+        self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
         return is_first
 
-    def _address_of(self, key: TopicKey) -> Address:
-        """Return the address of a key's messages; AddressError or NotCarriedError for one that has none here."""
-        namespace, topic, instance = split_ros2_topic(key.topic)
+    def _why_not_carried(self, key: TopicKey, topic: str) -> str | None:
+        """Return None for a key whose messages are carried, else a value for `not_carried`."""
         options, name = self._options, _message_name(key)
         is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
         if options.chosen_topics is None:
-            if not is_known:
-                raise NotCarriedError(name)
-        elif topic not in options.chosen_topics and (options.topics or key.dds_type not in self._given):
-            raise NotCarriedError("" if options.topics else f"{name} on {topic}" if is_known else name)
-        return Address(self._vehicle_of(key.domain, namespace), topic, instance)
+            return None if is_known else name
+        if topic in options.chosen_topics or (not options.topics and key.dds_type in self._given):
+            return None
+        return "" if options.topics else f"{name} on {topic}" if is_known else name
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
         """Return the vehicle that is configured, else one named by namespace and by any domain but the expected one."""
@@ -176,19 +264,16 @@ class StreamRegistry:
         hint = f"give PX4's own definition of it, as in px4-zenoh:?msg={name}.msg"
         if given:
             hashes = " or ".join(given)
-            raise NotAcceptedError(
-                f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's"
-            )
-        if known is None:
-            raise NotAcceptedError(f"{name} with the type hash {key.type_hash} has no file here: {hint}")
-        if key.type_hash != NO_HASH:
-            reason = f"no known layout of {name} has the type hash {key.type_hash}"
-            raise NotAcceptedError(f"{reason}: update nedbus, or {hint}")
-        release = self._options.layout
-        layout = known.layout_of_release(release) if release else None
-        if layout is None:
-            raise NotAcceptedError(f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14, or {hint}")
-        return known, layout
+            reason = f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's"
+        elif known is None:
+            reason = f"{name} with the type hash {key.type_hash} has no file here: {hint}"
+        elif key.type_hash != NO_HASH:
+            reason = f"no known layout of {name} has the type hash {key.type_hash}: update nedbus, or {hint}"
+        elif layout := known.layout_of_release(self._options.layout or ""):
+            return known, layout
+        else:
+            reason = f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14, or {hint}"
+        raise NotAcceptedError(reason)
 
 
 def _message_name(key: TopicKey) -> str:
@@ -198,26 +283,3 @@ def _message_name(key: TopicKey) -> str:
 @cache
 def _by_dds_type() -> Mapping[str, Definition[Any]]:
     return {dds_type(name): definition for name, definition in ros2_types().items()}
-
-
-def track_sequence(stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
-    """Account for a message; return the number lost just before it, and whether its publisher restarted.
-
-    Raises NotAcceptedError for a duplicate, and for a sequence that goes back repeatedly: two vehicles with one gid.
-    """
-    lost, restarted = 0, stream.restarted
-    if attachment is not None:
-        step = 1 if stream.sequence is None else attachment.sequence - stream.sequence
-        if step == 0:
-            raise NotAcceptedError(f"sequence number {attachment.sequence} is a duplicate")
-        if step < 0:
-            is_repeated = now - stream.last_reboot < _TIMEOUT
-            stream.last_reboot = now
-            if is_repeated:
-                raise NotAcceptedError(f"its sequence goes back and forth, as if two vehicles shared this key: {_HINT}")
-            restarted = True
-        elif step <= _MAX_LOSS:
-            lost = step - 1
-        stream.sequence = attachment.sequence
-    stream.last_received, stream.restarted = now, False
-    return lost, restarted

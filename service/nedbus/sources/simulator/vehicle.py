@@ -1,100 +1,89 @@
-"""The simulated vehicle beside its estimators: state, land detector, home, battery and GNSS receiver."""
+"""The messages of the simulated vehicle beside its estimates: state, landing, home, battery and GNSS receiver."""
 
 from __future__ import annotations
 
 import math
-from random import Random
 from typing import Final
 
 from nedbus_msgs import MESSAGES
 
-from .estimator import BOOT, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator
-from .trajectory import CLIMB, Truth
+from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator, Truth
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = BOOT - 1_000_000  # us since boot
-_CELLS: Final = 4
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
 _ENDURANCE: Final = 1200.0  # s after which it flies on with a full battery; a fifth is left then
 _BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: 2026 begins
 
 
-class SimulatedVehicle:
-    """The messages of a vehicle that flies by this estimate, without the fields that are not known."""
+def status(estimator: Estimator, time: float, _: Truth) -> dict[str, object]:
+    """Return take-off, then a mission; without a valid position a failsafe, in which it holds its altitude."""
+    failsafe = not estimator.xy_valid(time)
+    flown = _Status.NAVIGATION_STATE_AUTO_MISSION if time >= CLIMB else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
+    mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
+    return {
+        "timestamp": BOOT + round(time * 1e6), "armed_time": _ARMED, "takeoff_time": BOOT,
+        "arming_state": _Status.ARMING_STATE_ARMED,
+        "nav_state": mode, "nav_state_display": mode, "nav_state_user_intention": flown, "failsafe": failsafe,
+        "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
+        "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
+    }  # fmt: skip
 
-    def __init__(self, seed: int, estimator: Estimator) -> None:
-        self._estimator = estimator
-        self._random = Random(f"{seed}/gps")
-        self._mode, self._mode_since = -1, 0
 
-    def status(self, time: float, _: Truth) -> dict[str, object]:
-        """Return take-off, then a mission; without a valid position a failsafe, in which it holds its altitude."""
-        now, failsafe = BOOT + round(time * 1e6), not self._estimator.xy_valid
-        flown = _Status.NAVIGATION_STATE_AUTO_MISSION if time >= CLIMB else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
-        mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
-        if mode != self._mode:
-            self._mode, self._mode_since = mode, now
-        return {
-            "timestamp": now, "armed_time": _ARMED, "takeoff_time": BOOT,
-            "arming_state": _Status.ARMING_STATE_ARMED,
-            "latest_arming_reason": _Status.ARM_DISARM_REASON_COMMAND_EXTERNAL,
-            "nav_state": mode, "nav_state_display": mode, "nav_state_timestamp": self._mode_since,
-            "nav_state_user_intention": flown, "failsafe": failsafe,
-            "vehicle_type": _Status.VEHICLE_TYPE_ROTARY_WING, "system_type": 2, "system_id": 1, "component_id": 1,
-            "safety_off": True, "power_input_valid": True, "pre_flight_checks_pass": True,
-        }  # fmt: skip
+def land_detected(time: float, truth: Truth) -> dict[str, object]:
+    """Return landed while it has not left the ground."""
+    (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
+    return {
+        "timestamp": BOOT + round(time * 1e6),
+        **dict.fromkeys(("landed", "maybe_landed", "ground_contact", "at_rest"), landed),
+        "vertical_movement": abs(vz) > 0.5, "horizontal_movement": math.hypot(vx, vy) > 1.5,
+        "close_to_ground_or_skipped_check": truth.position[2] > -1.0,
+    }  # fmt: skip
 
-    def land_detected(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return landed while it has not left the ground."""
-        (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
-        return {
-            "timestamp": BOOT + round(time * 1e6),
-            **dict.fromkeys(("landed", "maybe_landed", "ground_contact", "at_rest"), landed),
-            "vertical_movement": abs(vz) > 0.5, "horizontal_movement": math.hypot(vx, vy) > 1.5,
-            "close_to_ground_or_skipped_check": truth.position[2] > -1.0,
-        }  # fmt: skip
 
-    def home(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return where it took off, on the globe too once the origin is known."""
-        known = time >= ORIGIN_SET
-        latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
-        return {
-            "timestamp": BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
-            "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
-            "valid_hpos": known, "valid_alt": known, "valid_lpos": True, "valid_attitude": True,
-            "update_count": 1 + known,
-        }  # fmt: skip
+def home(time: float, truth: Truth) -> dict[str, object]:
+    """Return where it took off, on the globe too once the origin is known."""
+    known = time >= ORIGIN_SET
+    latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
+    return {
+        "timestamp": BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
+        "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
+        "valid_hpos": known, "valid_alt": known, "valid_lpos": True, "valid_attitude": True,
+        "update_count": 1 + known,
+    }  # fmt: skip
 
-    def battery(self, time: float, _: Truth) -> dict[str, object]:
-        """Return a battery that a constant current discharges."""
-        discharged = _CURRENT * (time % _ENDURANCE) / 3.6
-        remaining = 1.0 - discharged / _CAPACITY
-        cell = 3.5 + 0.7 * remaining
-        return {
-            "timestamp": BOOT + round(time * 1e6), "connected": True, "id": 1, "scale": 1.0,
-            "voltage_v": _CELLS * cell, "current_a": _CURRENT, "current_average_a": _CURRENT,
-            "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
-            "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0,
-            "cell_count": _CELLS, "voltage_cell_v": (cell,) * _CELLS + (0.0,) * (14 - _CELLS),
-        }  # fmt: skip
 
-    def gps(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return its fix, with noise; in the outage, and before the first one, there is none."""
-        now, is_started = BOOT + round(time * 1e6), time >= ORIGIN_SET
-        fix = is_started and not OUTAGE[0] <= time % LAP < OUTAGE[1]
-        north, east, down = (value + self._random.gauss(0.0, 0.3) for value in truth.position)
-        latitude, longitude = PROJECTION.reproject(north, east) if fix else (math.nan, math.nan)
-        altitude = REFERENCE[2] - down if fix else math.nan
-        vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
-        return {
-            "timestamp": now, "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
-            "latitude_deg": latitude, "longitude_deg": longitude,
-            "altitude_msl_m": altitude, "altitude_ellipsoid_m": altitude,
-            "eph": 0.9 if fix else 100.0, "epv": 1.8 if fix else 100.0, "s_variance_m_s": 0.4 if fix else 100.0,
-            "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
-            "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
-            "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
-            "time_utc_usec": _BOOTED_AT + now if is_started else 0,
-        }  # fmt: skip
+def battery(time: float, _: Truth) -> dict[str, object]:
+    """Return a battery that a constant current discharges."""
+    discharged = _CURRENT * (time % _ENDURANCE) / 3.6
+    remaining = 1.0 - discharged / _CAPACITY
+    return {
+        "timestamp": BOOT + round(time * 1e6), "connected": True, "id": 1, "scale": 1.0,
+        "voltage_v": 14.0 + 2.8 * remaining, "current_a": _CURRENT, "current_average_a": _CURRENT,
+        "discharged_mah": discharged, "remaining": remaining, "capacity": round(_CAPACITY),
+        "time_remaining_s": remaining * _CAPACITY * 3.6 / _CURRENT, "temperature": 30.0, "cell_count": 4,
+    }  # fmt: skip
+
+
+def gps(time: float, truth: Truth) -> dict[str, object]:
+    """Return its fix, with noise; in the outage, and before the first one, there is none."""
+    now, is_started = BOOT + round(time * 1e6), time >= ORIGIN_SET
+    fix = is_started and not OUTAGE[0] <= time % LAP < OUTAGE[1]
+    north, east, down = (
+        value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
+    )
+    latitude, longitude = PROJECTION.reproject(north, east) if fix else (math.nan, math.nan)
+    altitude = REFERENCE[2] - down if fix else math.nan
+    vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
+    return {
+        "timestamp": now, "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
+        "latitude_deg": latitude, "longitude_deg": longitude,
+        "altitude_msl_m": altitude, "altitude_ellipsoid_m": altitude,
+        "eph": 0.9 if fix else 100.0, "epv": 1.8 if fix else 100.0, "s_variance_m_s": 0.4 if fix else 100.0,
+        "hdop": 0.7 if fix else 100.0, "vdop": 1.1 if fix else 100.0, "satellites_used": 14 if fix else 0,
+        "vel_ned_valid": fix, "vel_n_m_s": vx, "vel_e_m_s": vy, "vel_d_m_s": vz,
+        "vel_m_s": math.hypot(vx, vy), "cog_rad": math.atan2(vy, vx),
+        "time_utc_usec": _BOOTED_AT + now if is_started else 0,
+    }  # fmt: skip

@@ -35,7 +35,7 @@ document.addEventListener("keydown", event => {
   const action = keys[event.key]
   if (isPress && part) act(part)
   else if (event.key == "/") search.view?.focus?.()
-  else if (action) say(event.shiftKey && event.key.startsWith("Arrow") ? action.toUpperCase() : action)
+  else if (action) say(event.shiftKey && /^Arrow[LR]/.test(event.key) ? action.toUpperCase() : action)
   else return
   event.preventDefault()
 })

@@ -1,1 +1,0 @@
-"""Discovery of peers: vehicles, services and their status, layouts, rejected messages."""

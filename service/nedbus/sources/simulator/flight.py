@@ -1,0 +1,222 @@
+"""The simulated flight and its estimates: functions of the time since the start.
+
+The vehicle takes off and flies figures of eight at 20 m.
+
+Every lap of 120 s has the events of real flights:
+
+    t = 15 s         the heading is aligned: a heading reset
+    t = 60 to 75 s   no GPS: dead reckoning, growing error, xy invalid after 10 s; at its end resets of xy and vxy
+    t = 90 s         a reset of z
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from random import Random
+from typing import Any, Final, NamedTuple
+
+from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion, wrap
+
+TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
+LAP: Final = 120.0  # s
+OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
+ORIGIN_SET: Final = 2.0  # s after the start: the global origin is known
+REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
+BOOT: Final = 10_000_000  # us since boot at the start
+PROJECTION: Final = MapProjection(*REFERENCE[:2])
+
+_HEADING_RESET: Final = 15.0  # s into a lap
+_MAX_DEAD_RECKONING: Final = 10.0  # s after which the position is no longer valid
+_Z_RESET: Final = 90.0  # s into a lap
+_HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap: the error that the next heading reset corrects
+_Z_STEP: Final = 1.0  # m, up and down in turn
+_DRIFT: Final = 0.02  # m/s^2, half the acceleration of the error in dead reckoning
+_DELAY: Final = 5_000  # us from the sensor data to the estimate
+_SENSOR_RANGE: Final = 30.0  # m, of the distance sensor
+_GRAVITY: Final = 9.80665  # m/s^2
+
+_ALTITUDE: Final = 20.0  # m
+CLIMB: Final = 10.0  # s to this altitude
+_SIZE: Final = 40.0  # m
+_STEP: Final = 1e-3  # s, of the derivatives
+
+Vector = tuple[float, ...]  # north, east, down
+
+
+class Truth(NamedTuple):
+    """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad]."""
+
+    position: Vector
+    velocity: Vector
+    acceleration: Vector
+    heading: float
+
+
+def truth_at(time: float, direction: float) -> Truth:
+    """Return the truth at a time [s] since the start; `direction` [rad] is that of the figures."""
+    positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
+    axes = list(zip(*positions, strict=True))
+    velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
+    acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
+    moving = math.hypot(velocity[0], velocity[1]) > 0.5
+    heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
+    return Truth(positions[1], velocity, acceleration, heading)
+
+
+def _position(time: float, direction: float) -> Vector:
+    climb = _smoothstep(time / CLIMB)
+    # The phase starts slowly after the climb and then advances evenly, one figure a minute.
+    late = max(0.0, time - 8.0)
+    phase = math.tau / 60.0 * (late - 6.0 * (1.0 - math.exp(-late / 6.0)))
+    along, across = _SIZE * math.sin(phase), _SIZE / 2 * math.sin(2 * phase)
+    cos, sin = math.cos(direction), math.sin(direction)
+    down = -climb * (_ALTITUDE + 2.0 * math.sin(phase / 2) ** 2)
+    return along * cos - across * sin, along * sin + across * cos, down
+
+
+def _smoothstep(part: float) -> float:
+    """Rise from 0 to 1 with continuous acceleration."""
+    part = min(1.0, max(0.0, part))
+    return part**3 * (10 - 15 * part + 6 * part**2)
+
+
+class _State(NamedTuple):
+    """The state of an estimate: its errors in SI units, seconds of dead reckoning, counts and deltas of resets."""
+
+    position: tuple[float, float, float]
+    velocity: tuple[float, float, float]
+    heading: float
+    dead_reckoning: float
+    counters: Mapping[str, int]
+    deltas: Mapping[str, Any]
+
+    @property
+    def xy_valid(self) -> bool:
+        return self.dead_reckoning < _MAX_DEAD_RECKONING
+
+
+class Estimator:
+    """An estimate of the truth with an error that wanders, drifts without GPS, and is reset.
+
+    `noise`: size of its position error [m]; `aided`: it always has position aiding, and no resets.
+    """
+
+    def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
+        random = Random(f"{seed}/{name}")
+        self._noise, self._aided = noise, aided
+        self._phases = [random.uniform(0.0, math.tau) for _ in range(3)]
+        direction = random.uniform(-math.pi, math.pi)
+        self._north, self._east = math.cos(direction), math.sin(direction)  # of the drift
+        self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
+
+    def xy_valid(self, time: float) -> bool:
+        """Return the validity of its horizontal position and velocity."""
+        return self._at(time).xy_valid
+
+    def fields(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the message of this moment; EKF2's limits are infinite."""
+        state = self._at(time)
+        position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
+        velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
+        return {
+            **_motion(time, position, velocity, truth.acceleration, origin=time >= ORIGIN_SET),
+            **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
+            **{f"delta_{name}": delta for name, delta in state.deltas.items()},
+            **{f"{name}_reset_counter": count for name, count in state.counters.items()},
+            "heading": wrap(truth.heading + state.heading), "heading_var": 0.001 + state.heading**2,
+            "unaided_heading": truth.heading,
+            "heading_good_for_control": state.counters["heading"] > 0 or self._aided, "tilt_var": 1e-4,
+            **self._deviations(state),
+            "evh": self._noise / 2 + 0.05 * state.dead_reckoning, "evv": self._noise / 2,
+            **dict.fromkeys(("vxy_max", "vz_max", "hagl_min", "hagl_max_z", "hagl_max_xy"), math.inf),
+        }  # fmt: skip
+
+    def attitude(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the attitude: the tilt is that of a multicopter's thrust, which makes the acceleration; no wind."""
+        state, (ax, ay, az) = self._at(time), truth.acceleration
+        cos, sin = math.cos(truth.heading), math.sin(truth.heading)
+        forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
+        roll = math.atan2(right, math.hypot(forward, up))
+        q = euler_to_quaternion(roll, math.atan2(-forward, up), truth.heading + state.heading)
+        delta = euler_to_quaternion(0.0, 0.0, state.deltas["heading"])
+        return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"]}
+
+    def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
+        """Return the global position; there is one once the origin is known."""
+        state = self._at(time)
+        x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
+        (latitude, longitude), altitude = PROJECTION.reproject(x, y), REFERENCE[2]
+        return {
+            **_timestamps(time),
+            "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
+            "lat_lon_valid": state.xy_valid, "alt_valid": True, "delta_alt": -state.deltas["z"], "delta_terrain": 0.0,
+            "lat_lon_reset_counter": state.counters["xy"], "alt_reset_counter": state.counters["z"],
+            **self._deviations(state),
+            "terrain_alt": altitude, "terrain_alt_valid": -z < _SENSOR_RANGE,
+        }  # fmt: skip
+
+    def _at(self, time: float) -> _State:
+        lap, lap_time = (0.0, 0.0) if self._aided else divmod(time + TICK / 2, LAP)
+        outages, steps, alignments = (int(lap) + (lap_time >= end) for end in (OUTAGE[1], _Z_RESET, _HEADING_RESET))
+        dead_reckoning = lap_time - OUTAGE[0] if OUTAGE[0] <= lap_time < OUTAGE[1] else 0.0
+        moved, speed = self._drift(dead_reckoning)
+        corrected, slowed = self._drift(OUTAGE[0] - OUTAGE[1] if outages else 0.0)
+        x, y, z = (self._noise * (math.sin(time / 7.0 + each) + math.sin(time / 2.3 - each)) for each in self._phases)
+        return _State(
+            position=(x + moved[0], y + moved[1], z + _Z_STEP * (steps % 2)),
+            velocity=(*speed, 0.0),
+            heading=0.0 if _HEADING_RESET <= lap_time < _HEADING_DISTURBED else self._heading_error,
+            dead_reckoning=dead_reckoning,
+            counters={"xy": outages, "z": steps, "vxy": outages, "vz": 0, "heading": alignments},
+            deltas={
+                "xy": (-corrected[0], -corrected[1]), "vxy": slowed, "vz": 0.0,
+                "z": _Z_STEP * (1 if steps % 2 else -1) if steps else 0.0,
+                "heading": -self._heading_error if alignments else 0.0,
+            },
+        )  # fmt: skip
+
+    def _drift(self, seconds: float) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the errors of position and velocity after this time of dead reckoning."""
+        moved, speed = _DRIFT * seconds**2, 2 * _DRIFT * seconds
+        return (moved * self._north, moved * self._east), (speed * self._north, speed * self._east)
+
+    def _deviations(self, state: _State) -> dict[str, object]:
+        return {
+            "eph": self._noise * 2 + _DRIFT * state.dead_reckoning**2, "epv": self._noise * 3,
+            "dead_reckoning": state.dead_reckoning > 0,
+        }  # fmt: skip
+
+
+def truth_fields(time: float, truth: Truth) -> dict[str, object]:
+    """Return the groundtruth message: variances and limits are 0, as simulators send them."""
+    return {
+        **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
+        **_motion(time, truth.position, truth.velocity, truth.acceleration, origin=True),
+        **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
+        "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
+        "heading": truth.heading, "unaided_heading": truth.heading,
+    }  # fmt: skip
+
+
+def _timestamps(time: float) -> dict[str, object]:
+    timestamp = BOOT + round(time * 1e6)
+    return {"timestamp": timestamp, "timestamp_sample": timestamp - _DELAY}
+
+
+def _motion(
+    time: float, position: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float], *, origin: bool
+) -> dict[str, object]:
+    """Return the fields that estimate and truth have in common, with a distance sensor above flat ground."""
+    latitude, longitude, altitude = REFERENCE if origin else (math.nan,) * 3
+    names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
+    in_range = distance < _SENSOR_RANGE
+    return {
+        **_timestamps(time),
+        **dict(zip(names, (*position, *velocity, *acceleration), strict=True)), "z_deriv": velocity[2],
+        "xy_global": origin, "z_global": origin, "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if origin else 0,
+        "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
+        "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
+        "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,
+        "dist_bottom_sensor_bitfield": VehicleLocalPosition.DIST_BOTTOM_SENSOR_RANGE if in_range else 0,
+    }  # fmt: skip
