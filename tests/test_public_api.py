@@ -47,7 +47,8 @@ def annotations_of(public: object) -> typing.Iterator[str]:
         yield from (str(text) for name, text in inspect.get_annotations(public).items() if not name.startswith("_"))
         for name, member in list(vars(public).items()):
             function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
-            made_by_users = name == "__init__" and not re.search(r"get one from|from `connect", public.__doc__ or "")
+            returned = r"get one from|from `connect|returns one|yields them"
+            made_by_users = name == "__init__" and not re.search(returned, public.__doc__ or "")
             if inspect.isfunction(function) and (not name.startswith("_") or made_by_users):
                 yield from map(str, inspect.get_annotations(function).values())
 

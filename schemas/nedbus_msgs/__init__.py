@@ -1,4 +1,4 @@
-"""The contract of nedbus: the messages, their layouts, topics and wire format; no I/O, no Zenoh."""
+"""The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe

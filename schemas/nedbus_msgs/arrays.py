@@ -1,7 +1,7 @@
-"""Messages as a structured array of NumPy: decoding, encoding and validation of many at once.
+"""Messages as structured NumPy arrays: decode, encode and validate in bulk.
 
-Types, offsets and rules come from the same definition as those of a single message.
-Import this module only where arrays are used: NumPy takes longer to load than all the rest.
+Types, offsets and rules come from the same definition as for single messages.
+Import this module only where arrays are used: NumPy takes longer to load than everything else.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ MessageArray = npt.NDArray[np.void]
 """A structured array: one element per message, one column per field, such as `array["x"]`."""
 
 _CAST_FROM: Final = 256
-"""Messages from which NumPy's cast of all fields is faster than taking the bytes one by one."""
+"""Number of messages from which a NumPy cast of all fields is faster than copying single bytes."""
 _COLUMNS_FROM: Final = 20
-"""Messages from which checking the rules column by column is faster than one message after the other."""
+"""Number of messages from which checking rules by column is faster than by message."""
 
 
 def _numpy_type(kind: FieldType) -> Any:
@@ -45,9 +45,9 @@ def _numpy_type(kind: FieldType) -> Any:
 
 
 class Arrays(Generic[M]):
-    """The messages of one definition as structured arrays.
+    """Conversion of the messages of one definition to and from structured arrays.
 
-    `dtype`: PX4's fields in the order of the model, with PX4's types.
+    `dtype`: the fields in the order of the model, with PX4's types.
     """
 
     def __init__(self, definition: Definition[M]) -> None:
@@ -56,7 +56,7 @@ class Arrays(Generic[M]):
         self.dtype = np.dtype([(name, _numpy_type(kind)) for name, kind in types.items()])
         self._codec = codec_of(definition)
         self._size = size = self._codec.size
-        # The same bytes as the dtype, and a payload without its tags: one name for each value, also of arrays.
+        # Two flat dtypes with a name for each value, also those in arrays: of the array's bytes, and of a payload.
         named = [(f"{name}.{part}", self.dtype[name].base, offset) for name, part, offset in self._codec.offsets]
         self._native = np.dtype([(name, kind) for name, kind, _ in named])
         self._wire = np.dtype(
@@ -75,7 +75,7 @@ class Arrays(Generic[M]):
         self._value_mask = ~self._tag_mask
         self._arrays = [index for index, kind in enumerate(types.values()) if kind.length]
         ruled = {name for rule in definition.rules for name in rule.fields}
-        # The fields that rules look at, unpacked from the bytes of an element: as a struct, and their places in it.
+        # A struct that unpacks the fields with rules from the bytes of an element, and the index of each.
         steps, places, index = [], dict[str, str](), 0
         for name, kind in types.items():
             if name not in ruled:
@@ -91,11 +91,11 @@ class Arrays(Generic[M]):
         )
 
     def decode(self, payloads: bytes) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Return the messages of concatenated payloads of the codec's size, and a mask of those that are valid.
+        """Return the messages of concatenated payloads of the codec's size, and a mask of the valid ones.
 
         A payload that is False in the mask may still be valid: the codec decides.
         """
-        # Leaves zeros where the tags are right, and makes the bools 0 or 1.
+        # Zero where the tags are right, and 0 or 1 for bools.
         wire = np.frombuffer(payloads, np.uint8).reshape(-1, self._size) ^ self._tags
         wrong = wire & self._tag_mask
         if not np.count_nonzero(wrong):
@@ -117,7 +117,7 @@ class Arrays(Generic[M]):
         return wire.tobytes()
 
     def valid_mask(self, array: MessageArray) -> npt.NDArray[np.bool_]:
-        """Return a mask of the messages that pass the rules between fields; the array has this dtype."""
+        """Return a mask of the messages in an array of this dtype that pass the rules."""
         if len(array) < _COLUMNS_FROM:
             return np.fromiter(map(self._passes_rules, self._ruled.iter_unpack(array.tobytes())), np.bool_, len(array))
         invalid = np.zeros(len(array), np.bool_)
@@ -126,7 +126,7 @@ class Arrays(Generic[M]):
         return ~invalid
 
     def require_valid(self, array: MessageArray) -> None:
-        """Raise InvalidMessageError for the first message that breaks a rule between fields, with its index."""
+        """Raise InvalidMessageError, with its index, for the first message that breaks a rule."""
         for index in np.flatnonzero(~self.valid_mask(array)).tolist():
             try:
                 self._codec.encode_row(self.to_row(array[index]))
@@ -136,11 +136,11 @@ class Arrays(Generic[M]):
                 ) from exc
 
     def of(self, messages: Sequence[M]) -> MessageArray:
-        """Return messages as a structured array."""
+        """Convert messages to a structured array."""
         return np.array([tuple(message.__dict__.values()) for message in messages], self.dtype)
 
     def absent(self, count: int) -> MessageArray:
-        """Return `count` messages of which nothing is provided: NaN, false and 0."""
+        """Return `count` messages with no field provided: NaN, false and 0."""
         return np.repeat(np.array([tuple(kind.absent for kind in self.definition.types.values())], self.dtype), count)
 
     def to_row(self, element: np.void) -> Values:
@@ -156,7 +156,7 @@ class Arrays(Generic[M]):
         return self.definition.model(**fields)
 
     def encode_cdr(self, array: MessageArray, layout: Layout) -> npt.NDArray[np.void]:
-        """Return the CDR payloads of messages in a layout of fields of the model, one per element, not validated."""
+        """Return unvalidated CDR payloads, one per element; all fields of the layout are the model's."""
         cdr = self._cdr(layout)
         payloads = np.frombuffer(bytearray(cdr_layout(layout).zeros * len(array)), cdr)
         for name in layout.types:
@@ -164,9 +164,9 @@ class Arrays(Generic[M]):
         return payloads
 
     def decode_cdr(self, payloads: Sequence[bytes], layout: Layout) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Return the messages of CDR payloads of a layout of fields of the model, and a mask of those that are valid.
+        """Return the messages of CDR payloads, and a mask of the valid ones; all fields of the layout are the model's.
 
-        A payload that is False in the mask may still be valid: `decode_cdr` and the model decide.
+        A payload that is False in the mask may still be valid: `decode_with` and the model decide.
         """
         zeros = cdr_layout(layout).zeros
         fits = np.array([len(each) == len(zeros) and each[:2] == HEAD[:2] for each in payloads], bool)
@@ -204,7 +204,7 @@ class Arrays(Generic[M]):
 
 @cache
 def arrays_of(definition: Definition[M]) -> Arrays[M]:
-    """Return the arrays of the messages of a definition."""
+    """Return the array conversion of a definition, cached."""
     return Arrays(definition)
 
 

@@ -1,22 +1,22 @@
-"""The root of the error tree, and the errors of the contract; `nedbus.errors` draws the whole tree."""
+"""Root of the error tree, and the errors of the contract; `nedbus.errors` shows the whole tree."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
-_MAX_SHOWN: Final = 200  # characters of a value: a peer's key has up to 64 kB
+_MAX_SHOWN: Final = 200  # characters of a value, as a peer's key may have 64 kB
 
 
 class NedbusError(Exception):
-    """Base of every error that nedbus raises on purpose; it can be pickled, for process pools."""
+    """Base of all errors that nedbus raises on purpose; picklable, for process pools."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), self.args, self.__dict__)
 
 
 def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict[str, object]) -> NedbusError:
-    """Make an error from its finished text; its constructor would format the text again."""
+    """Create an error from its final text, which the constructor would format again."""
     error = kind.__new__(kind)
     error.args = arguments
     error.__dict__.update(facts)
@@ -32,11 +32,11 @@ class AddressError(NedbusError, ValueError):
 
 
 class LayoutError(NedbusError, ValueError):
-    """Raised when a layout is unknown, or when field names are not those of a layout."""
+    """Raised when a layout is unknown, or if field names are not those of a layout."""
 
 
 class DecodeError(NedbusError, ValueError):
-    """Raised when a payload is not a valid message, whose name is `message`; `reason` is one line."""
+    """Raised when a payload is not a valid message of the name `message`; `reason` is one line."""
 
     def __init__(self, reason: str, message: str = "message") -> None:
         super().__init__(f"not a {message}: {reason}")
@@ -46,7 +46,7 @@ class DecodeError(NedbusError, ValueError):
 class UnknownLayoutError(DecodeError):
     """Raised when a payload has a layout number that this reader does not know.
 
-    `layout` is that number, `count` the number of fields behind it, `known` the numbers that can be decoded.
+    `layout`: that number; `count`: the number of fields after it; `known`: the numbers that can be decoded.
     """
 
     def __init__(self, layout: int, count: int, known: Sequence[int], message: str) -> None:
@@ -60,10 +60,10 @@ class UnknownLayoutError(DecodeError):
 
 
 class InvalidMessageError(NedbusError, ValueError):
-    """Raised when a message that is published has a wrong type, an unknown field, or breaks a rule.
+    """Raised when a message to publish has a wrong type or an unknown field, or breaks a rule.
 
-    `reason` is one line: each field, the rule that it breaks, and its value.
-    `violations` has the field and the rule of each, without the value; `index` is the message's in an array.
+    `reason`: one line with each invalid field, the broken rule and the value.
+    `violations`: field and broken rule of each, without the value; `index`: that of the message in an array.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The flags of a VehicleLocalPosition that cast doubt on it, as text."""
+"""Describe the flags of a VehicleLocalPosition that cast doubt on it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from .messages.vehicle_local_position import VehicleLocalPosition
 from .model.rules import FiniteWhile
 
 FLAG_FIELDS: Final = next(rule.flags for rule in VehicleLocalPosition.RULES if isinstance(rule, FiniteWhile))
-"""The fields that are finite while a flag is set."""
+"""The fields that must be finite while a flag is set."""
 
 _VALID: Final = {"xy_valid": "xy", "z_valid": "z", "v_xy_valid": "vxy", "v_z_valid": "vz"}
-_WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # set is bad
+_WARNINGS: Final = {"dead_reckoning": "dead reckoning"}  # bad if set
 DOUBT_FLAGS: Final = (*_VALID, *_WARNINGS)
-"""The flags that are shown when they cast doubt on a position."""
+"""The flags that can cast doubt on a position."""
 
 
 def describe_flags(shares: Mapping[str, float]) -> str:
-    """Return the flags that cast doubt on messages, given the share of them with each flag set, 0 to 1; else "ok".
+    """Describe the flags that cast doubt on messages, given each flag's share of messages with it set (0 to 1).
 
-    "xy z invalid, dead reckoning" holds for all messages, "xy invalid 20 %" for some; a flag without a share is fine.
+    "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some of them; "ok" if there is none.
+    A flag without a share is ignored.
     """
     bad = {name: 1.0 - shares[name] for name in _VALID if name in shares}
     bad |= {name: shares[name] for name in _WARNINGS if name in shares}
@@ -36,5 +37,5 @@ def describe_flags(shares: Mapping[str, float]) -> str:
 
 
 def message_doubts(message: VehicleLocalPosition) -> str:
-    """Return the flags that cast doubt on one message, "ok" if none does."""
+    """Describe the flags that cast doubt on one message; "ok" if there is none."""
     return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})

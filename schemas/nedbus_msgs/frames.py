@@ -1,7 +1,7 @@
-"""Conversions between frames: NED and ENU, FRD and FLU, local and global positions, as PX4 computes them.
+"""Frame conversions as in PX4: NED and ENU, FRD and FLU, local and global positions.
 
 Angles are radians, latitudes and longitudes degrees, lengths metres.
-Source: PX4's MapProjection (azimuthal equidistant, on a sphere), so that a position agrees with PX4's own
+Source: PX4's MapProjection (azimuthal equidistant, on a sphere); a position agrees with PX4's own
 `vehicle_global_position` to the last digits.
 """
 
@@ -55,24 +55,24 @@ def yaw_enu_to_ned(yaw: float) -> float:
 
 
 def variances_ned_to_enu(variances: Vector) -> Vector:
-    """Convert variances of north, east and down to those of east, north and up: none changes its sign."""
+    """Convert variances of north, east and down to east, north and up; no sign changes."""
     north, east, down = variances
     return east, north, down
 
 
 def variances_enu_to_ned(variances: Vector) -> Vector:
-    """Convert variances of east, north and up to those of north, east and down: none changes its sign."""
+    """Convert variances of east, north and up to north, east and down; no sign changes."""
     east, north, up = variances
     return north, east, up
 
 
 def wrap(angle: float) -> float:
-    """Return the same angle within [-pi, pi]."""
+    """Wrap an angle to [-pi, pi]; NaN for NaN and infinities."""
     return math.remainder(angle, math.tau) if math.isfinite(angle) else math.nan
 
 
 def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the rotation from body FRD to NED (w, x, y, z) of a roll, a pitch and a heading."""
+    """Return the rotation from body FRD to NED (w, x, y, z) for roll, pitch and heading."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw))
     return (
         cr * cp * cy + sr * sp * sy,
@@ -94,7 +94,7 @@ def quaternion_to_euler(q: Sequence[float]) -> Vector:
 
 @dataclass(frozen=True, slots=True)
 class MapProjection:
-    """The plane that touches PX4's sphere at an origin: latitude and longitude [deg] <-> north and east [m]."""
+    """Projection to the plane that touches PX4's sphere at an origin: latitude, longitude [deg] <-> north, east [m]."""
 
     latitude: float
     longitude: float
@@ -119,7 +119,7 @@ class MapProjection:
         near, far = math.cos(angle), math.sin(angle)
         up = near * sine + x * far * cosine / angle
         along, aside = cosine * near - x * sine * far / angle, y * far / angle
-        # PX4's arc sine is not exact at the poles; elsewhere this is the same.
+        # PX4 uses an arc sine, which is inexact at the poles; elsewhere the result is the same.
         latitude = math.degrees(math.atan2(up, math.hypot(along, aside)))
         return latitude, math.remainder(self.longitude + math.degrees(math.atan2(aside, along)), 360.0)
 
@@ -134,9 +134,9 @@ class GlobalPosition(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class NoOrigin:
-    """Returned for a message without a global origin; it is false: `if position := to_global(message):`.
+    """Returned for a message without a global origin; falsy, for `if position := to_global(message):`.
 
-    `reason` names what is missing.
+    `reason`: the missing part.
     """
 
     reason: str
@@ -146,7 +146,7 @@ class NoOrigin:
 
 
 def to_global(message: Message) -> GlobalPosition | NoOrigin:
-    """Return the global position of a message; NoOrigin while it has no global origin.
+    """Return the global position of a message, or NoOrigin while it has no global origin.
 
     The altitude is NaN while only the horizontal origin is known.
     The position is that of x, y and z, valid or not: check `xy_valid` and `z_valid`.
@@ -160,7 +160,7 @@ def to_global(message: Message) -> GlobalPosition | NoOrigin:
 
 
 def to_local(position: GlobalPosition, origin: Message) -> Vector | NoOrigin:
-    """Return x, y and z of a global position in the local frame of a message; NoOrigin while that has no origin.
+    """Return x, y and z of a global position in the local frame of a message, or NoOrigin while that has no origin.
 
     z is NaN while only the horizontal origin is known.
     """

@@ -1,4 +1,4 @@
-"""The contract as functions: a message to its payload and back, and its schema."""
+"""Functions of the contract: encode and decode messages, and describe their schemas."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ _FIRST: Final = cast("type[Any]", VehicleLocalPosition)
 
 
 def definition_of(message: type[M] | str) -> Definition[M]:
-    """Return the definition of a message, given its class, its name or one of its topics; KeyError if it is unknown."""
+    """Return the definition of a message by class, name or topic; raise KeyError if it is unknown."""
     if isinstance(message, str):
         return MESSAGES[message] if message in MESSAGES else BY_TOPIC[message]
     return message.DEFINITION
 
 
 DEFAULT: Final[Definition[VehicleLocalPosition]] = definition_of(DEFAULT_TOPIC)
-"""The message of a call that names none."""
+"""The default message of functions that take one."""
 
 
 def encode(message: Message) -> bytes:
-    """Return the payload of a message; floats are float32 where PX4 has one.
+    """Return the payload of a message; float32 fields are rounded.
 
-    Raises EncodeError for values that do not fit their fields, in a message whose validation was bypassed.
+    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
     """
     return codec_of(message.DEFINITION).encode(message)
 
 
 def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = None) -> M:
-    """Return the message of a payload, validated by its model.
+    """Return the validated message of a payload.
 
-    `newer` has the field names of layouts that this version does not know, by their number on the wire: fields with a
-    known name are decoded, the others ignored.
+    `newer`: field names of layouts unknown to this version, by number on the wire; fields with known names are decoded,
+    others ignored.
 
     Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
     not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
@@ -48,21 +48,21 @@ def decode(payload: bytes, message: type[M] = _FIRST, *, newer: Newer | None = N
 
 
 def schema_of(definition: Definition[Any]) -> dict[str, object]:
-    """Return the description of a message that publishers answer queries with: its JSON Schema and its layouts."""
+    """Return the description of a message for queries: its JSON Schema and its layouts."""
     return {"json_schema": json_schema_of(definition), "layouts": layout_table_of(definition)}
 
 
 def json_schema_of(definition: Definition[Any]) -> dict[str, object]:
-    """Return the JSON Schema (2020-12) of a message as JSON; NaN and infinities are the strings of those names."""
+    """Return the JSON Schema (2020-12) of a message; NaN and infinities are strings of those names."""
     schema = definition.model.model_json_schema()
-    # JSON has no NaN, and a writer should leave out what is not provided: defaults stay in the model.
+    # No defaults: JSON has no NaN, and a writer should omit fields that are not provided.
     for field in schema["properties"].values():
         field.pop("default", None)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
 def layout_table_of(definition: Definition[Any]) -> list[dict[str, object]]:
-    """Return every layout as name, number on the wire (or None), and its fields in order, each with name and type."""
+    """Return all layouts with name, number on the wire (or None), and fields in order, each with name and type."""
     return [
         {
             "name": layout.name,

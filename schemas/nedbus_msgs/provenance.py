@@ -1,10 +1,10 @@
-"""The provenance of messages, carried by their Zenoh encoding: the source, and the fields that it does not provide.
+"""Provenance of messages, carried in their Zenoh encoding: the source, and the fields that it does not provide.
 
     application/msgpack;px4_msgs/VehicleLocalPosition;source=mavlink;missing=fffff00000000
 
-`missing` is a hexadecimal mask with a bit for each field in PX4's order, the lowest for `timestamp`; without it no
+`missing` is a hexadecimal mask with one bit per field in PX4's order, the lowest for `timestamp`; it is left out if no
 field is missing.
-Almost all messages of a publisher have the same encoding, so both directions are cached.
+Both directions are cached, as almost all messages of a publisher have the same encoding.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _CACHE_SIZE: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """The source of a message, as far as its publisher reports it.
+    """The origin of a message, as reported by its publisher.
 
-    `source`: the kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if it is unknown.
+    `source`: the kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if unknown.
     `missing`: the fields that the source does not provide; they hold NaN, false or 0.
 
     Raises AddressError for a source that is not 1 to 32 of a-z 0-9 _ -.
@@ -44,7 +44,7 @@ class Provenance:
 
 @lru_cache(_CACHE_SIZE)
 def encoding_of(definition: Definition[Any], source: str | None, provided: frozenset[str] | None = None) -> str:
-    """Return the Zenoh encoding of messages of a source that provides these fields; None stands for all fields."""
+    """Return the Zenoh encoding for a source that provides these fields; None means all fields."""
     names = definition.names
     mask = 0 if provided is None else sum(1 << index for index, name in enumerate(names) if name not in provided)
     parts = [f"application/msgpack;px4_msgs/{definition.name}"]
@@ -57,14 +57,14 @@ def encoding_of(definition: Definition[Any], source: str | None, provided: froze
 
 @lru_cache(_CACHE_SIZE)
 def message_name_of(encoding: str) -> str | None:
-    """Return the name of the message that an encoding names; a payload of a known topic is decoded without it."""
+    """Return the message name in an encoding, None if there is none; known topics are decoded without it."""
     found = _ENCODING.fullmatch(encoding)
     return found[1] if found else None
 
 
 @lru_cache(_CACHE_SIZE)
 def provenance_of(definition: Definition[Any], encoding: str) -> Provenance:
-    """Return the provenance in an encoding; unknown or invalid parts are ignored, as other programs publish too."""
+    """Parse the provenance in an encoding; unknown or invalid parts are ignored, as other programs also publish."""
     parts = dict(part.partition("=")[::2] for part in encoding.split(";")[2:])
     source, missing = parts.get("source", ""), parts.get("missing", "")
     fits = _MISSING.fullmatch(missing) and len(missing) <= math.ceil(len(definition.names) / 4)

@@ -1,9 +1,9 @@
-"""A continuous track of a stream whose estimator resets, computed from the deltas and reset counters of its messages.
+"""Compute a continuous track of a stream despite estimator resets, from the deltas and reset counters of its messages.
 
-When an estimator corrects itself its position jumps, and the message holds the delta.
+When an estimator corrects itself, its position jumps, and the message holds the delta.
 A delta explains a jump only if its counter rose by exactly one since the previous message.
-A new origin resets as well, and then the delta may describe a jump that did not happen: it is compared with the values.
-Source: counted on real logs, among them one where `delta_z` is -179.5 m and z moved by 2 mm.
+A new origin also counts as a reset, but its delta may describe a jump that did not happen, so it is compared with the
+values. Source: real logs, in one of which `delta_z` is -179.5 m and z moved by 2 mm.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Point = tuple[float, ...]
 
 
 class _Fields(NamedTuple):
-    """The fields of one quantity: its values, their delta, its reset counter, and their rates."""
+    """The fields of one quantity: values, delta, reset counter, and rates of the values."""
 
     values: tuple[str, ...]
     delta: str
@@ -50,18 +50,18 @@ _QUANTITIES: Final[Mapping[Quantity, _Fields]] = {
 RESET_COUNTERS: Final[Mapping[Quantity, str]] = {name: fields.counter for name, fields in _QUANTITIES.items()}
 """The field that counts the resets of each quantity, modulo 256."""
 
-_TOLERANCE: Final = 2.0  # m between a jump at a new origin and the candidate that explains it
+_TOLERANCE: Final = 2.0  # m between an observed jump at a new origin and a candidate that explains it
 
 
 @dataclass(frozen=True, slots=True)
 class Continuous:
-    """One message of a continuous track: its values without the jumps of all resets since the track began.
+    """One point of a continuous track: the values of a message without the jumps of all resets since its beginning.
 
-    Frame and units are the message's; `heading` is within [-pi, pi].
-    `reset`: the quantities that were reset just before this message, explained or not.
-    `discontinued`: those with an unexplained jump: their track starts again here, with the message's own value.
+    Frame and units are those of the message; `heading` is within [-pi, pi].
+    `reset`: quantities that were reset just before this message, explained or not.
+    `discontinued`: quantities with an unexplained jump, whose track restarts here with the value of the message.
     `origin_changed`: the global origin was set, or changed.
-    `resets`: the number of resets of each since the first message.
+    `resets`: number of resets of each quantity since the first message.
     """
 
     x: float
@@ -79,9 +79,9 @@ class Continuous:
 
 
 class ResetTracker:
-    """Track one stream, that is one address: each EKF has resets, and an origin, of its own.
+    """Tracker of one stream, that is, one address; each EKF has its own resets and its own origin.
 
-    The selector of several EKFs does not report resets of `dist_bottom`: its track of that may jump.
+    PX4's selector of several EKFs does not report resets of `dist_bottom`, so that track may jump.
     """
 
     def __init__(self) -> None:
@@ -90,9 +90,9 @@ class ResetTracker:
         self._resets: dict[Quantity, int] = dict.fromkeys(_QUANTITIES, 0)
 
     def add(self, message: Message) -> Continuous:
-        """Add the next message of the stream, and return its values without jumps.
+        """Add the next message of the stream and return its values without jumps.
 
-        When the timestamp goes back the vehicle has rebooted: all tracks start again.
+        All tracks restart when the timestamp goes back, as the vehicle has rebooted.
         """
         last, self._last = self._last, message
         reset: set[Quantity] = set()
@@ -128,14 +128,14 @@ class ResetTracker:
 
 
 def _delta(fields: _Fields, message: Message, count: int) -> Point | None:
-    """Return the jump by the delta of the message, None if there were other resets or the delta is not provided."""
+    """Return the delta of a single reset; None if there were several, or the delta is not provided."""
     delta = getattr(message, fields.delta)
     jump: Point = delta if isinstance(delta, tuple) else (delta,)
     return jump if count == 1 and all(map(math.isfinite, jump)) else None
 
 
 def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: int) -> Point | None:
-    """Return the jump at a new origin: none, the delta, or the shift between the origins, whichever fits the values."""
+    """Return the jump at a new origin: zero, the delta or the shift of the origin, if one fits the values."""
     fields = _QUANTITIES[name]
     candidates = [fields.zero, _delta(fields, message, count), _shift_of_origin(name, last, message)]
     seconds = (message.timestamp - last.timestamp) / 1e6
@@ -150,7 +150,7 @@ def _jump_of_new_origin(name: Quantity, last: Message, message: Message, count: 
 
 
 def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point | None:
-    """Return the move of a fixed point in the local frame as its origin changes."""
+    """Return the change of a fixed point's local coordinates when the origin changes."""
     if name == "z":
         step = message.ref_alt - last.ref_alt
         return (step,) if math.isfinite(step) else None
@@ -160,6 +160,6 @@ def _shift_of_origin(name: Quantity, last: Message, message: Message) -> Point |
 
 
 def _origin(message: Message) -> tuple[float | None, ...]:
-    """Return the origin with None for NaN, so that two missing origins are equal."""
+    """Return the origin with None for NaN, which makes two missing origins equal."""
     values = (message.ref_lat, message.ref_lon, message.ref_alt)
     return tuple(value if math.isfinite(value) else None for value in values)

@@ -1,4 +1,4 @@
-"""Addresses and selections of streams, their key expressions, and their topics in ROS 2."""
+"""Addresses and selections of streams, their key expressions, and their ROS 2 topics."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ DEFAULT_PREFIX: Final = "nedbus"
 
 _TOPIC = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
 _TOPIC_LENGTH: Final = 64
-_SIMILAR: Final = 0.9  # of two names from which one is taken for a misspelling of the other
+_SIMILAR: Final = 0.9  # similarity from which a name counts as a misspelling of another
 _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
-_RATE: Final = "/@rate/"  # between the key of a stream and the messages a second to which it is downsampled
+_RATE: Final = "/@rate/"  # between the key of a stream and its downsampled rate [messages per second]
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
 _PX4_PATH: Final = ("fmu", "out")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
@@ -46,7 +46,7 @@ class Address:
 
     @classmethod
     def from_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Return the address in a key; raise AddressError for any other key, wildcards included."""
+        """Parse a key; raise AddressError if it is not the key of an address, as with wildcards."""
         chunks = key.removeprefix(prefix + "/").split("/")
         if not key.startswith(prefix + "/") or len(chunks) not in (2, 3):
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]")
@@ -65,19 +65,19 @@ class Address:
         return f"{prefix}/{self.vehicle}/@alive/{self.stream}"
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression where rejected messages of this address are reported."""
+        """Return the key expression of reports on rejected messages of this address."""
         return f"{prefix}/@rejected/{self.vehicle}/{self.stream}"
 
     @classmethod
     def from_rate_key(cls, key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-        """Return the address in the key of a downsampled stream; raise AddressError for any other key."""
+        """Parse the key of a downsampled stream; raise AddressError for any other key."""
         whole, rate, _ = key.rpartition(_RATE)
         if not rate:
             raise AddressError("key", key, f"{prefix}/<vehicle>/<topic>[/<instance>]{_RATE}<messages a second>")
         return cls.from_key(whole, prefix=prefix)
 
     def rate_key(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of this stream, downsampled to `rate` messages a second; "*" is any rate."""
+        """Return the key expression of this stream downsampled to `rate` messages per second; "*" is any rate."""
         return f"{self.key(prefix=prefix)}{_RATE}{rate}"
 
     @property
@@ -91,7 +91,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """The addresses with this topic, vehicle and instance; "*" and None stand for any.
+    """The addresses with this topic, vehicle and instance; "*" and None match any.
 
     Raises AddressError for a vehicle, topic or instance that no address can have.
     """
@@ -107,10 +107,10 @@ class Selection:
             get_topic(self.topic)
             _check_instance(self.topic, self.instance)
         elif self.instance is not None:
-            raise AddressError("instance", self.instance, "none: name the topic as well")
+            raise AddressError("instance", self.instance, "none: give the topic as well")
 
     def matches(self, address: Address) -> bool:
-        """Return whether this address is one of them."""
+        """Return whether an address is selected."""
         return (
             self.topic in (ANY, address.topic)
             and self.vehicle in (ANY, address.vehicle)
@@ -130,12 +130,12 @@ class Selection:
         return f"{prefix}/{self.vehicle}/@alive/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
 
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of these streams, downsampled to `rate` messages a second; "*" is any rate."""
+        """Return the key expression of these streams downsampled to `rate` messages per second; "*" is any rate."""
         return f"{self.key_expr(prefix=prefix)}{_RATE}{rate}"
 
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-    """Return the address in the key of a liveliness token; raise AddressError for any other key."""
+    """Parse the key of a liveliness token; raise AddressError for any other key."""
     vehicle, alive, stream = key.removeprefix(prefix + "/").partition("/@alive/")
     if not alive:
         raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<topic>[/<instance>]")
@@ -143,12 +143,12 @@ def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
 
 
 def rejected_key_expr(*, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key expression for the reports of rejected messages of all addresses."""
+    """Return the key expression of reports on rejected messages of all addresses."""
     return f"{prefix}/@rejected/**"
 
 
 def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
-    """Return the address that a report is about; raise AddressError for any other key."""
+    """Parse the key of a report on rejected messages; raise AddressError for any other key."""
     begin = f"{prefix}/@rejected/"
     if not key.startswith(begin):
         raise AddressError("key", key, f"{begin}<vehicle>/<topic>[/<instance>]")
@@ -156,27 +156,27 @@ def address_of_rejected_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Addres
 
 
 def schema_key(message: str, *, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query for the JSON Schema and the layouts of a message that a publisher knows."""
+    """Return the key to query publishers for the JSON Schema and the layouts of a message."""
     return f"{prefix}/@schema/{message}"
 
 
 def status_key(service: str, *, prefix: str = DEFAULT_PREFIX) -> str:
-    """Return the key to query for the status of one service; "*" stands for all services."""
+    """Return the key to query for the status of one service; "*" matches all services."""
     return f"{prefix}/@service/{service}/status"
 
 
 def ack_key(key_expr: str) -> str:
-    """Return the key to query for acknowledgements by the readers of a key or key expression."""
+    """Return the key to query readers of a key or key expression for acknowledgements."""
     return f"{key_expr}/@ack"
 
 
 def get_topic(name: object) -> Topic:
-    """Return a topic by its name; one without a file here is taken for another one of PX4's.
+    """Return a topic by name; an unknown name counts as another topic of PX4's.
 
-    Raises AddressError for a name that is not lower_snake_case, and for a misspelling of a topic that has a file here.
+    Raises AddressError for a name that is not lower_snake_case, or looks like a misspelling of a known topic.
     """
     if not isinstance(name, str):
-        raise AddressError("topic", name, 'one name: several topics need a call each, or "*" where all are read')
+        raise AddressError("topic", name, 'one name: make a call for each of several topics, or give "*" to read all')
     return TOPICS.get(name) or _other_topic(name)
 
 
@@ -188,17 +188,17 @@ def _other_topic(name: str) -> Topic:
         expected = f"one of {', '.join(topics)}" + ", or another of PX4's in lower_snake_case" * (topics is TOPICS)
         raise AddressError("topic", name, f"{base}, and {instance} as its instance" if base in TOPICS else expected)
     if meant := get_close_matches(name, TOPICS, 3, _SIMILAR):
-        raise AddressError("topic", name, f"{' or '.join(meant)}, of which it looks like a misspelling")
+        raise AddressError("topic", name, f"{' or '.join(meant)} (looks like a misspelling)")
     return Topic(name, 0.0, "another topic of PX4's", instances=None)
 
 
 def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
-    """Return the namespace, the uORB topic and the instance that the name of a ROS 2 topic stands for.
+    """Split the name of a ROS 2 topic into namespace, uORB topic and instance.
 
-    `px4_1/fmu/out/estimator_local_position_0` is namespace `px4_1` and instance 0.
+    `px4_1/fmu/out/estimator_local_position_0` has namespace `px4_1` and instance 0.
     The `_v1` of a versioned topic is ignored.
 
-    Raises AddressError for another name than PX4's.
+    Raises AddressError for a name that is not a topic of PX4's.
     """
     *path, name = topic.strip("/").split("/")
     if tuple(path[-2:]) == _PX4_PATH:
@@ -211,21 +211,21 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
 
 
 def ros2_topic_of(address: Address, namespace: str) -> str:
-    """Return the name of an address's ROS 2 topic, without a leading slash; an empty namespace stands for none."""
+    """Return the ROS 2 topic of an address, without a leading slash; an empty namespace means none."""
     plain = address.instance is None or (address.instance == 0 and get_topic(address.topic).plain_first)
     topic = address.topic if plain else f"{address.topic}_{address.instance}"
     return "/".join(filter(None, (namespace.strip("/"), *_PX4_PATH, topic)))
 
 
 def vehicle_name(vehicle: str | int) -> str:
-    """Return the name of a vehicle that is given by name or by number, such as a MAVLink system id."""
+    """Return the name of a vehicle, given by name or by number, such as a MAVLink system id."""
     return str(vehicle) if type(vehicle) is int else cast("str", vehicle)
 
 
 def check_vehicle(vehicle: object) -> None:
-    """Raise AddressError for an invalid name of a vehicle."""
+    """Raise AddressError for an invalid vehicle name."""
     if not isinstance(vehicle, str):
-        expected = 'one name, such as "7": several vehicles need a call each, or "*" where all are read'
+        expected = 'one name, such as "7": make a call for each of several vehicles, or give "*" to read all'
         raise AddressError("vehicle", vehicle, expected)
     if not _CHUNK.fullmatch(vehicle) or len(vehicle) > _VEHICLE_LENGTH:
         raise AddressError("vehicle", vehicle, f"1 to {_VEHICLE_LENGTH} of A-Z a-z 0-9 _ -")
@@ -241,6 +241,6 @@ def _check_instance(topic: str, instance: int | None) -> None:
 
 
 def check_prefix(prefix: str) -> None:
-    """Raise AddressError for an invalid key prefix: it is plain chunks with slashes between them."""
+    """Raise AddressError for an invalid key prefix; it must be plain chunks separated by slashes."""
     if not all(_CHUNK.fullmatch(chunk) for chunk in prefix.split("/")):
-        raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - with / between them")
+        raise AddressError("prefix", prefix, "chunks of A-Z a-z 0-9 _ - separated by /")

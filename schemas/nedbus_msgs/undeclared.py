@@ -1,4 +1,4 @@
-"""Messages that have no file here: defined at run time by names and types, from a log, PX4's .msg, or a publisher."""
+"""Define messages without a file at run time, by field names and types, from a log, a .msg file or a publisher."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .model.px4_types import FieldType, Timestamp
 from .model.rules import Rule
 
 PX4: Final = "PX4"
-"""Name of the only layout of such a message."""
+"""Name of the only layout of a message without a file."""
 
 _NAME = re.compile(r"[A-Z][A-Za-z0-9]{0,63}")
 _FIELD = re.compile(r"[a-z][a-z0-9_]{0,63}")
-_MOST: Final = 256  # fields of a message; PX4's largest has a third of them
+_MOST: Final = 256  # fields per message; PX4's largest has a third of that
 
 
 def define(
@@ -30,14 +30,14 @@ def define(
     meanings: Mapping[str, str] | None = None,
     rules: Sequence[Rule] = (),
 ) -> Definition[Message]:
-    """Return the definition of a message with these fields, in the order of its CDR.
+    """Define a message with these fields, in the order of its CDR.
 
-    `meanings` has unit and meaning of fields.
+    `meanings`: unit and meaning of fields, by name.
 
     Raises ValueError for an invalid name, a missing timestamp, too many fields or too many bytes.
     """
     if not _NAME.fullmatch(name):
-        raise ValueError(f"{name!r:.100} is no name of a message: expected CamelCase of at most 64 characters")
+        raise ValueError(f"{name!r:.100} is not a message name: expected CamelCase of at most 64 characters")
     types: dict[str, FieldType] = {}
     for field, kind in fields:
         if not _FIELD.fullmatch(field):
@@ -45,12 +45,12 @@ def define(
         if hasattr(Message, field):
             raise ValueError(f"a field cannot be called {field!r}: a message has a method of that name in Python")
         if field in types:
-            raise ValueError(f"two fields are called {field!r}, with those of the messages within it")
+            raise ValueError(f"two fields are called {field!r}, including those of nested messages")
         types[field] = kind
     if len(types) > _MOST:
         raise ValueError(f"{len(types)} fields, more than the {_MOST} that a message can have")
     if str(types.get("timestamp")) != "uint64":
-        raise ValueError("it has no field 'uint64 timestamp', as every message of PX4 has")
+        raise ValueError("it lacks the field 'uint64 timestamp'")
     size = 4 + sum(len(full_width(kind)[0]) for kind in types.values())
     if size > PAYLOAD_LIMIT:
         raise ValueError(f"{size} bytes, more than the {PAYLOAD_LIMIT} that a message can have")

@@ -106,7 +106,7 @@ __all__ = [
     "variances_ned_to_enu", "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
-# Imported at the first use of a name: `nedbus --version` needs none, and only the last two load NumPy.
+# Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.
 _MODULES = (
     "nedbus_msgs", "nedbus.errors", "nedbus.transport", "nedbus.events", "nedbus.client", "nedbus_msgs.arrays",
     "nedbus.recording",
@@ -118,10 +118,10 @@ def __dir__() -> list[str]:
     return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
-if not TYPE_CHECKING:  # else type checkers would accept any name
+if not TYPE_CHECKING:  # otherwise type checkers would accept any name
 
     def __getattr__(name: str) -> object:
-        """Import the module of a public name when it is first used."""
+        """Import the module of a public name on first use."""
         if name in __all__:
             module = next(each for each in map(_import_module, _MODULES) if name in each.__all__)
             return globals().setdefault(name, getattr(module, name))

@@ -1,10 +1,10 @@
-"""Every error that nedbus raises on purpose.
+"""All errors that nedbus raises on purpose.
 
     NedbusError
     ├── the caller's arguments
-    │   ├── AddressError (ValueError)        a vehicle, topic, instance, key or prefix that is invalid
-    │   ├── LayoutError (ValueError)         field names that fit no layout
-    │   ├── InvalidMessageError (ValueError) a message to publish that breaks a rule of its fields
+    │   ├── AddressError (ValueError)        an invalid vehicle, topic, instance, key or prefix
+    │   ├── LayoutError (ValueError)         field names that match no layout
+    │   ├── InvalidMessageError (ValueError) a message to publish with an invalid field
     │   ├── EncodeError (ValueError)         a message whose validation was bypassed
     │   ├── AddressInUseError (ValueError)   two publishers of one address in one process
     │   ├── ConfigError (ValueError)         a setting, a flag or a line of a file
@@ -12,7 +12,7 @@
     │   └── OutputError (OSError)            a recording or a picture that cannot be written
     ├── the network
     │   ├── ConnectError (ConnectionError)   nothing answers at the endpoints
-    │   ├── ListenError (OSError)            the endpoint cannot be listened on: the port is taken, ...
+    │   ├── ListenError (OSError)            cannot listen on the endpoint: the port is taken, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   ├── ClosedError (RuntimeError)       the bus was closed
     │   └── ForkError (RuntimeError)         this process was forked from one that was connected
@@ -21,7 +21,7 @@
         │   └── UnknownLayoutError           ... because its layout is newer than this reader
         └── SourceError                      a source that cannot be opened or read
 
-`VehicleLocalPosition(...)` and `to_message` raise Pydantic's own ValidationError, which is a ValueError too.
+`VehicleLocalPosition(...)` and `to_message` raise Pydantic's ValidationError, which is also a ValueError.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ __all__ = [
 
 
 class AddressInUseError(NedbusError, ValueError):
-    """Raised when a second publisher of an address is asked for in one process."""
+    """Raised for a second publisher of the same address in one process."""
 
     def __init__(self, address: Address) -> None:
-        super().__init__(f"{address} is published by this process already: give one of the two another vehicle")
+        super().__init__(f"this process already publishes {address}: give one of the publishers another vehicle")
         self.address = address
 
 
 class ConfigError(NedbusError, ValueError):
-    """Raised for an invalid setting; `where` names the flag, the environment variable, or file, line and column.
+    """Raised for an invalid setting; `where` is the flag, the environment variable, or file, line and column.
 
-    `key` is the option of a source that is wrong, if it is one.
+    `key`: the invalid option, if the setting is a source.
     """
 
     def __init__(self, where: str, reason: str, *, key: str = "") -> None:
@@ -70,7 +70,7 @@ class ConfigError(NedbusError, ValueError):
 
     @classmethod
     def in_file(cls, path: Path, reason: str, *, line: int | None = None, column: int | None = None) -> ConfigError:
-        """Build the error for a line and column of a file."""
+        """Create the error for a position in a file."""
         position = f", line {line}, column {column}" if line else ""
         return cls(f"{path}{position}", reason)
 
@@ -96,7 +96,7 @@ class ConnectError(NedbusError, ConnectionError):
 
 
 class ListenError(NedbusError, OSError):
-    """Raised when an endpoint cannot be listened on."""
+    """Raised when a router cannot listen on an endpoint."""
 
     def __init__(
         self,
@@ -117,17 +117,17 @@ class NoDataError(NedbusError, TimeoutError):
 
 
 class PkiError(NedbusError):
-    """Raised when a key or a certificate cannot be made, or would replace one."""
+    """Raised when a key or certificate cannot be created, or would overwrite an existing one."""
 
 
 class OutputError(NedbusError, OSError):
-    """Raised when a file cannot be written; of a recording, the messages flushed before can be read."""
+    """Raised when a file cannot be written; messages of a recording that were flushed before can be read."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         hints = {
             errno.EEXIST: "choose another name, or remove it",
             errno.ENOSPC: "free some space, or write elsewhere",
-            errno.ESTALE: "what was written is lost; write to a folder that nothing cleans up",
+            errno.ESTALE: "the written data is lost; write to a folder that is not cleaned up",
         }
         hint = hints.get(error.errno or 0, "check that its folder exists and that this user may write there")
         super().__init__(f"{path} cannot be written ({(error.strerror or str(error)).lower()}): {hint}")
@@ -138,16 +138,16 @@ class ClosedError(NedbusError, RuntimeError):
     """Raised when a bus, a subscription or a publisher is used after it was closed."""
 
     def __init__(self) -> None:
-        super().__init__("this is closed, or the bus that it came from is: connect again")
+        super().__init__("this object or its bus was closed: connect again")
 
 
 class ForkError(NedbusError, RuntimeError):
-    """Raised when nedbus is used in a process that was forked from one that was connected: Zenoh would hang there."""
+    """Raised when nedbus is used in a process forked from a connected one, in which Zenoh would hang."""
 
     def __init__(self) -> None:
         super().__init__(
             "this process was forked from one with a Zenoh session: start processes with"
-            " multiprocessing.get_context('spawn') or subprocess, or connect after the fork only"
+            " multiprocessing.get_context('spawn') or subprocess, or connect only after the fork"
         )
 
 

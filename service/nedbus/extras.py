@@ -1,4 +1,4 @@
-"""Optional dependencies: modules that are imported when they are first used."""
+"""Optional dependencies: import modules on first use."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ EXTRAS: Final = frozenset({"mcap", "mavlink", "metrics", "foxglove", "plot", "pk
 
 
 def needs(extra: str, module: str) -> Any:
-    """Import and return a module that needs an extra, or another package.
+    """Import and return a module that requires an extra or another package.
 
-    Raises ConfigError, which says what to install, when something that it imports is missing.
+    Raises ConfigError, with the package to install, if a dependency of the module is missing.
     """
     collects = gc.isenabled()
-    gc.disable()  # as in the command line: nothing that is imported is garbage
+    gc.disable()  # as in the command line: imports make no garbage
     try:
         return import_module(module)
     except ModuleNotFoundError as exc:
         missing = (exc.name or "").split(".")[0]
-        # Never by the name alone: on PyPI that name is not ours.
+        # Never install by name alone: on PyPI the name belongs to another project.
         hint = f"in a clone of nedbus, pip install '.[{extra}]'" if extra in EXTRAS else f"pip install {extra}"
         raise ConfigError(missing, f"not installed: {hint}") from exc
     finally:
@@ -33,9 +33,9 @@ def needs(extra: str, module: str) -> Any:
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:
-    """Return a `__getattr__` for a package whose names are imported when they are first used.
+    """Return a `__getattr__` for a package whose names are imported on first use.
 
-    `modules` gives the extra ("" for none) and the module of each name.
+    `modules`: the extra ("" for none) and the module of each name.
     """
 
     def get(name: str) -> object:

@@ -1,4 +1,4 @@
-"""Files that are written whole, or not at all."""
+"""Atomic writes: a file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield the name of a file to write, in the same folder; at the end it gets the name that it is to have.
+    """Yield the path of a temporary file in the same folder, and rename it to `path` on success.
 
-    Without success nothing is left behind, and with `replace` the file that was there stays as it was.
+    On failure nothing is left behind, and with `replace` the previous file is unchanged.
 
-    Raises FileExistsError when there is one already that is not to be replaced, and any other OSError of the disk.
+    Raises FileExistsError if the file exists and `replace` is false, and any other OSError of the disk.
     """
     target = Path(os.path.realpath(path))
     exists = FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))

@@ -259,7 +259,7 @@ from nedbus_msgs.arrays import dtype_of
 definition = MESSAGES["WheelEncoders"]
 run = parse_source(f"ulog:{sys.argv[1]}").open_source(vehicle="7").open()
 messages = list(run.messages)
-assert {each or definition for each in run.addresses.values()} == {definition}, "it is known"
+assert list(run.addresses.values()) == [definition], "it is known"
 sent = [codec_of(definition).encode_fields(upgrade_fields(definition, each.fields)) for each in messages]
 assert nedbus.read(sys.argv[1], "wheel_encoders")["wheel_speed"].tolist() == [[n, -n] for n in range(len(messages))]
 with nedbus.connect(sys.argv[2]) as bus:

@@ -1,1 +1,1 @@
-"""Decisions alone: no Zenoh session, no process, time given by the test."""
+"""Tests of pure decisions: no Zenoh session, no process, time given by the test."""

@@ -1,4 +1,4 @@
-"""Publishing a live source's topics that have no rate, with a clock of the test's."""
+"""Publishing topics without a rate of a live source, with a fake clock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ATTITUDE = Address("1", "vehicle_attitude")
 
 
 class Sky:
-    """A live source, and what was published: address and timestamp."""
+    """A live source, and the address and timestamp of each message that it published."""
 
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
@@ -27,7 +27,7 @@ class Sky:
         )
 
     def hear(self, seconds: float, *addresses: Address, timestamp: int | None = None) -> None:
-        """Let time pass, hear something of each of these, and look who is silent."""
+        """Advance the clock, receive a message on each of these addresses, and check for silent ones."""
         self.now += seconds
         for address in addresses:
             fields = {"timestamp": round(self.now * 1e6) if timestamp is None else timestamp}
@@ -42,7 +42,7 @@ class Sky:
 
 
 def test_home_stays_while_its_vehicle_is_heard() -> None:
-    """It comes on events only: it is published for as long as anything else of its vehicle arrives."""
+    """A topic sent on events only stays published as long as other messages of its vehicle arrive."""
     sky = Sky()
     sky.hear(1, HOME, POSITION, OTHER)
     for _ in range(10):
@@ -54,7 +54,7 @@ def test_home_stays_while_its_vehicle_is_heard() -> None:
 
 
 def test_home_is_back_with_its_vehicle() -> None:
-    """After an outage of its link a vehicle would not send its home again; after a reboot it does."""
+    """It is published again after a link outage, as the vehicle would not repeat it, but not after a reboot."""
     sky = Sky()
     sky.hear(1, HOME, POSITION)
     sky.hear(4)
@@ -71,7 +71,7 @@ def test_home_is_back_with_its_vehicle() -> None:
 
 
 def test_home_of_before_a_reboot_is_never_back() -> None:
-    """A home is said seconds after the boot: the next boot is known by all that the vehicle said, not by that alone."""
+    """A home position from before a reboot is not published again, even if it was sent seconds after that boot."""
     sky = Sky()
     sky.hear(2, HOME, POSITION)
     for _ in range(30):

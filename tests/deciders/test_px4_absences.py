@@ -1,4 +1,4 @@
-"""Topics that are announced and do not arrive, or are not carried, at times that the test gives."""
+"""Topics that are announced but do not arrive, or have no definition, with a fake clock."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from nedbus.transport import PublisherToken, TopicKey, publisher_token
 
 
 def token(topic: str, message: str = "Any", *, session: str = "a") -> PublisherToken:
-    """Return the token of a PX4's publisher; its message does not matter for a topic that is carried."""
+    """Return the liveliness token of a PX4 publisher; for a known topic its message type does not matter."""
     domain = 0 if session == "a" else 2
     key = TopicKey(domain, f"fmu/out/{topic}", f"px4_msgs::msg::dds_::{message}_", "hash")
     return PublisherToken.parse(publisher_token(key, session, "px4_aabbcc00000000000000000000000000", 1))
@@ -19,7 +19,7 @@ def token(topic: str, message: str = "Any", *, session: str = "a") -> PublisherT
 
 @pytest.fixture
 def streams() -> StreamRegistry:
-    """Return a registry that knows of two topics, announced at 100 s by one node."""
+    """Return a registry with two topics, announced at 100 s by the same node."""
     streams = StreamRegistry(Px4ZenohOptions(), vehicle="1")
     for topic in ("vehicle_attitude", "vehicle_odometry"):
         streams.add_publisher(token(topic), 100.0)
@@ -27,13 +27,13 @@ def streams() -> StreamRegistry:
 
 
 def hear(streams: StreamRegistry, topic: str, now: float, *, session: str = "a") -> Absence:
-    """Return what is absent just after a message."""
+    """Return the absent topics after a message has arrived."""
     assert streams.hear(str(token(topic, session=session).key), now).not_carried is None
     return streams.report(now)
 
 
 def test_topic_is_silent_after_5_s_while_others_arrive(streams: StreamRegistry) -> None:
-    """It is silent from 5 s on, whether something came before or not, until something comes, or it is withdrawn."""
+    """A topic is silent after 5 s, whether it arrived before or not, until it arrives or its token is withdrawn."""
     assert hear(streams, "vehicle_attitude", 104.9) == Absence()
     assert hear(streams, "vehicle_attitude", 105.0) == Absence((), ("1/vehicle_odometry",))
     assert hear(streams, "vehicle_odometry", 105.1) == Absence()
@@ -43,21 +43,21 @@ def test_topic_is_silent_after_5_s_while_others_arrive(streams: StreamRegistry) 
 
 
 def test_nothing_is_silent_while_nothing_arrives(streams: StreamRegistry) -> None:
-    """A vehicle whose link is down loses all its topics, and another one does not make up for it."""
+    """A vehicle whose link is down has no silent topics; messages of other vehicles make no difference."""
     streams.add_publisher(token("vehicle_status", session="b"), 100.0)
     assert streams.report(200.0) == Absence()
     assert hear(streams, "vehicle_status", 200.0, session="b") == Absence()
 
 
 def test_topic_on_events_is_never_silent(streams: StreamRegistry) -> None:
-    """home_position may not come for as long as it likes."""
+    """home_position may be absent for any time."""
     streams.add_publisher(token("home_position"), 100.0)
     assert streams.report(200.0) == Absence()
     assert hear(streams, "vehicle_attitude", 200.0).silent == ("1/vehicle_odometry",)
 
 
 def test_messages_that_are_not_carried_are_listed(streams: StreamRegistry) -> None:
-    """They are sorted, each once, for as long as they are announced; and bounded."""
+    """Messages without a definition are listed sorted, once each, while they are announced; their number is bounded."""
     for number, name in enumerate(("Rpm", "Airspeed", "Rpm")):
         streams.add_publisher(token(f"topic_{number}", name), 100.0)
     assert streams.hear(str(token("topic_0", "Rpm").key), 100.0).not_carried == "Rpm"
@@ -70,7 +70,7 @@ def test_messages_that_are_not_carried_are_listed(streams: StreamRegistry) -> No
 
 
 def test_topics_that_no_option_asks_for_are_not_listed() -> None:
-    """With `topics=` all others are left out without a word."""
+    """With `topics=` all other topics are ignored silently."""
     streams = StreamRegistry(Px4ZenohOptions.model_validate({"topics": "vehicle_attitude"}), vehicle="1")
     streams.add_publisher(token("rpm", "Rpm"), 100.0)
     assert streams.report(100.0) == Absence()

@@ -1,4 +1,4 @@
-"""Publishers of rmw_zenoh, alive, alike or replaced, by the tokens of a real PX4 and of ROS 2 nodes."""
+"""Publishers of rmw_zenoh, with duplicates and restarts, by the tokens of a real PX4 and of ROS 2 nodes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ REAL = (
 
 
 def key(topic: str = VLP, *, domain: int = 0) -> TopicKey:
-    """Return the key of a topic, as PX4 writes it."""
+    """Return the key of a topic as PX4 writes it."""
     return TopicKey(domain, f"fmu/out/{topic}", dds_type(ROS2_TYPE), type_hash("1.16"))
 
 
@@ -30,23 +30,23 @@ def px4(session: str, topic: str = VLP) -> PublisherToken:
 
 
 def node(session: str, name: str = "talker") -> PublisherToken:
-    """Return the token of a ROS 2 node, whose gid does not stand in it."""
+    """Return the token of a ROS 2 node, which does not contain its gid."""
     return PublisherToken.parse(publisher_token(key(), session, name, 1))
 
 
 def send(streams: StreamRegistry, stream: Px4Stream, sequence: int, now: float, gid: bytes = GID) -> tuple[int, bool]:
-    """Pass one message on; return what was lost before it, and whether its vehicle rebooted."""
+    """Feed one message; return the messages lost before it, and True if its vehicle rebooted."""
     return streams.accept(stream, Attachment(sequence, 0, gid), now)
 
 
 @pytest.fixture
 def streams() -> StreamRegistry:
-    """Return a registry with default options, for a service whose vehicle is 1."""
+    """Return a registry with default options for a service of vehicle 1."""
     return StreamRegistry(Px4ZenohOptions.model_validate({}), vehicle="1")
 
 
 def test_token_of_a_real_px4_is_parsed() -> None:
-    """Its key is that of its messages, and its node is named by its gid; a ROS 2 node's is not."""
+    """A token gives the key of the messages and, for PX4 but not for ROS 2, the gid of the node."""
     token = PublisherToken.parse(REAL)
     assert str(token.key) == f"0/fmu/out/{VLP}/px4_msgs::msg::dds_::VehicleLocalPosition_/{type_hash('1.16')}"
     assert (token.session, token.gid) == ("7f683599e27664034d4ab1bf80ed5a2f", GID)
@@ -63,36 +63,42 @@ def test_other_tokens_are_refused(text: str) -> None:
 
 
 def test_alike_vehicles_are_rejected_until_one_is_gone(streams: StreamRegistry) -> None:
-    """From the second token on nothing is accepted; afterwards the sequence starts anywhere: no loss, no reboot."""
+    """Two publishers of one key are both rejected. After one has gone, the sequence of the other may start anywhere.
+
+    That is neither a loss nor a reboot.
+    """
     stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     assert send(streams, stream, 7, 100.1) == (0, False)
     streams.add_publisher(px4("b"), 100.2)
     for number in range(100):
-        with pytest.raises(NotAcceptedError, match="two vehicles are alike, with one key and one gid: give each"):
+        with pytest.raises(NotAcceptedError, match="two vehicles publish on this key with the same gid: give each"):
             send(streams, stream, number, 100.2 + number)
     streams.remove_publisher(px4("a"), 201.0)
-    with pytest.raises(NotAcceptedError, match="alike"):
+    with pytest.raises(NotAcceptedError, match="the same gid"):
         send(streams, stream, 900, 201.9)  # what it sent last comes after its token
     assert send(streams, stream, 30, 202.1) == (0, False)
     assert send(streams, stream, 31, 202.2) == (0, False)
 
 
 def test_alike_vehicles_that_go_together_are_rejected_for_a_second(streams: StreamRegistry) -> None:
-    """A link that breaks takes both; what waits of them cannot be told apart, and the key is free at once."""
+    """After a link with both of them breaks, their queued messages are rejected, as they are indistinguishable.
+
+    The key is free at once.
+    """
     stream = streams.hear(str(key()), 0.0)
     for session in ("a", "b"):
         streams.add_publisher(px4(session), 0.0)
     assert not streams.remove_publisher(px4("a"), 10.0)
     assert streams.remove_publisher(px4("b"), 10.0)
-    with pytest.raises(NotAcceptedError, match="alike"):
+    with pytest.raises(NotAcceptedError, match="the same gid"):
         send(streams, stream, 1, 10.9)
     streams.report(11.0)
     assert send(streams, stream, 2, 11.0) == (0, False)
 
 
 def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
-    """Two publishers of one session, and two sessions with different topics, are one vehicle each."""
+    """Two publishers in one session, or two sessions with different topics, are the same vehicle."""
     stream = streams.hear(str(key()), 0.0)
     for token in (px4("a"), px4("a", "external_ins_local_position"), px4("b", "estimator_local_position_0")):
         streams.add_publisher(token, 100.0)
@@ -100,7 +106,7 @@ def test_topics_of_one_vehicle_are_not_alike(streams: StreamRegistry) -> None:
 
 
 def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistry) -> None:
-    """A router notices after up to 10 s that a link is dead: who was silent for 3 s is not in the way of who is new."""
+    """A publisher silent for 3 s does not block its successor, as a router detects a dead link only after 10 s."""
     stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(px4("a"), 100.0)
     send(streams, stream, 500, 100.0)
@@ -110,8 +116,8 @@ def test_vehicle_that_lost_its_connection_is_back_at_once(streams: StreamRegistr
     assert send(streams, stream, 2, 109.1) == (0, False)
 
 
-def test_ros_2_nodes_of_one_name_are_told_apart_by_their_gids(streams: StreamRegistry) -> None:
-    """The first one is published, and the other one's messages are rejected, as long as both are there."""
+def test_ros_2_nodes_of_one_name_are_distinguished_by_their_gids(streams: StreamRegistry) -> None:
+    """The first one is published; messages of the second are rejected while both exist."""
     stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     assert send(streams, stream, 1, 100.0, b"a" * 16) == (0, False)
@@ -122,7 +128,7 @@ def test_ros_2_nodes_of_one_name_are_told_apart_by_their_gids(streams: StreamReg
 
 
 def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegistry) -> None:
-    """Its token says that the one before it is gone: a reboot, and nothing is lost."""
+    """The new token shows that the old publisher has gone: a reboot without losses."""
     stream = streams.hear(str(key()), 0.0)
     streams.add_publisher(node("a"), 100.0)
     send(streams, stream, 41, 100.0, b"a" * 16)
@@ -133,7 +139,7 @@ def test_ros_2_publisher_that_restarts_is_accepted_at_once(streams: StreamRegist
 
 
 def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
-    """A reboot counts once for a vehicle, whichever of its topics tells it first, and again the next time."""
+    """A reboot counts once per vehicle, whichever topic shows it first, and so does the next one."""
     topics = (VLP, "vehicle_local_position_groundtruth", "estimator_local_position_0", "estimator_local_position_1")
     vehicle = [streams.hear(str(key(topic)), 0.0) for topic in topics]
     other = streams.hear(str(key(domain=1)), 0.0)
@@ -146,7 +152,7 @@ def test_reboot_of_four_topics_is_one(streams: StreamRegistry) -> None:
 
 
 def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
-    """A peer that declares tokens without end is followed up to a limit, and costs nothing once they are gone."""
+    """The number of tokens tracked for one peer is bounded, and withdrawn tokens are removed."""
     tokens = [node(str(number)) for number in range(100)]
     for token in tokens:
         streams.add_publisher(token, 0.0)
@@ -158,12 +164,12 @@ def test_publishers_of_a_key_are_bounded(streams: StreamRegistry) -> None:
 
 
 def test_keys_are_bounded(monkeypatch: pytest.MonkeyPatch, streams: StreamRegistry) -> None:
-    """Announced or not, keys have a limit; those of which nothing was accepted and that are gone do not count."""
+    """The number of keys is bounded; keys of withdrawn publishers without an accepted message do not count."""
     monkeypatch.setattr("nedbus.sources.px4.streams._MAX_STREAMS", 3)
     streams.add_publisher(px4("a"), 0.0)
     for domain in (1, 2):
         streams.hear(str(key(domain=domain)), 0.0)
-    with pytest.raises(NotAcceptedError, match="more than 3 keys: name a domain"):
+    with pytest.raises(NotAcceptedError, match="more than 3 keys: choose a domain"):
         streams.hear(str(key(domain=3)), 0.0)
     streams.report(0.0)
     streams.hear(str(key(domain=3)), 0.0)

@@ -1,4 +1,4 @@
-"""The choice of streams that the bridge publishes to ROS 2, without a network and at times that the test gives."""
+"""The choice of streams that the bridge publishes to ROS 2, without a network and with a fake clock."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def actions(
 
 
 def test_topic_has_a_namespace_by_vehicle() -> None:
-    """Vehicle 1 has none, a given one wins, else it is the vehicle's name as ROS 2 allows it."""
+    """Vehicle 1 has no namespace; otherwise a configured one wins over the vehicle's name in ROS 2 form."""
     arbiter = make({"named": "/fleet/a/", "bare": ""})
     estimator = Address("wing-2", "estimator_local_position", 1)
     assert arbiter.topic_of(estimator) == "wing_2/fmu/out/estimator_local_position_1"
@@ -37,13 +37,13 @@ def test_topic_has_a_namespace_by_vehicle() -> None:
 
 @pytest.mark.parametrize("namespace", ["7up", "a b", "a//b", "a-b", "/1/"])
 def test_namespace_invalid_in_ros_2_is_rejected(namespace: str) -> None:
-    """Names in ROS 2 begin with a letter and have letters, digits and underscores."""
+    """ROS 2 names begin with a letter and consist of letters, digits and underscores."""
     with pytest.raises(AddressError, match="namespace"):
         make({"1": namespace})
 
 
 def test_address_is_published_once_and_withdrawn_when_gone() -> None:
-    """Only changes are decided: nothing while all stays as it is; a sample may come before and after."""
+    """Only changes produce decisions; a sample may arrive before or after the token."""
     arbiter = make()
     assert not arbiter.publishes(ONE)
     assert arbiter.update([ONE], {}, now=0.0) == [Decision("publish", ONE, TOPIC)]
@@ -56,7 +56,7 @@ def test_address_is_published_once_and_withdrawn_when_gone() -> None:
 
 @pytest.mark.parametrize("published", [False, True])
 def test_topic_of_another_node_is_left_to_it(published: bool) -> None:
-    """It is not published, or no more: PX4 itself wins over the bridge; the node is named once."""
+    """The bridge does not publish a topic of another node, such as PX4 itself, or stops; the node is reported once."""
     arbiter = make()
     arbiter.update([ONE] if published else [], {}, now=0.0)
     assert arbiter.publishes(ONE) is published
@@ -66,7 +66,7 @@ def test_topic_of_another_node_is_left_to_it(published: bool) -> None:
 
 
 def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
-    """The delay counts from when the node was seen last: a node that restarts keeps its topic."""
+    """The delay starts when the node was last seen, so a node that restarts keeps its topic."""
     arbiter = make()
     for now in (0.0, 4.0):
         arbiter.update([ONE], {ONE: "px4"}, now=now)
@@ -76,7 +76,7 @@ def test_topic_is_taken_over_some_time_after_the_node_is_gone() -> None:
 
 
 def test_vehicle_that_was_gone_is_published_at_once() -> None:
-    """Nothing is remembered of an address that left the bus: the delay does not hold for its return."""
+    """An address that left the bus is forgotten, so its return is not delayed."""
     arbiter = make()
     arbiter.update([ONE], {ONE: "px4"}, now=0.0)
     arbiter.update([], {}, now=1.0)
@@ -84,7 +84,7 @@ def test_vehicle_that_was_gone_is_published_at_once() -> None:
 
 
 def test_two_addresses_of_one_topic_conflict() -> None:
-    """The first in order has it; the other is named once, and follows when the first is gone."""
+    """The first address in order gets the topic; the other one is reported once, and follows when that is gone."""
     arbiter = make()
     first, second = Address("a-b", VLP), Address("a_b", VLP)
     topic = f"a_b/fmu/out/{VLP}"
@@ -99,4 +99,4 @@ def test_two_addresses_of_one_topic_conflict() -> None:
     assert arbiter.update([first, second], {}, now=3.0) == [Decision("conflict", first, topic, str(second))]
     assert actions(arbiter, [first, second], {second: "px4"}, now=4.0) == [("defer", topic)]
     assert actions(arbiter, [first, second], now=5.0) == [("publish", topic)]
-    assert actions(arbiter, [first, second], now=5.0 + TAKE_OVER_DELAY) == [("conflict", topic)]  # told anew
+    assert actions(arbiter, [first, second], now=5.0 + TAKE_OVER_DELAY) == [("conflict", topic)]  # reported again

@@ -1,4 +1,4 @@
-"""The worker of one source: its states, its pauses, its streams; with a clock that only waiting moves."""
+"""The worker of one source: states, retry pauses and streams, with a clock that advances only by waiting."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Script = list[SourceMessage | Rejection | float | None]
 
 @dataclass
 class StandingClock:
-    """A clock that goes on only by waiting, and stops after a while."""
+    """A clock that advances only by waiting, and stops the worker after a while."""
 
     stop_at: float = 1000.0
     seconds: float = 0.0
@@ -48,7 +48,7 @@ class StandingClock:
 
 @dataclass
 class FakeRegistry:
-    """One publisher for each address, as the real one has, without a session: what it gets is validated, and kept."""
+    """A registry without a session, with one publisher per address; payloads are validated and recorded."""
 
     clock: StandingClock
     open: dict[Address, SimpleNamespace] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class FakeRegistry:
 
 @dataclass
 class FakeReplay:
-    """A replay of these messages, or of what `run` does; each of `failures` is raised by one `open` before it works."""
+    """A replay of messages, or of the generator `run`; each `open` first raises one of `failures`."""
 
     messages: list[SourceMessage]
     failures: list[BaseException] = field(default_factory=list)
@@ -107,7 +107,7 @@ class FakeReplay:
 
 @dataclass
 class FakeLive:
-    """A live source that delivers a script: a number lets time pass."""
+    """A live source that delivers a script, in which a number advances the clock."""
 
     clock: StandingClock
     script: Script
@@ -135,7 +135,7 @@ def at(due: float, address: Address = ONE, **fields: object) -> SourceMessage:
 
 
 class Ran:
-    """A worker, what it published where, and how often it told its end."""
+    """A worker, the messages it published by address, and the number of times it reported its end."""
 
     def __init__(self, source: object, clock: StandingClock, *, retry: bool = True) -> None:
         self.ends = 0
@@ -158,7 +158,7 @@ class Ran:
 
     @property
     def times(self) -> list[float]:
-        """When messages of vehicle 1 were published."""
+        """Return the times at which messages of vehicle 1 were published."""
         return [round(seconds, 6) for seconds, _ in self.registry.published.get(ONE, [])]
 
 
@@ -169,7 +169,7 @@ def run(source: object, clock: StandingClock | None = None, *, retry: bool = Tru
 
 
 def test_replay_publishes_each_message_when_it_is_due() -> None:
-    """At speed 2 after half the time; then the source is done, and says so once."""
+    """At speed 2 messages are published in half the time; then the source is done, and reports it once."""
     ran = Ran(FakeReplay([at(0.0), at(1.0), at(3.0)], speed=2.0), StandingClock())
     assert ran.status.state == "starting"
     ran.worker.run()
@@ -180,7 +180,7 @@ def test_replay_publishes_each_message_when_it_is_due() -> None:
 
 
 def test_replay_at_full_speed_is_lossless_and_never_waits() -> None:
-    """Its publishers wait for readers; it does not wait for the clock."""
+    """Its publishers wait for readers, but not for the clock."""
     clock = StandingClock()
     ran = run(FakeReplay([at(0.0), at(100.0)], speed=None), clock)
     assert (ran.times, clock.waits) == ([0.0, 0.0], [])
@@ -188,7 +188,7 @@ def test_replay_at_full_speed_is_lossless_and_never_waits() -> None:
 
 
 def test_replay_that_is_late_goes_on_from_there() -> None:
-    """After a pause of the machine messages are not rushed: the time that is lost is lost."""
+    """After the machine was suspended, messages are not sent faster to catch up."""
     clock = StandingClock()
 
     def stall() -> Iterator[SourceMessage]:
@@ -200,7 +200,7 @@ def test_replay_that_is_late_goes_on_from_there() -> None:
 
 
 def test_replay_waits_for_a_reader_once() -> None:
-    """wait=1: nothing is published before somebody subscribes; a second run of a loop does not wait again."""
+    """With wait=1 nothing is published before there is a subscriber; later runs of a loop do not wait again."""
     ran = Ran(FakeReplay([at(0.0), at(0.5)], wait=True, loop=True), StandingClock(stop_at=2.0))
     ran.registry.readers_at = 1.0
     ran.worker.run()
@@ -208,13 +208,13 @@ def test_replay_waits_for_a_reader_once() -> None:
 
 
 def test_loop_does_not_spin() -> None:
-    """A run takes a tenth of a second at least, however short the log is."""
+    """A run takes at least a tenth of a second, however short the log is."""
     ran = run(FakeReplay([at(0.0)], loop=True), StandingClock(stop_at=1.0))
     assert ran.times[:10] == pytest.approx([step / 10 for step in range(10)])
 
 
 def test_failure_is_retried_with_growing_pauses() -> None:
-    """1, 2, 4, 8, 16, 30, 30 s, until it works, and anew when it has worked; the addresses are free meanwhile."""
+    """Pauses are 1, 2, 4, 8, 16, 30, 30 s, and start again after a success; the addresses are free meanwhile."""
     clock = StandingClock()
     failures: list[BaseException] = [SourceError("flight.ulg", "no such file")] * 7
     ran = run(FakeReplay([at(0.0)], failures), clock)
@@ -233,7 +233,7 @@ def test_failure_is_retried_with_growing_pauses() -> None:
 
 
 class PanicException(BaseException):
-    """The exception that pyo3 raises when Rust panics, as Zenoh does under a clock before 1970."""
+    """The exception that pyo3 raises when Rust panics, as Zenoh does if the clock is before 1970."""
 
 
 @pytest.mark.parametrize("retry", [True, False])
@@ -241,19 +241,19 @@ class PanicException(BaseException):
     ("failure", "reason"),
     [
         (SourceError("flight.ulg", "no such file"), "flight.ulg: no such file"),
-        (ZeroDivisionError("1/0"), "an unexpected ZeroDivisionError: 1/0"),
-        (PanicException("clock before 1970"), "an unexpected PanicException: clock before 1970"),
+        (ZeroDivisionError("1/0"), "unexpected ZeroDivisionError: 1/0"),
+        (PanicException("clock before 1970"), "unexpected PanicException: clock before 1970"),
     ],
 )
 def test_any_failure_is_retried_or_final(failure: BaseException, reason: str, retry: bool) -> None:
-    """A bug, and what is no Exception, too: it never leaves a source "running" whose thread ended."""
+    """No exception, not even a BaseException, leaves a source in state "running" after its thread has ended."""
     ran = run(FakeReplay([at(0.0)], [failure] * 9), StandingClock(stop_at=100.0), retry=retry)
     assert (ran.status.state, ran.status.ended) == (("retrying", False) if retry else ("failed", True))
     assert (ran.status.error, ran.ends) == (reason, 1)
 
 
 def test_error_while_a_failure_is_handled_ends_the_source() -> None:
-    """Even an error that nobody handles leaves the source failed, with the reason."""
+    """After an error in the error handling the source is failed, with the reason."""
 
     def panic() -> None:
         raise PanicException("poisoned")
@@ -265,12 +265,12 @@ def test_error_while_a_failure_is_handled_ends_the_source() -> None:
 
     ran = Ran(FakeReplay([at(0.0)], run=break_), StandingClock())
     ran.worker.run()
-    assert (ran.status.state, ran.status.error) == ("failed", "an unexpected PanicException: poisoned")
+    assert (ran.status.state, ran.status.error) == ("failed", "unexpected PanicException: poisoned")
     assert ran.ends == 1
 
 
 def test_closed_session_is_a_failure_unless_the_service_is_stopped() -> None:
-    """A session that was closed meanwhile cannot be used again: the source has failed, and says why."""
+    """A closed session cannot be used again: the source fails with the reason."""
     status = run(FakeReplay([at(0.0)], [ClosedError()])).status
     assert (status.state, status.error) == ("failed", str(ClosedError()))
     clock = StandingClock()
@@ -285,24 +285,24 @@ def test_closed_session_is_a_failure_unless_the_service_is_stopped() -> None:
 
 
 def test_live_source_is_retried_without_retry() -> None:
-    """--until-done: a serial port that fails once does not end a live source; only replays have no second try."""
+    """With --until-done a live source still recovers from failures, such as of a serial port; only replays do not."""
     clock = StandingClock(stop_at=100.0)
     ran = run(FakeLive(clock, [at(0.0)], [SourceError("mavlink:/dev/ttyACM0", "the link broke")]), clock, retry=False)
     assert (ran.times, ran.status.state, ran.status.retries) == ([1.0], "done", 1)
 
 
 def test_taken_address_leaves_the_others_free() -> None:
-    """A source whose second address is taken takes none, not even for a moment: others may need the first."""
+    """If one address of a source is taken, it takes none of the others, not even briefly."""
     ran = Ran(FakeReplay([at(0.0), at(0.0, TWO)]), StandingClock(stop_at=1.0))
     ran.registry.publisher(TWO, lossless=False, source="other")
     ran.worker.run()
     assert ran.registry.log == ["0 +2 other"]
     assert ran.status.state == "retrying"
-    assert "2/vehicle_local_position is published by this process already" in str(ran.status.error)
+    assert "this process already publishes 2/vehicle_local_position" in str(ran.status.error)
 
 
 def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixture) -> None:
-    """It is counted, reported with its reason and its fields, and the first five are logged; the others go on."""
+    """An invalid message is counted and reported with reason and fields, the first five are logged; others go on."""
     broken = [at(0.0, z_valid=True), *(at(number, timestamp_sample=10**9) for number in range(7))]
     ran = run(FakeReplay([*broken, at(0.0, z=1.0, z_valid=True)], speed=None))
     assert list(ran.status.rejections.values()) == [1, 7], "by field and rule, and not by value"
@@ -315,7 +315,7 @@ def test_invalid_message_is_rejected_and_reported(caplog: pytest.LogCaptureFixtu
 
 
 def test_live_source_publishes_what_arrives_until_it_is_stale() -> None:
-    """A vehicle is published from its first message on, withdrawn after 3 s without one, and comes back."""
+    """A vehicle is published from its first message, withdrawn after 3 s without one, and published when it returns."""
     clock = StandingClock(stop_at=100.0)
     source = FakeLive(clock, [at(0.0), 1.0, at(0.0, TWO), 3.5, at(0.0), 1.0])
     ran = run(source, clock)
@@ -325,7 +325,7 @@ def test_live_source_publishes_what_arrives_until_it_is_stale() -> None:
 
 
 def test_live_states_follow_the_vehicles() -> None:
-    """Waiting before the first message and when all are stale, running in between; stale addresses are listed."""
+    """The state is waiting before the first message and if all are stale, else running; stale addresses are listed."""
     clock = StandingClock(stop_at=100.0)
     states: list[tuple[str, tuple[str, ...]]] = []
 
@@ -343,15 +343,15 @@ def test_live_states_follow_the_vehicles() -> None:
 
 
 def test_live_losses_and_reboots_are_summed() -> None:
-    """Messages that a source reports as lost are counted, and so is each restart of a vehicle."""
+    """Messages that a source reports as lost are counted, and so are reboots of vehicles."""
     clock = StandingClock(stop_at=100.0)
     reboot = SourceMessage(0.0, ONE, {"timestamp": 0}, 0, True)
     status = run(FakeLive(clock, [SourceMessage(0.0, ONE, {"timestamp": 1}, lost=4), reboot]), clock).status
     assert (status.lost, status.reboots, status.streams[0].health.lost) == (4, 1, 4)
 
 
-def test_rejections_are_bounded_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    """A flood from many senders is counted whole; 50 of them are remembered, each with 300 characters."""
+def test_rejections_are_bounded_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    """All rejections of a flood are counted; 50 senders are remembered, with 300 characters each."""
     clock = StandingClock(stop_at=100.0)
     script: Script = [Rejection(f"sender {number % 80}", "x" * 1000, ONE) for number in range(200)]
     ran = run(FakeLive(clock, script), clock)
@@ -361,13 +361,13 @@ def test_rejections_are_bounded_and_told_once(caplog: pytest.LogCaptureFixture) 
 
 
 def test_addresses_of_a_live_source_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One peer cannot make a service publish without end; the vehicles that are known go on."""
+    """One peer cannot make a service publish any number of addresses; known vehicles are not affected."""
     monkeypatch.setattr("nedbus.daemon.output._MAX_ADDRESSES", 10)
     clock = StandingClock(stop_at=100.0)
     script: Script = [at(0.0, Address(str(number), VLP)) for number in range(15)]
     status = run(FakeLive(clock, [*script, *script[:10]]), clock).status
     assert (status.published, status.rejected, len(status.addresses)) == (20, 5, 10)
-    assert status.warnings == ("vehicles: more than 10 addresses: 10/vehicle_local_position is left out",)
+    assert status.warnings == ("vehicles: more than 10 addresses: 10/vehicle_local_position is ignored",)
 
 
 def test_stop_ends_a_replay_in_its_pause() -> None:

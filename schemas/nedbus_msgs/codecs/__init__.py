@@ -1,1 +1,1 @@
-"""The forms of a message: msgpack on the wire, CDR of ROS 2 and PX4, arrays of NumPy; each from its definition."""
+"""Codecs of messages: msgpack on the wire, and CDR as in ROS 2 and PX4."""

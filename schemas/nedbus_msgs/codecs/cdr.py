@@ -1,6 +1,6 @@
-"""The CDR codec of ROS 2, PX4's Zenoh module and rosbag2, for every layout.
+"""CDR codec for all layouts, as in ROS 2, PX4's Zenoh module and rosbag2.
 
-It converts between payloads and fields by name; the model validates the fields.
+Converts between payloads and fields by name; the model validates the fields.
 """
 
 from __future__ import annotations
@@ -20,14 +20,15 @@ from nedbus_msgs.model.px4_types import BASES
 from nedbus_msgs.model.validation import Validation
 
 HEAD: Final = b"\x00\x01\x00\x00"  # XCDR1, little-endian, no options
-_PX4_EXTRA: Final = 24  # bytes that PX4 sends beyond the header and its own struct, of which CDR may need less
+_PX4_EXTRA: Final = 24  # bytes that PX4 may send after the header and its own struct, which may be longer than CDR
 
 
 @dataclass(frozen=True, slots=True)
 class CdrLayout:
     """One layout in CDR: its body, and the offset of each field in a payload.
 
-    No payload is longer than `limit`. `not_bools`: the bits of a payload, as a little-endian number, that no bool has.
+    `limit`: bytes of the longest payload. `not_bools`: bits of a payload, as a little-endian integer, that are 0 in all
+    valid bools.
     """
 
     body: struct.Struct
@@ -43,12 +44,12 @@ class CdrLayout:
 
 
 def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> dict[str, object]:
-    """Return the fields of a CDR payload, in the order of the layout; arrays are tuples.
+    """Decode a CDR payload to fields by name, in the order of the layout; arrays are tuples.
 
-    Padding is ignored, and so are the bytes that PX4 appends.
+    Padding and the bytes that PX4 appends are ignored.
 
-    Raises DecodeError for another encapsulation than little-endian XCDR1, for missing or too many bytes and for a bool
-    that is neither 0 nor 1.
+    Raises DecodeError for an encapsulation other than little-endian XCDR1, for too few or too many bytes, and for a
+    bool that is neither 0 nor 1.
     """
     cdr = cdr_layout(layout)
     shortest = len(HEAD) + cdr.body.size
@@ -66,11 +67,11 @@ def decode_with(definition: Definition[Any], payload: bytes, layout: Layout) -> 
 
 
 def encode_with(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> bytes:
-    """Return the CDR payload of the fields of a layout, such as `downgrade` returns, with zeros in its padding.
+    """Encode the fields of a layout, as returned by `downgrade`, as CDR with zeros for padding.
 
-    Floats are rounded to the nearest float32 where PX4 has one.
+    float32 fields are rounded to the nearest float32.
 
-    Raises LayoutError for other fields than the layout's, EncodeError for a value that its type cannot hold.
+    Raises LayoutError for fields other than the layout's, EncodeError for a value that its type cannot hold.
     """
     cdr = cdr_layout(layout)
     require_fields(definition, fields, layout)
@@ -88,7 +89,7 @@ def encode_with(definition: Definition[Any], fields: Mapping[str, object], layou
 
 @cache
 def cdr_layout(layout: Layout) -> CdrLayout:
-    """Return the place of a layout's fields in a payload: each at the next multiple of its alignment."""
+    """Compute the CDR form of a layout, with each field at the next multiple of its alignment."""
     body, size, unpadded, not_bools = "<", 0, 0, 0
     offsets = {}
     for name, kind in layout.types.items():

@@ -1,6 +1,6 @@
-"""The msgpack codec: one array `[layout, field 1 ... field n]`, every field at its full width.
+"""The msgpack codec: one array `[layout, field 1 ... field n]`, with every field at full width.
 
-So a payload is both plain msgpack and a fixed-size struct: 244 bytes of a VehicleLocalPosition.
+A payload is therefore both plain msgpack and a fixed-size struct, 244 bytes for a VehicleLocalPosition.
 Any other valid msgpack encoding of the array is decoded as well.
 """
 
@@ -22,16 +22,16 @@ from nedbus_msgs.model.px4_types import BASES, FieldType
 from nedbus_msgs.model.validation import Values
 
 PAYLOAD_LIMIT: Final = 4096
-"""Bytes of the largest payload that is decoded, and of the largest message that can be carried."""
+"""Bytes of the largest payload and the largest message that can be carried."""
 
 Newer = Mapping[int, Sequence[str]]
-"""Field names of layouts that this version does not know, by their number on the wire."""
+"""Field names of layouts unknown to this version, by number on the wire."""
 
 
 def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
-    """Return the tags of a type with zeros for its values, the struct format of both, and the mask of its values.
+    """Return the tags of a type with zeros for values, the struct format of both, and the bit mask of the values.
 
-    A bool is only a tag, 0xc2 or 0xc3: its last bit is the value.
+    A bool is only a tag, 0xc2 or 0xc3, whose last bit is the value.
     """
     base = BASES[kind.base]
     if kind.base == "bool":
@@ -49,20 +49,20 @@ def full_width(kind: FieldType) -> tuple[bytes, str, bytes]:
 class Codec(Generic[M]):
     """The codec of one message.
 
-    `size`: bytes of every payload that is encoded here.
-    `tags`: a payload with zeros for its values, as a number; `tag_mask`: its bits that are no values.
+    `size`: bytes of an encoded payload.
+    `tags`: a payload with zeros for values, as an integer; `tag_mask`: its bits that are not values.
     `offsets`: name, element and offset of every value in a payload.
 
-    `encode(message)`: return the payload of a message; floats are float32 where PX4 has one.
-    Raises EncodeError for values that do not fit their fields, in a message whose validation was bypassed.
-    `encode_fields(fields)`: return the payload of a message with these fields, validated without a model.
+    `encode(message)`: return the payload of a message; float32 fields are rounded.
+    Raises EncodeError if values do not fit their fields, in a message whose validation was bypassed.
+    `encode_fields(fields)`: return the payload of these fields, validated without building a model.
     Raises InvalidMessageError for an invalid message.
-    `encode_row(values)`: the same with the values of all fields in their order.
-    Raises EncodeError for another number of values as well.
-    `decode(payload, newer=...)`: return the message of a payload, validated.
+    `encode_row(values)`: the same for the values of all fields in order.
+    Also raises EncodeError for a wrong number of values.
+    `decode(payload, newer=...)`: return the validated message of a payload.
     Raises UnknownLayoutError for a layout that is neither known nor in `newer`, DecodeError for anything else that is
     not one message: other types, other lengths, trailing, missing or too many bytes, values that the model rejects.
-    `decode_row(payload, newer=...)`: the same as a Row, a named tuple.
+    `decode_row(payload, newer=...)`: the same, as a Row.
     """
 
     definition: Definition[M]
@@ -79,7 +79,7 @@ class Codec(Generic[M]):
 
 @cache
 def codec_of(definition: Definition[M]) -> Codec[M]:
-    """Return the codec of a message; its functions are closures, as every attribute costs time on the hot path."""
+    """Return the codec of a message; its functions are closures, as attribute access costs time on the hot path."""
     name, types, model = definition.name, definition.types, definition.model
     validation, make_row = definition.validation, definition.row
     check_row, row_of, passes_rules = validation.check_row, validation.row_of, validation.passes_rules
@@ -91,7 +91,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
 
     def pack(row: Values) -> bytes:
         """Pack a row; raise struct.error, OverflowError or TypeError for values that do not fit their fields."""
-        # The packed struct has zeros in place of the tags, and `tags` has zeros in place of the values.
+        # The packed struct has zeros for the tags, and `tags` has zeros for the values.
         return (from_bytes(pack_flat(*flatten(row)), "big") | tags).to_bytes(size, "big")
 
     def encode(message: M) -> bytes:
@@ -114,7 +114,7 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
     def encode_valid(row: Values) -> bytes:
         try:
             return pack(row)
-        except OverflowError:  # beyond float32: the model raises the error for it
+        except OverflowError:  # beyond float32; the model raises the error
             return encode(to_model(name_values(row)))
 
     def to_model(fields: Mapping[str, object]) -> M:
@@ -125,15 +125,15 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
             raise InvalidMessageError(describe(exc, definition), violations, message=name) from exc
 
     def decode_full_width(payload: bytes) -> Values | None:
-        """Return the values of a payload as `encode` writes it, validated; None if `decode_any` has to decide."""
+        """Decode a payload in the form that `encode` writes; None if `decode_any` has to decide."""
         if len(payload) != size or from_bytes(payload, "big") & tag_mask != tags:
             return None
-        # With these tags each value has its type and range: there is nothing left to validate but the rules.
+        # The tags prove type and range of every value; only the rules are left to check.
         row: Values = unpack(payload, use_list=False)[1:]
         return row if passes_rules(row) else None
 
     def decode_any(payload: bytes, newer: Newer | None) -> M:
-        """Return the message of any msgpack encoding, in any known layout."""
+        """Decode any msgpack encoding of any known layout."""
         try:
             return upgrade_with(definition, _unpack_fields(definition, payload, newer or {}))
         except ValidationError as exc:
@@ -161,13 +161,13 @@ def codec_of(definition: Definition[M]) -> Codec[M]:
 def _forms(
     types: Mapping[str, FieldType], head: bytes
 ) -> tuple[int, int, struct.Struct, tuple[tuple[str, int, int], ...]]:
-    """Return tags, mask of the bits that are no values, values as a struct, and the offset of each value."""
+    """Return the tags, the mask of bits that are not values, the struct of values, and the offset of each value."""
     tags, values, code = head, bytes(len(head)), f">{len(head)}x"
     offsets: list[tuple[str, int, int]] = []
     for name, kind in types.items():
         own_tags, own_code, own_values = full_width(kind)
         tags, values, code = tags + own_tags, values + own_values, code + own_code
-        tag = int(kind.base != "bool")  # bytes of it beside a value
+        tag = int(kind.base != "bool")  # bytes of the tag besides the value
         step = tag + kind.size
         offsets += [(name, part, len(tags) - (kind.count - part) * step + tag) for part in range(kind.count)]
     mask = ((1 << 8 * len(tags)) - 1) ^ int.from_bytes(values, "big")
@@ -175,7 +175,7 @@ def _forms(
 
 
 def describe(error: ValidationError, definition: Definition[Any]) -> str:
-    """Return a validation error in one line: each field, the reason, and its value."""
+    """Format a validation error as one line: each field with the reason and its value."""
     reasons = []
     for detail in error.errors(include_url=False):
         reason = f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}"
@@ -205,10 +205,10 @@ def _unpack_fields(definition: Definition[Any], payload: bytes, newer: Newer) ->
     if len(values) != len(names):
         raise reject(f"{len(values)} fields where layout {layout} has {len(names)}")
     for name, value in zip(names, values, strict=True):
-        # No field is nested deeper, and printing a deeply nested value would exhaust the stack.
+        # No field is nested deeper, and formatting a deeply nested value would exhaust the stack.
         parts = value if isinstance(value, tuple) else (value,)
         if any(isinstance(part, tuple) for part in parts):
             raise reject(f"{name}: an array within an array")
-        if any(isinstance(part, str) for part in parts):  # which the model accepts as "NaN", from JSON
+        if any(isinstance(part, str) for part in parts):  # the model accepts "NaN" and the like, from JSON
             raise reject(f"{name}: text, where msgpack has numbers and bools")
     return dict(zip(names, values, strict=True))

@@ -1,4 +1,4 @@
-"""The messages, one file each: what is in this folder is a message that nedbus carries."""
+"""The messages that nedbus has a definition of, one file each."""
 
 from importlib import import_module
 from pkgutil import iter_modules

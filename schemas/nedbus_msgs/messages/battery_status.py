@@ -7,11 +7,11 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float32x14, Uint8, Uint16
 
 
 class BatteryStatus(Message):
-    """State of one battery: voltage, current, charge; a smart battery says more than a power module.
+    """State of one battery: voltage, current and charge; smart batteries provide more fields than power modules.
 
-    One uORB instance for each battery; id, from 1, names the battery on its vehicle.
-    Not known: -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s and
-    temperature, 0 in the others. Simulators have current -1 and no cell voltages throughout.
+    One uORB instance per battery; id, from 1, identifies the battery on its vehicle.
+    Unknown values: -1 in current_a, current_average_a, discharged_mah, remaining and scale, NaN in time_remaining_s and
+    temperature, 0 in the others. Simulators always have current -1 and no cell voltages.
     faults has bit n (1 << n) for number n of FAULT_; numbers 6 and 7 of warning are STATE_UNHEALTHY and STATE_CHARGING.
     """
 

@@ -7,12 +7,12 @@ from nedbus_msgs.model.px4_types import Bool, Uint32, Uint64, field
 class EstimatorStatusFlags(Message):
     """Fusions of one EKF2 instance: active (cs_), failed (fs_) and, up to 1.17, rejected data (reject_).
 
-    Published when a flag changes and about once a second, by each instance of several.
-    While cs_inertial_dead_reckoning is set nothing holds the horizontal position: it drifts, and is not valid for long.
+    Each EKF2 instance publishes it when a flag changes, and about once a second.
+    While cs_inertial_dead_reckoning is set, the horizontal position is not aided: it drifts, and soon becomes invalid.
     A flag that a vehicle's layout lacks is false here, and not in `model_fields_set`.
 
     cs_gps, cs_gps_yaw and cs_gps_yaw_fault (up to 1.15) are cs_gnss_pos, cs_gnss_yaw and cs_gnss_yaw_fault here.
-    In those layouts cs_gnss_pos stands for position and velocity of GNSS; since 1.16 cs_gnss_vel is a flag of its own.
+    In those layouts cs_gnss_pos covers GNSS position and velocity; since 1.16 cs_gnss_vel is a separate flag.
     """
 
     TOPICS = (

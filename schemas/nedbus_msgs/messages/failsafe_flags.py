@@ -5,11 +5,11 @@ from nedbus_msgs.model.px4_types import Bool, Uint8, Uint32, field
 
 
 class FailsafeFlags(Message):
-    """Requirements of the modes and which are missing: why a vehicle does not arm, and what its failsafes act upon.
+    """Requirements of the modes, and the unmet ones: reasons that a vehicle does not arm, and triggers of failsafes.
 
-    A mask mode_req_ has bit n (1 << n) for the mode n of VehicleStatus.NAVIGATION_STATE_.
-    A mode is blocked while what it needs is missing: its bit in mode_req_local_position, and local_position_invalid.
-    All flags are false while all is well. remote_id_unhealthy and the like are also set where there is no such system.
+    The masks mode_req_ have bit n (1 << n) for mode n of VehicleStatus.NAVIGATION_STATE_.
+    An unmet requirement blocks a mode, for example its bit in mode_req_local_position with local_position_invalid.
+    All flags are false if there is no fault, but remote_id_unhealthy and the like are also set without such a system.
     primary_geofence_breached (1.14) and local_position_accuracy_low (up to 1.16) have their newer names here.
     """
 

@@ -1,16 +1,16 @@
-"""HomePosition: the place that the vehicle returns to."""
+"""HomePosition: the place to which the vehicle returns."""
 
 from nedbus_msgs.model import FiniteWhile, Layout, Message, Topic, Within
 from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint32, field
 
 
 class HomePosition(Message):
-    """Home of a vehicle: where it returns to, on the globe and in local NED.
+    """Home of a vehicle, the place to which it returns, in global coordinates and in local NED.
 
-    Latitude and longitude, altitude, and local position each have a flag; what is not valid is mostly 0, not NaN.
+    Latitude and longitude, altitude, and local position each have a flag; invalid values are mostly 0, not NaN.
     PX4 publishes it when home is set or moves, and then perhaps not for minutes: keep the last one.
-    valid_attitude is of main; up to 1.18 nothing says whether roll, pitch and yaw are valid.
-    x, y and z hold until the estimator moves the origin of local NED.
+    valid_attitude exists in main; up to 1.18 the validity of roll, pitch and yaw is unknown.
+    x, y and z apply until the estimator moves the origin of local NED.
     """
 
     TOPICS = (Topic("home_position", 0.0, "the commander, when home is set or moves", on_change=True),)

@@ -7,18 +7,18 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Int32, Uint8, Ui
 
 
 def _integer(value: float, scale: float) -> int:
-    """Return a value in units of 1/scale as an integer; 0 for NaN and infinity, which integers do not have."""
+    """Convert a value to an integer in units of 1/scale; 0 for NaN and infinity, which integers lack."""
     return round(value * scale) if math.isfinite(value * scale) else 0
 
 
 class SensorGps(Message):
-    """Output of a GNSS receiver (sensor_gps), or of the choice or blend of all that EKF2 uses (vehicle_gps_position).
+    """Output of a GNSS receiver (sensor_gps), or the selected or blended output that EKF2 uses (vehicle_gps_position).
 
-    Look at fix_type first: with 0 or 1, no fix, position and velocity may look good, and vel_ned_valid may be true.
-    eph and epv are thousands of kilometres with some receivers that have no fix; timestamp_sample is 0 with many.
+    Check fix_type first: with 0 or 1 (no fix), position and velocity may look good, and vel_ned_valid may be true.
+    Without a fix, some receivers report eph and epv of thousands of kilometres; many leave timestamp_sample at 0.
     cog_rad is within [-pi, pi] or [0, 2 pi], as the receiver has it; time_utc_usec is 0 until the receiver knows UTC.
 
-    Layouts 1.13 and 1.14 have latitude and longitude in 1e-7 deg and altitudes in mm as integers: converted, both ways.
+    Layouts 1.13 and 1.14 have integers for latitude and longitude (1e-7 deg) and altitudes (mm), converted both ways.
     Since 1.17 jamming_state and spoofing_state 2 and 3 mean "mitigated" and "detected";
     before, "warning" and "critical" (jamming), "indicated" and "multiple" (spoofing).
     """

@@ -8,8 +8,8 @@ class TimesyncStatus(Message):
     """Offset between the clock of a companion or ground station and the vehicle's, as the vehicle measures it.
 
     Vehicle's time (its `timestamp`) = remote time + estimated_offset.
-    Where the other side has Unix time, the offset is negative, and -estimated_offset is when the vehicle booted.
-    There is no message unless the other side answers; right after a start the offset may be off by milliseconds.
+    If the other side uses Unix time, the offset is negative, and -estimated_offset is the time of the vehicle's boot.
+    There are no messages unless the other side answers; just after a start, the offset may be wrong by milliseconds.
     """
 
     TOPICS = (Topic("timesync_status", 10.0, "the MAVLink or DDS module, while a companion answers"),)

@@ -7,12 +7,12 @@ from nedbus_msgs.model.px4_types import Float32x4, Uint8, Uint64, field
 class VehicleAttitude(Message):
     """Attitude of a vehicle: the rotation from its body frame (FRD) to the local frame (NED).
 
-    Quaternions are Hamilton's, (w, x, y, z), of norm 1; FRD: x forward, y right, z down.
-    q turns a vector of the body frame into one of NED; q and -q are the same attitude, either may come.
-    A first element of NaN means that the attitude is not known.
+    Quaternions follow the Hamilton convention, (w, x, y, z), with norm 1; FRD: x forward, y right, z down.
+    q rotates a vector from the body frame to NED; q and -q are the same attitude, and both occur.
+    If the first element is NaN, the attitude is unknown.
 
     delta_q_reset keeps the value of the latest reset: it explains a jump only if quat_reset_counter rose by exactly 1.
-    It is all 0 in some ground truth, which is no rotation at all.
+    In some ground truth it is all 0, which is not a rotation.
     """
 
     TOPICS = (

@@ -5,11 +5,11 @@ from nedbus_msgs.model.px4_types import Bool, Float32, Float64, Uint8, Uint64, f
 
 
 class VehicleGlobalPosition(Message):
-    """Position of a vehicle on the globe, as its estimator has it; what the GNSS receiver says is SensorGps.
+    """Global position estimate of a vehicle; the output of its GNSS receiver is SensorGps.
 
     Degrees (WGS84) and metres upwards; VehicleLocalPosition is the same estimate in local NED.
-    Layouts up to 1.15 have no lat_lon_valid and alt_valid: there false says nothing, see `model_fields_set`.
-    The position can jump by metres without a count of a reset, as when GNSS comes back after dead reckoning.
+    Layouts up to 1.15 lack lat_lon_valid and alt_valid: false means unknown then, see `model_fields_set`.
+    The position can jump by metres without a counted reset, as when GNSS returns after dead reckoning.
     alt_ellipsoid is often alt in simulators, and 0 in some ground truth.
     """
 

@@ -5,11 +5,11 @@ from nedbus_msgs.model.px4_types import Bool, field
 
 
 class VehicleLandDetected(Message):
-    """Output of the land detector: in the air, on the ground, and why.
+    """Output of the land detector: in the air or on the ground, and the evidence for it.
 
-    A multicopter lands in three steps, each after some time of its signs: ground_contact, maybe_landed, landed.
-    So landed comes some time after touchdown; other kinds of vehicles mostly use landed alone.
-    The flags from in_descend to close_to_ground_or_skipped_check are the signs behind these steps, for diagnosis.
+    A multicopter lands in three steps: ground_contact, maybe_landed, landed, each once its evidence has lasted a while.
+    So landed is set some time after touchdown; other kinds of vehicles mostly use landed alone.
+    The flags from in_descend to close_to_ground_or_skipped_check are the evidence, for diagnosis.
     """
 
     TOPICS = (Topic("vehicle_land_detected", 1.0, "the land detector", on_change=True),)

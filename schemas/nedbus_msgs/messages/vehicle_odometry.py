@@ -5,17 +5,17 @@ from nedbus_msgs.model.px4_types import Float32x3, Float32x4, Int8, Uint8, Uint6
 
 
 class VehicleOdometry(Message):
-    """Pose and twist of a vehicle in one message: EKF2's estimate, or what vision or motion capture measured.
+    """Pose and twist of a vehicle in one message: EKF2's estimate, or a measurement by vision or motion capture.
 
     pose_frame is the frame of position and q, velocity_frame that of velocity: NED, aligned to true north, or FRD, with
-    an origin and heading of its own; z points down in both. A body frame is FRD too: x forward, y right.
-    Not known: NaN in the first element of an array. Variances are without covariances.
-    reset_counter counts resets of all kinds together, and no field says how far they jumped.
-    timestamp_sample may be another computer's, so that it can be later than timestamp.
+    its own origin and heading; z points down in both. The body frame is also FRD: x forward, y right.
+    Unknown: NaN in the first element of an array. Variances come without covariances.
+    reset_counter counts resets of all kinds together; no field holds the size of their jumps.
+    timestamp_sample may be from another computer's clock, and can be later than timestamp.
 
     Layout 1.13: its covariance matrices and q_offset are dropped on upgrade, NaN on downgrade; it has no quality.
-    local_frame (0 NED, 1 FRD, 2 other) becomes pose_frame. velocity_frame is kept as it is, though 1.13 numbers it
-    as local_frame, with 3 the body: EKF2 of 1.13 says 1 for a velocity in NED, which is right in today's numbers.
+    local_frame (0 NED, 1 FRD, 2 other) becomes pose_frame. velocity_frame is kept, although 1.13 numbers it
+    like local_frame, with 3 for the body: EKF2 of 1.13 sends 1 for a velocity in NED, which is right in newer ones.
     """
 
     TOPICS = (

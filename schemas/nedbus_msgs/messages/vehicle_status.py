@@ -5,12 +5,12 @@ from nedbus_msgs.model.px4_types import Bool, Uint8, Uint16, Uint32, Uint64, fie
 
 
 class VehicleStatus(Message):
-    """State of a vehicle as its commander has it: armed or not, mode, failsafe, links.
+    """State of a vehicle from PX4's commander: arming, mode, failsafe, links.
 
-    nav_state is the mode in force; nav_state_user_intention is what the user chose, which a failsafe does not change.
-    A mask has bit n (1 << n) for the mode n of NAVIGATION_STATE_; modes 23 to 30 are a companion's.
+    nav_state is the active mode; nav_state_user_intention is the user's choice, which a failsafe does not change.
+    Masks have bit n (1 << n) for mode n of NAVIGATION_STATE_; modes 23 to 30 are a companion's.
 
-    The constants are those of main; numbers that were free in older releases have names now. What changed its meaning:
+    The constants are those of main; numbers unused in older releases have names now. Numbers with another meaning:
     mode 8 landed after an engine failure in 1.13; ARM_DISARM_REASON_ from 6 on: up to 1.17 6 was the safety button,
     7 landed, 8 no take-off, 9 the kill switch, 10 lockdown, 11 the failure detector, 12 shutdown, 13 a test.
     data_link_lost and data_link_lost_counter of layout 1.13 are gcs_connection_lost and its counter here.

@@ -1,4 +1,4 @@
-"""The definition of a message: fields and types, layouts, rules, validation; made from its file in `messages/`."""
+"""The definition of a message, built from its file in `messages/`: fields, types, layouts, rules and validation."""
 
 from .declaration import Layout, Older, Topic
 from .message import Message

@@ -1,4 +1,4 @@
-"""Parts of the file of a message beside its fields: topics, layouts, and older names of fields."""
+"""Declarations in a message's file besides its fields: topics, layouts, and fields of older layouts."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from typing import Any, Final, Literal
 from .px4_types import FieldType
 
 DEFAULT_TOPIC: Final = "vehicle_local_position"
-"""The topic of a call that names none."""
+"""The default topic."""
 RELEASES: Final = ("1.13", "1.14", "1.15", "1.16", "1.17", "1.18", "main")
-"""The releases of PX4 whose layouts are known, oldest first."""
+"""The PX4 releases with known layouts, oldest first."""
 ALL: Final = "all"
-"""Name of the layout that has every field of the model, where no release of PX4 has them all."""
+"""Name of the layout with every field of the model, if no release of PX4 has them all."""
 
-_CACHE_SECONDS: Final = 20.0
-_MIN_CACHE: Final = 400
+_CACHE_SECONDS: Final = 20.0  # s of messages in a publisher's cache, at the nominal rate
+_MIN_CACHE: Final = 400  # messages in a publisher's cache
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
     """One uORB topic.
 
-    `rate`: the nominal rate at which PX4 publishes or logs it [Hz], 0 where there is none.
+    `rate`: nominal rate at which PX4 publishes or logs it [Hz]; 0 if there is none.
     `doc`: its publisher.
-    `on_change`: PX4 sends it at each change, and at `rate` otherwise: bursts and pauses are no faults.
-    `instances`: it has uORB instances, one per EKF or sensor; None if that is not known.
-    `plain_first`: in ROS 2 the topic of its instance 0 has no number, as PX4 calls it by default.
-    `priority`: on a congested link, messages of a higher one go first.
+    `on_change`: PX4 sends it on change, and at `rate` otherwise, so bursts and pauses are not faults.
+    `instances`: True if it has uORB instances, one per EKF or sensor; None if unknown.
+    `plain_first`: the ROS 2 topic of instance 0 has no number, as in PX4's defaults.
+    `priority`: messages of higher priority go first on a congested link.
     """
 
     name: str
@@ -42,20 +42,20 @@ class Topic:
 
     @property
     def kept(self) -> int:
-        """Number of messages that a publisher keeps for readers that missed some: 20 s at the nominal rate."""
+        """Number of messages in a publisher's retransmission cache: 20 s at the nominal rate, at least 400."""
         return max(_MIN_CACHE, round(_CACHE_SECONDS * self.rate))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """One layout.
+    """One layout of a message.
 
     `name`: the first PX4 release with it.
-    `text`: the names of its fields, `*` for those of the model, or its difference from another layout:
-    `1.13, without a b, c: d e` lacks a and b, and has d and e behind c; `d:uint8` has a type that is not the model's.
+    `text`: the names of its fields, `*` for those of the model, or the difference from another layout:
+    `1.13, without a b, c: d e` lacks a and b, and has d and e after c; `d:uint8` overrides the type in the model.
     `wire`: its number in payloads, if it has one.
-    `aliases`: names of ROS 2 types that hold it beside that of the message.
-    `types`: its fields with their types, in order, as the definition of the message makes them of `text`.
+    `aliases`: further ROS 2 types with this layout, besides that of the message.
+    `types`: its fields and their types in order, which the definition of the message parses from `text`.
     """
 
     name: str
@@ -74,9 +74,9 @@ class Layout:
 class Older:
     """A field of older layouts, and its place in the model.
 
-    `new`: the fields of the model that have its value, or an element of one, such as `position[0]`.
-    `up` and `down` convert a value; without them it is only renamed.
-    `type`: PX4's type of it, where that is another one; `doc`: its unit and meaning.
+    `new`: the fields of the model with its value, or elements such as `position[0]`.
+    `up`, `down`: functions that convert its value to the model and back; without them, it is only renamed.
+    `type`: its PX4 type, if different; `doc`: its unit and meaning.
     """
 
     name: str
@@ -88,6 +88,6 @@ class Older:
 
     @property
     def places(self) -> list[tuple[str, int | None]]:
-        """The fields of the model that have its value, each with the index of an element or None."""
+        """The fields of the model with its value, each with the index of an element or None."""
         parts = [place.rstrip("]").partition("[") for place in self.new.split()]
         return [(field, int(index) if index else None) for field, _, index in parts]

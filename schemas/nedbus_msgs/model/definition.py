@@ -1,6 +1,6 @@
-"""The definition of a message in one object, the table of all, and the conversion of PX4's layouts to the model.
+"""Definitions of messages, their registry, and the conversion of PX4's layouts to the model.
 
-A layout is found by its field names or given by its name; never by MESSAGE_VERSION, which two layouts may share.
+A layout is identified by its field names or its name, never by MESSAGE_VERSION, which two layouts may share.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ M_co = TypeVar("M_co", bound="Message", covariant=True)
 
 
 class Row(tuple[Any, ...]):
-    """A message as a named tuple: a fraction of the time of a model, with the same fields in the same order.
+    """A message as a named tuple: the fields of the model in the same order, in a fraction of the time.
 
-    It is validated where it is decoded or encoded, not where it is made.
-    For type checkers it is the message itself; `_fields` and `_asdict()` are those of any named tuple.
+    Validated when decoded or encoded, not when created.
+    Type checkers see the message class; `_fields` and `_asdict()` are those of any named tuple.
     """
 
     __slots__ = ()
@@ -53,10 +53,10 @@ class Row(tuple[Any, ...]):
 
 
 class Plan(NamedTuple):
-    """Mapping of the fields of some layout to those of the model.
+    """Mapping from the fields of a layout to those of the model.
 
-    `names`: the field of the model, and that with its value. `converted`: the same, with a function of the value.
-    `parts`: the field of the model, and those with its elements, None for an element that no field has.
+    All keys are fields of the model. `names`: the field with the same value. `converted`: the field, and a function to
+    convert its value. `parts`: the fields with the elements of an array, None for an element without a field.
     """
 
     names: Mapping[str, str]
@@ -65,17 +65,17 @@ class Plan(NamedTuple):
 
     @property
     def provided(self) -> frozenset[str]:
-        """The fields of the model that get a value."""
+        """The fields of the model that receive a value."""
         return frozenset({*self.names, *self.converted, *self.parts})
 
 
 class Definition(Generic[M_co]):
-    """Everything that is known of one message, of the class in its file.
+    """Metadata of one message, from the class in its file.
 
-    `name`: PX4's name of it, such as VehicleAttitude. `model`: its Pydantic model.
-    `types`: PX4's type of every field of the model, in its order.
-    `topics` and `older` fields: by name. `rules`: those between its fields.
-    `always`: the fields that it has in every log, however old.
+    `name`: its name in PX4, such as VehicleAttitude. `model`: its Pydantic model.
+    `types`: the PX4 type of every field of the model, in order.
+    `topics`, `older`: topics and older fields by name. `rules`: the rules for its fields.
+    `always`: the fields that every log has, even the oldest.
     """
 
     def __init__(self, model: type[M_co]) -> None:
@@ -94,7 +94,7 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def layouts(self) -> Mapping[str, Layout]:
-        """PX4's layouts by name, oldest first; the last one is the model's own."""
+        """PX4's layouts by name, oldest first; the last one is that of the model."""
         found = {layout.name: replace(layout, types=self._types_of(layout.text)) for layout in self.model.LAYOUTS}
         if all(layout.wire is None for layout in found.values()):
             fields = list(self.types.items())
@@ -105,7 +105,7 @@ class Definition(Generic[M_co]):
 
     @cached_property
     def wire_layouts(self) -> Mapping[int, Layout]:
-        """The layouts that a payload may have, by its first value, the number of the layout."""
+        """The layouts that payloads may have, by number on the wire."""
         return {layout.wire: layout for layout in self.layouts.values() if layout.wire is not None}
 
     @cached_property
@@ -125,20 +125,20 @@ class Definition(Generic[M_co]):
         return type(f"{self.name}Row", (Row,), {**places, "__slots__": (), "_fields": self.names, "DEFINITION": self})
 
     def layout_of_release(self, release: str) -> Layout | None:
-        """Return the layout of a release of PX4, or that with this name; None for a message that it does not have."""
+        """Return the layout of a PX4 release, or of this name; None if the release lacks the message."""
         if release in self.layouts or release not in RELEASES:
             return self.layouts.get(release)
         until = RELEASES[: RELEASES.index(release) + 1]
         return next((self.layouts[each] for each in reversed(until) if each in self.layouts), None)
 
     def find_layout(self, names: Iterable[str]) -> Layout | None:
-        """Return the layout with exactly these field names, in any order, or None."""
+        """Return the layout with exactly these field names in any order, or None."""
         given = frozenset(names)
         return next((layout for layout in self.layouts.values() if given == layout.types.keys()), None)
 
     @cached_property
     def known_types(self) -> Mapping[str, Set[FieldType]]:
-        """The types that each field has, or had in an older layout."""
+        """All types of each field, including those in older layouts."""
         known: dict[str, set[FieldType]] = {}
         for layout in self.layouts.values():
             for name, kind in layout.types.items():
@@ -146,29 +146,29 @@ class Definition(Generic[M_co]):
         return known
 
     def recorded_layout(self, provided: frozenset[str]) -> Layout:
-        """Return the layout to write messages in of which these fields of the model are provided.
+        """Return the layout to record messages in, given the provided fields of the model.
 
-        That is the current one, or where no layout of PX4 has all fields that of PX4 with just these.
+        This is the current layout; if no PX4 layout has all fields, it is the PX4 layout with exactly these, if any.
         """
         if self.current.name != ALL:
             return self.current
         return next((layout for layout in self.layouts.values() if layout.types.keys() == provided), self.current)
 
     def plan(self, names: Iterable[str]) -> Plan:
-        """Return the mapping of these fields, of any PX4 release, to the model; unknown names are ignored."""
+        """Return the mapping from these fields, of any PX4 release, to the model; unknown names are ignored."""
         return _plan(self, tuple(names))
 
     def downgrade(self, values: Mapping[str, Any], layout: Layout) -> dict[str, object]:
-        """Return the fields of an older layout, in that layout's order; what the model lacks is "not provided"."""
+        """Convert to an older layout, in its field order; fields that the model lacks are "not provided"."""
         return {name: self._down(name, kind, values) for name, kind in layout.types.items()}
 
     def meaning(self, name: str) -> str:
-        """Return unit and meaning of a field of any layout."""
+        """Return unit and meaning of a field in any layout."""
         field = self.model.model_fields.get(name)
         return (field.description if field else self.older[name].doc if name in self.older else "") or ""
 
     def explain_unknown_field(self, name: str) -> str:
-        """Return the error text for a name that no field has, with the names that may have been meant."""
+        """Return the error text for an unknown field, with suggestions."""
         base, bracket, _ = name.partition("[")
         near = [base] if bracket and base in self.types else difflib.get_close_matches(name.lower(), self.names, 3, 0.5)
         schema = "nedbus schema" if DEFAULT_TOPIC in self.topics else f"nedbus schema {self.name}"
@@ -182,7 +182,7 @@ class Definition(Generic[M_co]):
         return attrgetter("DEFINITION"), (self.model,)
 
     def _types_of(self, text: str) -> Mapping[str, FieldType]:
-        """Return the fields of a layout, given its text."""
+        """Parse the text of a layout to its fields."""
         base, *changes = (part.strip() for part in text.split(","))
         same = next((layout for layout in self.model.LAYOUTS if layout.name == base), None)
         if same or base == "*":
@@ -200,7 +200,7 @@ class Definition(Generic[M_co]):
         return dict(fields)
 
     def _field(self, text: str) -> tuple[str, FieldType]:
-        """Return name and type of `name`, or of `name:type` where the type is not the model's."""
+        """Parse `name`, or `name:type` with a type that overrides the model's, to name and type."""
         name, _, kind = text.partition(":")
         if kind or name in self.types:
             return name, field_type(kind) if kind else self.types[name]
@@ -240,10 +240,10 @@ def _plan(definition: Definition[Any], names: tuple[str, ...]) -> Plan:
 
 
 def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
-    """Return the message with these fields of any PX4 release; arrays are tuples.
+    """Build a message from the fields of any PX4 release; arrays are tuples.
 
-    Known fields are used, by their present name, and unknown names are ignored.
-    A missing field is "not provided": NaN, false or 0, and absent from the message's `model_fields_set`.
+    Older names are mapped to current ones, and unknown names are ignored.
+    A missing field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
     Raises pydantic.ValidationError for an invalid message.
     """
@@ -251,7 +251,7 @@ def upgrade_with(definition: Definition[M], fields: Mapping[str, object]) -> M:
 
 
 def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a message by their names in the model, as `upgrade` does, not validated yet."""
+    """Convert the fields of any PX4 release to those of the model, as `upgrade_with` does, without validation."""
     plan = definition.plan(fields)
     upgraded = {name: fields[old] for name, old in plan.names.items()}
     if plan.converted or plan.parts:
@@ -262,7 +262,7 @@ def upgrade_fields(definition: Definition[Any], fields: Mapping[str, Any]) -> di
 
 
 def _converted(convert: Callable[[Any], Any], value: object) -> object:
-    """Return a converted value; anything but a number stays as it is, for the model to reject."""
+    """Convert a value; leave anything but a number for the model to reject."""
     try:
         return convert(value)
     except (TypeError, OverflowError):
@@ -270,7 +270,7 @@ def _converted(convert: Callable[[Any], Any], value: object) -> object:
 
 
 def require_fields(definition: Definition[Any], fields: Mapping[str, object], layout: Layout) -> None:
-    """Raise LayoutError, with the missing and the unknown names, unless these are the layout's fields."""
+    """Raise LayoutError, with missing and unknown names, unless these are exactly the layout's fields."""
     given, wanted = set(fields), set(layout.types)
     if given == wanted:
         return
@@ -293,15 +293,15 @@ _topics: Final[dict[str, Topic]] = {}
 _by_topic: Final[dict[str, Definition[Any]]] = {}
 
 MESSAGES: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_messages)
-"""The definitions by name of the message: those with a file in `nedbus_msgs.messages`."""
+"""Definitions by message name, of the messages with a file in `nedbus_msgs.messages`."""
 TOPICS: Final[Mapping[str, Topic]] = MappingProxyType(_topics)
-"""The topics of all messages by name."""
+"""The topics of these messages by name."""
 BY_TOPIC: Final[Mapping[str, Definition[Any]]] = MappingProxyType(_by_topic)
 """The definition of the messages on each topic."""
 
 
 def register(definition: Definition[Any]) -> None:
-    """Make a message known; raise ValueError if another one has its name or one of its topics."""
+    """Register a message; raise ValueError if its name or one of its topics is taken."""
     if taken := [name for name in (definition.name, *definition.topics) if name in _messages or name in _topics]:
         raise ValueError(f"{definition.name}: there is a message with {', '.join(taken)} already")
     _messages[definition.name] = definition

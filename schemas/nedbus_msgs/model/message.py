@@ -21,11 +21,11 @@ _FLOAT_NAMES: Final = frozenset({"NaN", "Infinity", "-Infinity"})
 class Message(BaseModel):
     """One message of one vehicle; a subclass in a file of `nedbus_msgs.messages` declares its fields.
 
-    A float32 field holds the float32 nearest to the number given, as a C float would, so that a message is received
-    bit for bit as it was made; a number beyond float32 (1e39) is rejected.
-    A field that is not given is "not provided": NaN, false or 0, and absent from `model_fields_set`.
+    Numbers in float32 fields are rounded to the nearest float32, like a C float, so a message is received bit for bit
+    as it was created; numbers beyond the range of float32 (1e39) are rejected.
+    An omitted field is "not provided": NaN, false or 0, and absent from `model_fields_set`.
 
-    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a violated rule.
+    Raises pydantic.ValidationError, with field and reason, for a wrong type, an unknown field or a broken rule.
     """
 
     model_config = ConfigDict(
@@ -45,19 +45,19 @@ class Message(BaseModel):
 
         def __init__(self, /, **fields: object) -> None:
             definition = self.DEFINITION
-            # A subclass may have validators of its own, which only Pydantic knows.
+            # A subclass may have its own validators, which only Pydantic runs.
             values = definition.validation.validate_fields(fields) if type(self) is definition.model else None
             if values is None:
                 super().__init__(**fields)
             else:
                 fill(self, values, definition.all_fields if len(fields) == len(values) else frozenset(fields))
 
-        # As Pydantic marks its own constructor: validation of dicts and JSON does not call this one.
+        # The mark of Pydantic's own constructor: validation of dicts and JSON then skips this one.
         __init__.__pydantic_base_init__ = True
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Define and register the message, if this class names its topics."""
+        """Define and register the message if this class declares topics."""
         super().__pydantic_init_subclass__(**kwargs)
         if "TOPICS" in vars(cls):
             cls.DEFINITION = Definition(cls)
@@ -66,7 +66,7 @@ class Message(BaseModel):
     @model_validator(mode="wrap")
     @classmethod
     def _accept_equivalents(cls, fields: object, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Validate; if that fails, validate once more with values of NumPy and JSON converted to Python's."""
+        """Validate; if that fails, retry with NumPy and JSON values converted to Python's."""
         try:
             return validate(fields)
         except ValidationError:
@@ -80,7 +80,7 @@ class Message(BaseModel):
 
     @model_validator(mode="after")
     def _round_and_check(self) -> Self:
-        """Round float32 fields to float32, then check the rules between fields."""
+        """Round float32 fields, then check the rules."""
         values, validation = self.__dict__, self.DEFINITION.validation
         row = validation.values_of(values)
         try:
@@ -103,14 +103,14 @@ class Message(BaseModel):
         return hash((self.timestamp, self.__dict__.get("timestamp_sample")))
 
     def model_copy(self, *, update: Mapping[str, object] | None = None, deep: bool = False) -> Self:
-        """Return a copy; unlike Pydantic's own, one with updates is validated."""
+        """Return a copy; unlike with Pydantic's own method, updates are validated."""
         if not update:
             return super().model_copy(deep=deep)
         given = {name: self.__dict__[name] for name in self.model_fields_set}
         return type(self).model_validate({**given, **update})
 
     def _error(self, broken: Iterable[tuple[str, str]]) -> ValidationError:
-        """Build an error with an entry for each field, like Pydantic's own."""
+        """Create an error with one entry per field, like Pydantic's own."""
         details: list[InitErrorDetails] = [
             {
                 "type": PydanticCustomError("px4_rule", "{reason}", {"reason": reason}),
@@ -129,9 +129,9 @@ def _is_same(one: object, other: object) -> bool:
 
 
 def _to_python(value: Any, kind: FieldType | None) -> object:
-    """Return Python's own value for NumPy's scalar or array, a list, or the name that JSON has for a float.
+    """Convert a NumPy scalar or array, a list, or JSON's name of a float to Python's own value.
 
-    Anything else stays as it is, for the model to reject.
+    Anything else is left for the model to reject.
     """
     if type(value).__module__ == "numpy":
         value = value.tolist()
@@ -144,7 +144,7 @@ def _to_python(value: Any, kind: FieldType | None) -> object:
 
 
 def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
-    """Set the fields of a new message, which are valid and rounded to float32, without validating them; return it."""
+    """Set the fields of a new message to valid, rounded values, without validating them; return the message."""
     _set_dict(message, values)
     _set_fields_set(message, given)
     _set_extra(message, None)
@@ -152,7 +152,7 @@ def fill(message: _M, values: dict[str, object], given: Set[str]) -> _M:
     return message
 
 
-# What Pydantic's own validator sets on an instance (2.12 to 2.x); the models are frozen, so this sets their slots.
+# The slots that Pydantic's own validator sets (2.12 to 2.x); set directly, as the models are frozen.
 _set_dict, _set_fields_set, _set_extra, _set_private = (
     cast("Callable[[Message, object], None]", vars(BaseModel)[slot].__set__)
     for slot in ("__dict__", "__pydantic_fields_set__", "__pydantic_extra__", "__pydantic_private__")

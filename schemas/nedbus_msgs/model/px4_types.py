@@ -1,4 +1,4 @@
-"""PX4's field types: a table of the base types, and each type as an annotation for Pydantic."""
+"""PX4's field types: a table of base types, and annotations for Pydantic."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from pydantic_core import CoreSchema, core_schema
 
 NAN: Final = math.nan
 LONGEST_ARRAY: Final = 1024
-"""Elements of the longest array that a field may be; PX4's longest has 512."""
+"""Elements of the longest array allowed; PX4's longest has 512."""
 
 
 class Base(NamedTuple):
-    """A base type: its format in a struct, its tag in msgpack, its number in a ROS 2 type description, its default."""
+    """A base type: struct format, msgpack tag, id in ROS 2 type descriptions, and default."""
 
     code: str
     tag: int
@@ -47,9 +47,9 @@ ALIASES: Final[Mapping[str, str]] = {"char": "uint8", "byte": "uint8"}
 
 @dataclass(frozen=True)
 class FieldType:
-    """PX4's type of a field, such as `float32[4]`; `length` is None for a single value.
+    """A PX4 field type, such as `float32[4]`; `length` is None for a single value.
 
-    Raises ValueError for a base type that PX4 does not have, and for an array of no or too many elements.
+    Raises ValueError for an unknown base type, and for an array with no or too many elements.
     """
 
     base: str
@@ -57,7 +57,7 @@ class FieldType:
 
     def __post_init__(self) -> None:
         if self.base not in BASES:
-            raise ValueError(f"{self.base!r} is no type: expected {', '.join(BASES)}, or an array of a fixed length")
+            raise ValueError(f"{self.base!r} is not a type: expected {', '.join(BASES)}, or an array of fixed length")
         if self.length is not None and not 0 < self.length <= LONGEST_ARRAY:
             raise ValueError(f"an array of {self.length}: expected 1 to {LONGEST_ARRAY} elements")
 
@@ -71,35 +71,35 @@ class FieldType:
 
     @cached_property
     def size(self) -> int:
-        """Bytes of one value, and its alignment in CDR."""
+        """Size of one value in bytes, which is also its alignment in CDR."""
         return struct.calcsize("<" + BASES[self.base].code)
 
     @cached_property
     def is_float(self) -> bool:
-        """True for floats, whose values may be NaN."""
+        """True for float types, whose values may be NaN."""
         return self.base.startswith("float")
 
     @cached_property
     def absent(self) -> object:
-        """Value of a field that is not provided: NaN, false or 0, in each element of an array."""
+        """Value of a field that is not provided: NaN, false or 0; in an array, for each element."""
         absent = BASES[self.base].absent
         return absent if self.length is None else (absent,) * self.length
 
     @cached_property
     def limits(self) -> tuple[int, int]:
-        """The least and the greatest integer that it holds."""
+        """Minimum and maximum of an integer type."""
         bits = 8 * self.size
         return (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
     @cached_property
     def annotation(self) -> Any:
-        """The annotation of a field of this type."""
+        """The type annotation of a model's field."""
         value = bool if self.base == "bool" else float if self.is_float else int
         python = value if self.length is None else tuple[(value,) * self.length]  # type: ignore[misc] # one for each
         return Annotated[python, self, Field(default=self.absent)]
 
     def core_schema(self, *, from_json: bool) -> CoreSchema:
-        """Return Pydantic's schema: integers have limits, and with `from_json` floats may be the names of NaN, ..."""
+        """Return Pydantic's schema: integers have limits; with `from_json`, floats may be names such as "NaN"."""
         if self.length is not None:
             return core_schema.tuple_positional_schema(
                 [FieldType(self.base).core_schema(from_json=from_json)] * self.length
@@ -122,20 +122,20 @@ class FieldType:
 
 @cache
 def field_type(text: str) -> FieldType:
-    """Return a type by PX4's name of it; raise ValueError, as FieldType does, for another text."""
+    """Parse PX4's name of a type; raise ValueError, as FieldType does, if it is invalid."""
     found = re.fullmatch(r"(\w+)(?:\[(\d{1,9})\])?", text)
     if found is None:
-        raise ValueError(f"{text!r} is no type: expected one such as uint8 or float32[4]")
+        raise ValueError(f"{text!r} is not a type: expected one such as uint8 or float32[4]")
     return FieldType(ALIASES.get(found[1], found[1]), None if found[2] is None else int(found[2]))
 
 
 def field(meaning: str) -> Any:
-    """Declare a field with its unit, frame and meaning; while it is not provided it is NaN, false or 0."""
+    """Declare a field with its unit, frame and meaning; its default is NaN, false or 0."""
     return Field(description=meaning)
 
 
 Timestamp = Annotated[int, field_type("uint64")]
-"""The time of a message, its only field that is required."""
+"""The time of a message, its only required field."""
 Bool = Annotated[bool, field_type("bool"), Field(default=False)]
 Int8 = Annotated[int, field_type("int8"), Field(default=0)]
 Int32 = Annotated[int, field_type("int32"), Field(default=0)]

@@ -1,6 +1,6 @@
-"""The rules between the fields of a message, each an expression of Python: of values, and of columns of NumPy.
+"""Rules for the fields of a message, as Python expressions on values and on NumPy columns.
 
-A rule is one only if no real flight breaks it: docs/messages.md has the counts.
+Every rule holds on all real flights examined; docs/messages.md has the counts.
 """
 
 from __future__ import annotations
@@ -17,14 +17,15 @@ FLOAT32_PI: Final = struct.unpack("<f", struct.pack("<f", math.pi))[0]
 _QUATERNION: Final = struct.Struct("<4f")
 
 Place = Callable[[str], str]
-"""Return the Python expression of a field's value, given its name."""
+"""A function from the name of a field to the Python expression of its value."""
 
 
 class Check(NamedTuple):
-    """The check of one field: `wrong` is an expression that is true if it breaks the rule.
+    """The check of one field.
 
-    `reason`: the text for it, with other fields in braces.
-    `wrong` has parentheses around each comparison, and no `if`, so that it can be made one of columns.
+    `reason`: the error text, with other fields in braces.
+    `wrong`: an expression that is true if the field breaks the rule. It has parentheses around each comparison and no
+    `if`, to be convertible to an expression on columns.
     """
 
     field: str
@@ -33,9 +34,9 @@ class Check(NamedTuple):
 
 
 class Rule:
-    """A rule of each of some `fields` by itself, or between them; the values have the right types.
+    """A rule for each of its `fields`, or between them; values already have the right types.
 
-    NaN never breaks the rule of a field.
+    NaN never breaks the rule of a single field.
     """
 
     reason: str
@@ -44,7 +45,7 @@ class Rule:
         self.fields = fields
 
     def wrong(self, value: str) -> str:
-        """Return an expression that is true for a value that breaks it."""
+        """Return an expression that is true if a value breaks the rule."""
         raise NotImplementedError
 
     def checks(self, at: Place) -> Iterator[Check]:
@@ -53,25 +54,25 @@ class Rule:
             yield Check(name, self.reason, self.wrong(at(name)))
 
     def kept(self, at: Place) -> str:
-        """Return an expression that is true for a message that keeps it."""
+        """Return an expression that is true if a message obeys the rule."""
         return f"not ({' or '.join(check.wrong for check in self.checks(at))})"
 
 
 class FiniteWhile(Rule):
-    """While a flag is set, its fields are finite; `flags` has the fields of each."""
+    """Fields are finite while their flag is set; `flags` maps each flag to its fields."""
 
     def __init__(self, flags: Mapping[str, Sequence[str]]) -> None:
         super().__init__(*(name for flag, names in flags.items() for name in (flag, *names)))
         self.flags = flags
 
     def checks(self, at: Place) -> Iterator[Check]:
-        """Yield the check of each field that a flag stands for."""
+        """Yield the check of each field of each flag."""
         for flag, names in self.flags.items():
             for name in names:
                 yield Check(name, f"must be finite while {flag} is true", f"({at(flag)} and not isfinite({at(name)}))")
 
     def kept(self, at: Place) -> str:
-        """Look at all fields at once first: almost always they are finite."""
+        """Check all fields at once first, as they are almost always finite."""
         fields = [at(name) for names in self.flags.values() for name in names]
         return f"(isfinite({' + '.join(fields)}) or {super().kept(at)})"
 
@@ -100,14 +101,14 @@ class Within(Rule):
 
 
 class InRange(Rule):
-    """A field, or each element of an array, is from `least` to `greatest`, or the value of "not known"; NaN passes."""
+    """A field, or each element of an array, is within `least` and `greatest`, or is `or_` ("unknown"); NaN passes."""
 
     def __init__(
         self, field: str, least: float, greatest: float, *, or_: float | None = None, is_array: bool = False
     ) -> None:
         super().__init__(field)
         self._is_array = is_array
-        # A value that is rounded to float32 on its way must keep the rule that it kept before.
+        # A valid value must remain valid when it is rounded to float32.
         self._bounds = min(least, float32(least)), max(greatest, float32(greatest))
         self._unknown = () if or_ is None else tuple(dict.fromkeys((or_, float32(or_))))
         unknown = "" if or_ is None else f", or {or_:g} while it is not known"
@@ -132,13 +133,13 @@ class NotLater(Rule):
         super().__init__(earlier, later)
 
     def checks(self, at: Place) -> Iterator[Check]:
-        """Yield that of the earlier one."""
+        """Yield the check of the earlier field."""
         earlier, later = self.fields
         yield Check(earlier, f"must not be later than {later} ({{{later}}})", f"({at(earlier)} > {at(later)})")
 
 
 class UnitQuaternion(Rule):
-    """A quaternion (w, x, y, z) has norm 1, to a thousandth, or is not provided: w is NaN."""
+    """A quaternion (w, x, y, z) has norm 1, within 0.001, or is not provided (w is NaN)."""
 
     reason = "must have norm 1, or NaN as its first element while it is not known"
     _SQUARE: Final = (0.999**2 + 1.001**2) / 2
@@ -151,15 +152,15 @@ class UnitQuaternion(Rule):
 
 
 def passes_all(rules: Sequence[Rule], at: Place) -> Callable[[Any], bool]:
-    """Return a function that returns whether `values` pass the rules; `at` gives the place of each field in it.
+    """Return a function that checks whether `values` pass all rules; `at` gives the expression of a field in it.
 
-    It is one expression, so that it takes no more time than the comparisons that it is made of.
+    It is compiled from a single expression, so it costs no more than its comparisons.
     """
     return evaluated(f"lambda values: {' and '.join(rule.kept(at) for rule in rules) or True}")
 
 
 def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield field and reason of each field that breaks a rule, given the values of all fields."""
+    """Yield the name and the reason for each field that breaks a rule, given the values of all fields."""
     for rule in rules:
         for field, reason, wrong in rule.checks(lambda name: f"values[{name!r}]"):
             if evaluated(f"lambda values: {wrong}")(values):
@@ -167,9 +168,9 @@ def violations(rules: Sequence[Rule], values: Mapping[str, Any]) -> Iterator[tup
 
 
 def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> list[Callable[[Any], Any]]:
-    """Return functions that return a mask of the messages of a structured array that break a rule.
+    """Return one function per check, from a structured array to a mask of the messages that break the rule.
 
-    `functions` are those of columns, by the names that checks have for them; an array of vectors is transposed.
+    `functions`: the functions that checks call, for columns; columns of arrays are transposed.
     """
     texts = [check.wrong for rule in rules for check in rule.checks(lambda name: f"values[{name!r}].T")]
     for word, operator in {" or ": " | ", " and ": " & ", "not ": "~"}.items():
@@ -179,9 +180,9 @@ def wrong_columns(rules: Sequence[Rule], **functions: Callable[..., Any]) -> lis
 
 @cache
 def evaluated(expression: str, **functions: Callable[..., Any]) -> Callable[[Any], Any]:
-    """Return the function of a lambda that is made here, of numbers and places: nothing of it comes from a peer."""
+    """Compile a lambda that was generated from numbers and field positions, never from a peer's data."""
     names = {"isfinite": math.isfinite, "squared_norm": _squared_norm, "inf": math.inf, **functions}
-    code = compile(expression, "<rules>", "eval")  # of a text, eval makes CPython forget a Ctrl-C of another thread
+    code = compile(expression, "<rules>", "eval")  # eval() of a str makes CPython lose a pending Ctrl-C
     return cast("Callable[[Any], Any]", eval(code, names))  # noqa: S307 - see above
 
 
@@ -194,7 +195,7 @@ def float32(value: float) -> float:
 
 
 def _squared_norm(quaternion: tuple[float, float, float, float]) -> float:
-    """Return the square of the norm that it has once it is rounded to float32."""
+    """Return the squared norm of a quaternion after rounding to float32."""
     try:
         w, x, y, z = _QUATERNION.unpack(_QUATERNION.pack(*quaternion))
     except OverflowError:

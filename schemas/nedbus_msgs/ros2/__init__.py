@@ -1,1 +1,1 @@
-"""ROS 2: the names, hashes and .msg texts of types, and the names of topics."""
+"""ROS 2 types: names, type hashes and .msg definitions."""

@@ -1,4 +1,4 @@
-"""Parser of PX4's .msg files: fields with their types, units, ranges and meanings; errors have line and column."""
+"""Parser for PX4's .msg files: fields with types, units, ranges and meanings; errors have line and column."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _FIELD = re.compile(r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]+)\s*(?:=\s*(?P<value
 _NUMBER: Final = r"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|inf)"
 _RANGE = re.compile(rf"@range\s+({_NUMBER})?\s*,\s*({_NUMBER})?")
 _INVALID = re.compile(rf"@invalid\s+({_NUMBER})")
-_MOST: Final = 1000  # fields that are read; a message has fewer
-_NESTED: Final = 3  # levels of messages within messages; PX4 has one
-_LONGEST: Final = 2**18  # characters of a file; PX4's longest has 20,000
+_MOST: Final = 1000  # fields read from a file; a message has fewer
+_NESTED: Final = 3  # levels of nested messages; PX4 has one
+_LONGEST: Final = 2**18  # characters per file; PX4's longest has 20,000
 
 
 class MsgError(ValueError):
-    """Raised for a text that is no .msg file of a message; `line` and `column` count from 1."""
+    """Raised for text that is not a valid .msg file; `line` and `column` count from 1."""
 
     def __init__(self, line: int, column: int, reason: str) -> None:
         super().__init__(f"line {line}, column {column}: {reason}")
@@ -37,7 +37,7 @@ class MsgError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MsgField:
-    """One field of a .msg file, with its comment, and the range that it is annotated with."""
+    """One field of a .msg file, with its comment and its annotated range."""
 
     name: str
     type: FieldType
@@ -46,17 +46,17 @@ class MsgField:
 
 
 def read_msg(text: str) -> list[MsgField]:
-    """Return the fields of a .msg file, in order, without its constants; raise MsgError for another text.
+    """Return the fields of a .msg file in order, without constants; raise MsgError if it is malformed.
 
-    Messages within it follow it as in ROS 2 and MCAP, behind a line of = and one of `MSG: package/Name`: their fields
-    are those of the message, `current_lat`, `esc_0_esc_rpm`.
+    Nested messages follow it as in ROS 2 and MCAP, each after a line of = and a line `MSG: package/Name`. Their fields
+    are flattened into the message: `current_lat`, `esc_0_esc_rpm`.
     """
     return list(islice(_flatten(_parts(text), "", "", 0), _MOST))
 
 
 @lru_cache(256)  # its codecs are kept with it
 def define_msg(name: str, text: str) -> Definition[Message]:
-    """Return the message of a .msg file, range-checked by its annotations; raise MsgError for another text."""
+    """Define the message of a .msg file, range-checked by its annotations; raise MsgError if it cannot be carried."""
     fields = read_msg(text)
     try:
         return define(
@@ -70,7 +70,7 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 
 
 def hash_of_msg(name: str, text: str) -> str:
-    """Return the RIHS01 hash of the px4_msgs type that a .msg file describes, with the messages within it."""
+    """Return the RIHS01 hash of the px4_msgs type in a .msg file, including nested messages."""
     parts = _parts(text)
     described = {part: [_describe(line, parts) for line in lines] for part, lines in parts.items()}
     used = sorted({line.base for lines in parts.values() for line in lines} & parts.keys())
@@ -78,12 +78,12 @@ def hash_of_msg(name: str, text: str) -> str:
 
 
 def bases_of_msg(text: str) -> set[str]:
-    """Return the names of the types that a .msg file has, base types and messages within it."""
+    """Return the names of all field types in a .msg file, both base types and nested messages."""
     return {line.base for lines in _parts(text).values() for line in lines}
 
 
 class _Line(NamedTuple):
-    """A field as it is written: `base` is its type without the length of an array."""
+    """A field as written; `base`: its type without the array length."""
 
     number: int
     column: int
@@ -94,9 +94,9 @@ class _Line(NamedTuple):
 
 
 def _parts(text: str) -> dict[str, list[_Line]]:
-    """Return the fields of the message, by "", and of those within it by their names."""
+    """Return the fields of the message under "", and those of nested messages under their names."""
     if len(text) > _LONGEST:
-        raise MsgError(1, 1, f"{len(text)} characters are no .msg file")
+        raise MsgError(1, 1, f"{len(text)} characters, more than the limit of {_LONGEST}")
     parts: dict[str, list[_Line]] = {"": []}
     current = parts[""]
     for number, line in enumerate(text.splitlines(), 1):

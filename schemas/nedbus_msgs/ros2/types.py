@@ -1,4 +1,4 @@
-"""The ROS 2 types of messages: their names, definitions and RIHS01 hashes, computed from the layouts."""
+"""ROS 2 types of messages: names, definitions and RIHS01 hashes, computed from layouts."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from nedbus_msgs.model.definition import MESSAGES, Definition
 from nedbus_msgs.model.px4_types import BASES, FieldType
 
 PACKAGE: Final = "px4_msgs/msg"
-ARRAY: Final = 48  # of type_description_interfaces/msg/FieldType, for an array of fixed size
-NESTED: Final = 1  # of the same, for a message
+ARRAY: Final = 48  # offset in type_description_interfaces/msg/FieldType, for an array of fixed size
+NESTED: Final = 1  # in the same, for a nested message
 Described = tuple[str, int, int, str]
-"""A field in a type description: name, type, length of its array, and the type of a message within the message."""
+"""A field in a type description: name, type id, array length, and name of the nested type."""
 
 _RIHS01: Final = "RIHS01_"
 
@@ -27,14 +27,14 @@ def ros2_type(definition: Definition[Any]) -> str:
 
 
 def dds_type(name: str) -> str:
-    """Return the DDS name of a ROS 2 type, as in a key: `px4_msgs::msg::dds_::VehicleLocalPosition_`."""
+    """Return the DDS name of a ROS 2 type, as used in keys: `px4_msgs::msg::dds_::VehicleLocalPosition_`."""
     package, kind, type_name = name.split("/")
     return f"{package}::{kind}::dds_::{type_name}_"
 
 
 @cache
 def ros2_types() -> Mapping[str, Definition[Any]]:
-    """Return the message of each ROS 2 type that holds a known one; PX4's translation node has types of its own."""
+    """Return the definition for each ROS 2 type of a known message, including those of PX4's translation node."""
     types = {ros2_type(definition): definition for definition in MESSAGES.values()}
     for definition in MESSAGES.values():
         types |= {alias: definition for layout in definition.layouts.values() for alias in layout.aliases}
@@ -42,12 +42,12 @@ def ros2_types() -> Mapping[str, Definition[Any]]:
 
 
 def hash_of(layout: Layout, ros2_type: str) -> str:
-    """Return the RIHS01 hash of a ROS 2 type with the fields of a layout (ROS REP 2016): `RIHS01_`, 64 hex digits."""
+    """Return the RIHS01 hash (REP 2016) of a ROS 2 type with the fields of a layout: `RIHS01_` and 64 hex digits."""
     return type_hash((ros2_type, [described(name, kind) for name, kind in layout.types.items()]))
 
 
 def type_hash(*types: tuple[str, Sequence[Described]]) -> str:
-    """Return the RIHS01 hash of a type, of its name and its fields, given with the types within it, sorted by name."""
+    """Return the RIHS01 hash of a type, given by name and fields, followed by its nested types sorted by name."""
     whole, *within = [
         {
             "type_name": type_name,
@@ -66,19 +66,19 @@ def type_hash(*types: tuple[str, Sequence[Described]]) -> str:
 
 
 def described(name: str, kind: FieldType) -> Described:
-    """Return a field as a type description has it."""
+    """Return a field as part of a type description."""
     capacity = kind.length or 0
     return name, BASES[kind.base].ros2 + (ARRAY if capacity else 0), capacity, ""
 
 
 def definition_text(definition: Definition[Any], layout: Layout) -> str:
-    """Return the .msg file of a layout, with unit and meaning of each field."""
+    """Return the .msg definition of a layout, with unit and meaning of each field."""
     lines = ((f"{kind} {name}", definition.meaning(name)) for name, kind in layout.types.items())
     return "".join(f"{field}  # {meaning}\n" if meaning else f"{field}\n" for field, meaning in lines)
 
 
 def message_of_type_hash(text: str) -> tuple[Definition[Any], Layout] | None:
-    """Return the message and the layout whose type has this hash, with `RIHS01_` or without; None if unknown."""
+    """Return message and layout for a type hash, with or without `RIHS01_`; None if it is unknown."""
     return _by_hash().get(text.removeprefix(_RIHS01).lower())
 
 

@@ -1,4 +1,4 @@
-"""Bridges: live streams of a bus for ROS 2 nodes and for Foxglove."""
+"""Bridges from a bus to ROS 2 nodes and to Foxglove."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ if TYPE_CHECKING:
 __all__ = ["FOXGLOVE_PORT", "FoxgloveServer", "Ros2Bridge"]
 
 FOXGLOVE_PORT: Final = 8765
-"""The port that the Foxglove app proposes."""
+"""The default port of the Foxglove app."""
 
 __getattr__ = lazy_exports(__name__, {"FoxgloveServer": ("foxglove", "foxglove"), "Ros2Bridge": ("", "ros2")})

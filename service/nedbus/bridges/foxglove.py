@@ -1,11 +1,11 @@
-"""Serve live vehicles to Foxglove: all fields for plots, poses and frames for the 3D view, positions for the map.
+"""Foxglove server for live vehicles: all fields for plots, poses and frames for 3D, positions for the map panel.
 
     /<vehicle>/<topic>     px4_msgs/msg/..., every field
-    /<vehicle>/pose        foxglove.PoseInFrame, ENU and FLU, of vehicle_local_position and vehicle_attitude
+    /<vehicle>/pose        foxglove.PoseInFrame in ENU and FLU, from vehicle_local_position and vehicle_attitude
     /<vehicle>/location    foxglove.LocationFix, while the position is valid and has a global origin
     /tf                    foxglove.FrameTransforms: map -> <vehicle>/local -> <vehicle>
 
-Vehicles with different origins share the frame `map`, whose origin is that of the first vehicle that has one.
+Vehicles with different origins share the frame `map`; its origin is the first global origin of any vehicle.
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ from . import FOXGLOVE_PORT
 from .foxglove_messages import MapFrame, has_position, orientation_of, to_location, to_pose, to_transforms
 
 _ATTITUDE: Final = "vehicle_attitude"
-_POLL: Final = 1.0  # s between two queries for the addresses that are published
+_POLL: Final = 1.0  # s between queries for the published addresses
 
 
 class FoxgloveServer:
-    """Serve the streams of a bus to Foxglove, over its WebSocket protocol; a context manager that stops the server.
+    """Serve the streams of a bus over Foxglove's WebSocket protocol; a context manager that stops the server on exit.
 
-    Fields are encoded only for channels with a subscriber; a client that is too slow misses the oldest messages.
+    Fields are encoded only for channels with a subscriber. A slow client misses the oldest messages.
 
-    Raises ListenError when the address cannot be listened on.
+    Raises ListenError when it cannot listen on the address.
     """
 
     def __init__(self, bus: Bus, *, host: str = "127.0.0.1", port: int = FOXGLOVE_PORT) -> None:
         self._bus = bus
         self._context = foxglove.Context()
         self._fields: dict[Address, foxglove.Channel] = {}
-        # The last messages of streams without a rate, until a client subscribes.
+        # The last message of each stream without a rate, until a client subscribes.
         self._unseen: dict[Address, tuple[Message, int]] = {}
         self._vehicles: dict[str, _Vehicle] = {}
-        self._attitudes: dict[str, Any] = {}  # the last message of each vehicle
+        self._attitudes: dict[str, Any] = {}  # last message of each vehicle
         self._map = MapFrame()
         try:
             self._server = foxglove.start_server(name="nedbus", host=host, port=port, context=self._context)
@@ -66,7 +66,7 @@ class FoxgloveServer:
         self.url = f"ws://{host}:{self._server.port}"
 
     def run(self, stop: threading.Event, *, selection: Selection | None = None) -> None:
-        """Serve until `stop` is set: all addresses, or those of a selection.
+        """Serve the selected addresses, by default all, until `stop` is set.
 
         Raises ClosedError when the bus is closed meanwhile.
         """
@@ -84,7 +84,7 @@ class FoxgloveServer:
                     continue
 
     def show(self, sample: Sample[Any]) -> None:
-        """Show one sample on all channels of its address, and of its vehicle."""
+        """Log one sample to the channels of its address and its vehicle."""
         time_ns = sample.sent or sample.received
         self._show_fields(sample.address, sample.message, time_ns)
         if sample.topic == _ATTITUDE:
@@ -93,7 +93,7 @@ class FoxgloveServer:
             self._show_position(sample.vehicle, sample.message, time_ns)
 
     def close(self) -> None:
-        """Stop the server; it closes the connections of its clients."""
+        """Stop the server and disconnect its clients."""
         self._server.stop()
 
     def __enter__(self) -> FoxgloveServer:
@@ -115,7 +115,7 @@ class FoxgloveServer:
             self._unseen.pop(address, None)
             channel.log(encode_with(definition, message.__dict__, definition.current), log_time=time_ns)
         elif not get_topic(address.topic).rate:
-            self._unseen[address] = message, time_ns  # it may never come again
+            self._unseen[address] = message, time_ns  # there may be no further message
 
     def _show_position(self, vehicle: str, message: VehicleLocalPosition, time_ns: int) -> None:
         shown = self._vehicles.get(vehicle)
@@ -138,7 +138,7 @@ class FoxgloveServer:
         """Close the channels of addresses that are no longer published."""
         published = {address for addresses in self._bus.vehicles().values() for address in addresses}
         if not self._bus.connected:
-            return  # without a link the answers are incomplete
+            return  # without a link the reply is incomplete
         for address in self._fields.keys() - published:
             self._fields.pop(address).close()
             self._unseen.pop(address, None)
@@ -153,7 +153,7 @@ class FoxgloveServer:
 
 @dataclass(slots=True)
 class _Vehicle:
-    """The channels of a vehicle, and the last known translation of its local frame in the map."""
+    """Channels of a vehicle, and the last known translation of its local frame in the map."""
 
     pose: PoseInFrameChannel
     location: LocationFixChannel

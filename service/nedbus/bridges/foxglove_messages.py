@@ -1,4 +1,4 @@
-"""Convert position and attitude to Foxglove's messages: pose, transforms and location; no I/O and no clock."""
+"""Conversion of position and attitude to Foxglove's pose, transforms and location messages; no I/O, no clock."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from foxglove.messages import (
 from nedbus_msgs import MapProjection, VehicleLocalPosition, ned_to_enu, to_global, yaw_ned_to_enu
 
 _MAP: Final = "map"
-_MAX_APART: Final = 500_000  # us between a position and the attitude that goes with it
+_MAX_APART: Final = 500_000  # us between a position and the attitude paired with it
 
 
 class MapFrame:
-    """The frame `map`: its origin is the first global origin of any vehicle."""
+    """The frame `map`, with its origin at the first global origin of any vehicle."""
 
     def __init__(self) -> None:
         self._projection: MapProjection | None = None
         self._altitude = math.nan
 
     def locate(self, message: VehicleLocalPosition) -> Vector3 | None:
-        """Return the translation of a vehicle's local frame, ENU in metres; None without a global origin."""
+        """Return the translation of a vehicle's local frame in ENU [m]; None without a global origin."""
         if not message.xy_global:
             return None
         if self._projection is None:
@@ -44,14 +44,14 @@ class MapFrame:
 
 
 def has_position(message: VehicleLocalPosition) -> bool:
-    """Return whether there is a local position to show."""
+    """Return whether the local position is finite."""
     return math.isfinite(message.x + message.y + message.z)
 
 
 def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple[float, float, float, float]:
-    """Return the rotation from FLU to ENU as (x, y, z, w): of a VehicleAttitude of that time, else of the heading.
+    """Return the rotation from FLU to ENU as (x, y, z, w).
 
-    Without either the vehicle faces east.
+    Taken from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, facing east.
     """
     if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
         w, x, y, z = (each * math.sqrt(0.5) for each in attitude.q)
@@ -71,7 +71,7 @@ def to_pose(vehicle: str, message: VehicleLocalPosition, orientation: Quaternion
 def to_transforms(
     vehicle: str, message: VehicleLocalPosition, orientation: Quaternion, *, local_in_map: Vector3, time_ns: int
 ) -> FrameTransforms:
-    """Return where the local frame is in the map, and where the vehicle is in its local frame."""
+    """Return the transforms from map to the local frame and from the local frame to the vehicle."""
     local, stamp, no_rotation = f"{vehicle}/local", _stamp(time_ns), Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
     return FrameTransforms(transforms=[
         FrameTransform(
@@ -85,7 +85,7 @@ def to_transforms(
 
 
 def to_location(vehicle: str, message: VehicleLocalPosition, *, time_ns: int) -> LocationFix | None:
-    """Return the global position, None while there is no valid one."""
+    """Return the global position, None if it is not valid."""
     position = to_global(message)
     if not position or not message.xy_valid:
         return None

@@ -1,4 +1,4 @@
-"""Hold back samples that arrive late, by their publishers' own clocks; no I/O, and hosts are not compared."""
+"""Filter of late samples, by each publisher's own clock; no I/O, and no synchronized clocks needed."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from nedbus.client import Sample
 from nedbus_msgs import Address
 
 MAX_LATENESS: Final = 10**9
-"""Nanoseconds from which on a sample is late: it was recovered after an outage, or waited behind one that was."""
+"""Nanoseconds above which a sample is late: it was recovered after an outage, or queued behind one that was."""
 
 DRIFT: Final = 60 * 10**9
-"""Nanoseconds for which the fastest sample counts: two clocks drift apart."""
+"""Nanoseconds for which the fastest sample is the reference: the two clocks drift apart."""
 
-_STANDING: Final = 1000  # ns between two timestamps of a clock that stands
+_STALLED: Final = 1000  # ns; timestamps closer together come from a stalled clock
 
 
 class LateFilter:
-    """Admit the current samples of each address, and count the rest.
+    """Pass the current samples of each address, and count the late ones.
 
-    `last`: the last samples from before; they are held back, as their age is not known.
+    `last`: the latest samples at start-up; they are held back because their age is unknown.
     """
 
     def __init__(self, last: Iterable[Sample] = ()) -> None:
         self._last = {sample.address: (_publisher(sample), sample.sent) for sample in last}
         self._clocks: dict[Address, tuple[str, PublisherClock]] = {}
         self._held = Counter[Address]()
-        self._latest = 0  # ns that the latest of them was late
+        self._latest = 0  # ns, greatest lateness among these
 
     def admits(self, sample: Sample, *, arrived: int) -> bool:
-        """Return True for a current sample, and for one without a timestamp.
+        """Return True if a sample is current or has no timestamp.
 
-        `arrived` is in ns of this host's monotonic clock.
+        `arrived`: arrival time by this host's monotonic clock [ns].
         """
         sent, address, publisher, late = sample.sent, sample.address, _publisher(sample), 0
         if sent is None:
@@ -55,34 +55,35 @@ class LateFilter:
         self._clocks.pop(address, None)
 
     def report(self) -> str | None:
-        """Return the number of samples held back since the last report, None if there were none."""
+        """Describe the samples held back since the last report; None if there were none."""
         if not self._held:
             return None
         first, *others = sorted(self._held)
         of = f"{first}" + (f" and {len(others)} others" if others else "")
         by = f", up to {self._latest / 1e9:.1f} s late" if self._latest else ""
-        text = f"{of}: messages from before that were held back: {self._held.total()}{by}"
+        count = self._held.total()
+        text = f"{of}: {count} old message{'s' if count > 1 else ''} held back{by}"
         self._held.clear()
         self._latest = 0
         return text
 
 
 class PublisherClock:
-    """Follow the clock of one publisher by its timestamps and their arrival, both in ns.
+    """Clock offset of one publisher, estimated from timestamps and arrival times [ns].
 
-    The smallest difference of the two is that of the clocks, with the transit of the fastest sample; a sample is late
-    by the difference to that, whatever either clock shows. A clock that is set back is known after two DRIFT.
+    The smallest arrival minus timestamp is the clock offset plus the transit time of the fastest sample. The lateness
+    of a sample is its excess over that, so the clocks need not agree. A clock set back is detected within 2 * DRIFT.
     """
 
     def __init__(self, sent: int, arrived: int) -> None:
         self._sent, self._arrived = sent, arrived
-        self._before = self._smallest = arrived - sent  # of the time before `_since`, and after it
+        self._before = self._smallest = arrived - sent  # minima before and after `_since`
         self._since = arrived
 
     def lateness(self, sent: int, arrived: int) -> int:
-        """Return the lateness of a sample, in ns."""
-        if 0 <= sent - self._sent < _STANDING:
-            # Zenoh's timestamps never go back: those of a clock that was set back stand until it has caught up.
+        """Return the lateness of a sample [ns]."""
+        if 0 <= sent - self._sent < _STALLED:
+            # Zenoh's timestamps never decrease: after a clock is set back they stall until it catches up.
             self._before += arrived - self._arrived
             self._smallest += arrived - self._arrived
         self._sent, self._arrived = sent, arrived
@@ -94,5 +95,5 @@ class PublisherClock:
 
 
 def _publisher(sample: Sample) -> str:
-    """Return the session that stamped a sample: another run of a publisher may have another clock."""
+    """Return the session that stamped a sample; a restarted publisher may have another clock."""
     return "" if sample.stamp is None else str(sample.stamp.get_id())

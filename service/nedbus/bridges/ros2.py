@@ -1,4 +1,4 @@
-"""Publish the streams of a bus to ROS 2: CDR over rmw_zenoh, in the layout of the workspace."""
+"""Bridge from a bus to ROS 2: CDR over rmw_zenoh, in the message layout of the ROS 2 workspace."""
 
 from __future__ import annotations
 
@@ -54,23 +54,23 @@ from .ros2_arbiter import Decision, Ros2Arbiter
 
 _log = logging.getLogger(__name__)
 
-_POLL: Final = 1.0  # s between two queries for addresses and for publishers of other nodes
-_MAX_ABSENCE: Final = 60.0  # s that a vehicle may be gone and still be recovered from; publishers keep 20 s
-_MAX_LEFT_OUT: Final = 1000  # addresses that are logged as left out
-_VISIBLE_TIMEOUT: Final = 5.0  # s after which a token is visible to other sessions, or denied
+_POLL: Final = 1.0  # s between queries for addresses and for publishers of other nodes
+_MAX_ABSENCE: Final = 60.0  # s after which a withdrawn address is forgotten; publishers keep 20 s for recovery
+_MAX_LEFT_OUT: Final = 1000  # addresses logged as unsupported
+_VISIBLE_TIMEOUT: Final = 5.0  # s for a token to become visible to other sessions; later counts as denied
 
 
 class Ros2Bridge:
-    """Publish addresses of a bus to ROS 2, for nodes that use rmw_zenoh on the router of `session`.
+    """Publish addresses of a bus to ROS 2 nodes that use rmw_zenoh on the router of `session`.
 
-    `ros2 topic list` shows each topic for as long as its vehicle is published, as `/fmu/out/<topic>` with a namespace
-    before it (`Ros2Arbiter`). Instances are `estimator_local_position_0`, `_1` and so on; `battery_status` and others
-    of PX4's default have none for the first.
-    A topic that another node publishes is left to that node: a PX4 that speaks Zenoh itself is not published twice.
+    While a vehicle is published, `ros2 topic list` shows its topics as `/fmu/out/<topic>`, prefixed with a namespace
+    (see `Ros2Arbiter`). Instances are named `estimator_local_position_0`, `_1` and so on; the first instance of
+    `battery_status` and other topics of PX4's default list has no suffix.
+    A topic that another node publishes is left to that node, so a PX4 that speaks Zenoh itself is not published twice.
 
-    `selection`: the addresses to publish, all without it; `layout`: a release of PX4, or a layout.
-    `hashed=False` is for ROS 2 Humble, whose keys have no type hash.
-    `observer`: another session at the same router, to notice access control, which denies silently.
+    `selection`: the addresses to publish, by default all; `layout`: a PX4 release or a layout.
+    `hashed=False`: for ROS 2 Humble, whose keys have no type hash.
+    `observer`: a second session at the same router; it detects access control, which denies silently.
 
     Raises LayoutError for an unknown layout, AddressError for a namespace that is invalid in ROS 2.
     """
@@ -89,7 +89,7 @@ class Ros2Bridge:
     ) -> None:
         known = dict.fromkeys((*RELEASES, *DEFAULT.layouts))
         if layout not in known:
-            raise LayoutError(f"no layout {layout!r}: choose from {', '.join(known)}")
+            raise LayoutError(f"unknown layout {layout!r}: choose from {', '.join(known)}")
         self._bus = bus
         self._session = session
         self._observer = observer
@@ -100,21 +100,21 @@ class Ros2Bridge:
             topic: (definition, found, hash_of(found, ros2_type(definition)) if hashed else NO_HASH)
             for topic, definition in BY_TOPIC.items()
             if (found := definition.layout_of_release(layout))
-        }  # that the workspace has
+        }  # messages of the workspace
         self._node = f"nedbus_{os.getpid()}"
         self._arbiter = Ros2Arbiter(namespaces or {})
         self._late_filter = LateFilter()
-        self._withdrawn: dict[Address, float] = {}  # since when [s]; the late filter still knows their clocks
+        self._withdrawn: dict[Address, float] = {}  # withdrawal time [s]; the late filter still knows their clocks
         self._publishers: dict[Address, _Ros2Publisher] = {}
         self._entities = 0
         self._left_out: set[Address] = set()
-        self._held: dict[Address, Sample[Any]] = {}  # the last of streams without a rate, until published
+        self._held: dict[Address, Sample[Any]] = {}  # last sample of streams without a rate, until published
 
     def run(self, stop: threading.Event) -> None:
         """Publish until `stop` is set.
 
-        Raises ClosedError when the bus or the session is closed meanwhile, NedbusError when the observer does not see
-        the bridge.
+        Raises ClosedError when the bus or the session is closed meanwhile, NedbusError when access control hides the
+        bridge from the observer.
         """
         key = node_token(self._domain, self._zid, self._node)
         with while_open():
@@ -122,7 +122,7 @@ class Ros2Bridge:
         try:
             if self._observer is not None:
                 self._require_visible(self._observer, key, stop)
-            # Messages from before must not reach ROS 2 as the current estimate.
+            # Messages from before the start must not reach ROS 2 as the current estimate.
             self._late_filter = LateFilter(self._bus.latest(ANY))
             with self._bus.subscribe_to(self._selection, mode="every") as subscription:
                 self._forward(subscription, stop)
@@ -136,11 +136,11 @@ class Ros2Bridge:
         end = time.monotonic() + _VISIBLE_TIMEOUT
         while not stop.is_set() and not alive_keys(observer, token, timeout=0.5):
             if not all(session.info.routers_zid() for session in (observer, self._session)):
-                end = time.monotonic() + _VISIBLE_TIMEOUT  # without a link no other session sees anything
+                end = time.monotonic() + _VISIBLE_TIMEOUT  # without a link the token cannot be visible
             elif time.monotonic() > end:
                 raise NedbusError(
-                    "this router hides what nedbus announces to ROS 2: its access control has no rule for the keys of"
-                    " ROS 2: start the router of ROS 2, and name it with --to"
+                    "the router's access control denies the keys of ROS 2, so no ROS 2 node sees this bridge:"
+                    " start the router of ROS 2 and set its endpoint with --to"
                 )
             stop.wait(0.05)
 
@@ -154,7 +154,7 @@ class Ros2Bridge:
                 sample = subscription.receive(0.1)
             except NoDataError:
                 continue
-            # A message of a stream without a rate holds until the next one comes, however old it is.
+            # In a stream without a rate a message stays current until the next one, at any age.
             has_rate = get_topic(sample.topic).rate > 0
             if has_rate and not self._late_filter.admits(sample, arrived=time.monotonic_ns()):
                 continue
@@ -167,7 +167,7 @@ class Ros2Bridge:
         """Report late samples, query the addresses of the bus and the nodes of ROS 2, and apply the decisions."""
         held_back = self._late_filter.report()
         if held_back:
-            _log.warning("%s: ROS 2 would use them as the current estimate", held_back, extra=about("held-back"))
+            _log.warning("%s: ROS 2 would take them for the current estimate", held_back, extra=about("held-back"))
         for address in [each for each, since in self._withdrawn.items() if time.monotonic() - since > _MAX_ABSENCE]:
             del self._withdrawn[address]
             self._held.pop(address, None)
@@ -175,7 +175,7 @@ class Ros2Bridge:
         published = [address for addresses in self._bus.vehicles().values() for address in addresses]
         addresses = list(filter(self._is_bridged, published))
         if not (self._bus.connected and self._session.info.routers_zid()):
-            return  # without a link the answers are incomplete
+            return  # without a link the replies are incomplete
         nodes = self._other_nodes()
         others = {address: node for address in addresses if (node := nodes.get(self._key(address))) is not None}
         for decision in self._arbiter.update(addresses, others, now=time.monotonic()):
@@ -192,21 +192,21 @@ class Ros2Bridge:
             if address in self._held:
                 self._put(self._held.pop(address))
         elif decision.action == "conflict":
-            text = "%s is not published: %s has the topic /%s already: set --namespace"
+            text = "%s is not published: %s already uses the topic /%s: set --namespace"
             _log.warning(text, address, other, topic, extra=about("conflict", address))
         elif decision.action == "defer":
             self._close(address)
-            text = "%s: node %s publishes /%s already: left to that node"
+            text = "%s is left to node %s, which already publishes /%s"
             _log.warning(text, address, other, topic, extra=about("conflict", address))
         else:
             self._close(address)
-            # After a router's restart it is back in a moment, and with it come the messages of the outage.
+            # After a router restart the address soon returns, followed by the messages of the outage.
             self._withdrawn[address] = time.monotonic()
-            text = "%s is no longer published: /%s is withdrawn"
+            text = "%s is no longer on the bus: /%s is withdrawn"
             _log.info(text, address, topic, extra=about("withdrawn", address))
 
     def _other_nodes(self) -> dict[TopicKey, str]:
-        """Return the name of another node for each topic that one publishes, by one query: there may be thousands."""
+        """Return the publishing node of each topic of another node, with a single query: there may be thousands."""
         nodes, own = dict[TopicKey, str](), self._zid
         for text in alive_keys(self._session, px4_publishers_key_expr(self._domain), timeout=0.5):
             with suppress(DecodeError):
@@ -243,7 +243,7 @@ class Ros2Bridge:
         return TopicKey(self._domain, self._arbiter.topic_of(address), dds_type(ros2_type(definition)), type_hash)
 
     def _is_bridged(self, address: Address) -> bool:
-        """Return whether an address is selected, and the workspace has its message."""
+        """Return whether an address is selected and the workspace has its message; warn once if it has not."""
         if not self._selection.matches(address):
             return False
         if address.topic in self._types:
@@ -251,7 +251,7 @@ class Ros2Bridge:
         if address not in self._left_out and len(self._left_out) < _MAX_LEFT_OUT:
             self._left_out.add(address)
             known = address.topic in BY_TOPIC
-            reason = f"PX4 {self._layout} has no such message" if known else "its message in px4_msgs is not known"
+            reason = f"PX4 {self._layout} has no such message" if known else "its px4_msgs type is unknown"
             _log.warning("%s is not published to ROS 2: %s", address, reason, extra=about("unsupported", address))
         return False
 
@@ -262,7 +262,7 @@ class Ros2Bridge:
 
 @dataclass(slots=True, eq=False)
 class _Ros2Publisher:
-    """One topic of ROS 2: the id and the sequence of its publisher, and its liveliness token."""
+    """One ROS 2 topic: its publisher with gid and sequence number, and its liveliness token."""
 
     gid: bytes
     publisher: zenoh.Publisher

@@ -1,4 +1,4 @@
-"""Decide which addresses are published to ROS 2, under which topic names; no I/O and no clock."""
+"""Arbitration of ROS 2 topics: the addresses to publish and their topic names; no I/O, no clock."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from typing import Final, Literal
 from nedbus_msgs import Address, AddressError, ros2_topic_of
 
 TAKE_OVER_DELAY: Final = 5.0
-"""Seconds without another node's publisher after which its topic is taken over."""
+"""Seconds after another node's publisher is gone until its topic is taken over."""
 
 _NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z][A-Za-z0-9_]*)*|")
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """One change of the topics of ROS 2; `topic` has no leading slash.
+    """One change to the ROS 2 topics; `topic` has no leading slash.
 
     `publish`: publish the address.
-    `withdraw`: the address is no longer on the bus; stop publishing it.
-    `defer`: the node `other` publishes the topic; stop publishing the address if it is published.
-    `conflict`: the address `other` has the topic already; the address is not published.
+    `withdraw`: stop publishing the address, which is no longer on the bus.
+    `defer`: stop publishing the address if it is published; the node `other` publishes its topic.
+    `conflict`: do not publish the address; the address `other` already uses its topic.
     """
 
     action: Literal["publish", "withdraw", "defer", "conflict"]
@@ -33,10 +33,10 @@ class Decision:
 
 
 class Ros2Arbiter:
-    """Follow the addresses of the bus and the nodes of ROS 2, and decide the changes.
+    """Decide topic changes from the addresses on the bus and the publishers of other ROS 2 nodes.
 
-    A namespace stands before the topics of every vehicle but "1": that of `namespaces`, else the vehicle's name, or
-    `px4_<name>` where ROS 2 requires a leading letter.
+    The topics of every vehicle except "1" have a namespace: the one in `namespaces`, else the vehicle's name, with the
+    prefix `px4_` if it does not start with a letter.
 
     Raises AddressError for a namespace that is invalid in ROS 2.
     """
@@ -47,7 +47,7 @@ class Ros2Arbiter:
                 raise AddressError("namespace", namespace, "a letter, then letters, digits and _, with / between names")
         self._namespaces = {"1": "", **namespaces}
         self._published: dict[Address, str] = {}
-        self._deferred: dict[Address, float] = {}  # when another node's publisher was seen last
+        self._deferred: dict[Address, float] = {}  # time another node's publisher was last seen
         self._conflicts: set[Address] = set()
 
     def topic_of(self, address: Address) -> str:
@@ -61,9 +61,10 @@ class Ros2Arbiter:
     def update(
         self, addresses: Collection[Address], other_nodes: Mapping[Address, str], *, now: float
     ) -> list[Decision]:
-        """Return the changes, with these addresses on the bus, and the nodes that publish the topics of some of them.
+        """Return the changes since the last call.
 
-        `now` is in seconds, of any monotonic clock.
+        `addresses`: those on the bus; `other_nodes`: for addresses whose topic another node publishes, its name.
+        `now`: seconds on any monotonic clock.
         """
         present = set(addresses)
         decisions = [

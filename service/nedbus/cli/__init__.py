@@ -1,4 +1,4 @@
-"""The command line, a user of the library."""
+"""Command line, built on the public API."""
 
 import atexit
 import gc
@@ -14,13 +14,13 @@ __all__ = ["main"]
 def main() -> None:
     """Run `nedbus`."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C in the middle of an import would show a traceback
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the imports
     _fill_closed_streams()
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
-        sys.stdout.write(f"nedbus {__version__}\n")  # at once: the imports below take longer
+        sys.stdout.write(f"nedbus {__version__}\n")  # before the slow imports below
         return
     atexit.register(_give_up_stderr)
-    gc.disable()  # collections take a sixth of the time of the imports, and find nothing
+    gc.disable()  # garbage collection takes a sixth of the import time and frees nothing
     from .app import app
 
     gc.enable()
@@ -28,16 +28,16 @@ def main() -> None:
 
 
 def _fill_closed_streams() -> None:
-    """Open the null device in place of closed standard streams: a socket with their number would get their output."""
+    """Open /dev/null for closed standard streams: a socket could reuse their descriptors and receive the output."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
     if sys.stderr is None:
-        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - until the end
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - open until exit
 
 
 def _give_up_stderr() -> None:
-    """Discard stderr if its terminal is gone: Python would flush it again at exit, and exit with 120."""
+    """Redirect stderr to /dev/null if its terminal is gone: flushing it at exit would fail with exit code 120."""
     try:
         sys.stderr.flush()
     except OSError:

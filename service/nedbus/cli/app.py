@@ -1,4 +1,4 @@
-"""The table of commands."""
+"""The Typer application: commands and global options."""
 
 from __future__ import annotations
 
@@ -47,13 +47,15 @@ def _show_version(asked: bool) -> None:
 @app.callback()
 def _set_up(
     *,
-    version: Annotated[bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show it")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Log everything, and show tracebacks")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Log debug messages, show tracebacks")] = False,
     log_level: Annotated[
-        LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Log from this level on")
+        LogLevel, typer.Option("--log-level", envvar="NEDBUS_LOG_LEVEL", help="Lowest level to log")
     ] = "info",
     log_format: Annotated[
-        LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="json: an object a line")
+        LogFormat, typer.Option("--log-format", envvar="NEDBUS_LOG_FORMAT", help="Format of the log")
     ] = "text",
 ) -> None:
     log_to_stderr(level="debug" if debug else log_level, log_format=log_format)

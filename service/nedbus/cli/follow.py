@@ -1,4 +1,4 @@
-"""The loop of commands that follow a subscription; it logs when the link to the router breaks and when it is back."""
+"""Receive loop of commands with a subscription; it logs when the router link is lost and restored."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .output.streams import write_stderr
 _log = logging.getLogger("nedbus")
 
 SILENCE_TIMEOUT: Final = 2.0
-"""Time without a first sample after which stderr reports it [s]."""
+"""Time without a first sample until a notice is written to stderr [s]."""
 
 
 def follow(
@@ -28,9 +28,11 @@ def follow(
     duration: float | None,
     each_second: Callable[[], object] = lambda: None,
 ) -> None:
-    """Handle samples until there were `count`, or for `duration` [s]; raise NoDataError if there were none.
+    """Handle samples until `count` are counted or `duration` [s] has passed.
 
-    `handle` returns whether a sample counts. The link is checked once a second, before `each_second` is called.
+    `handle` returns True if a sample counts. The link is checked once a second, before `each_second` is called.
+
+    Raises NoDataError if no sample was counted.
     """
     start = time.monotonic()
     end = float("inf") if duration is None else start + duration
@@ -41,7 +43,7 @@ def follow(
             next_second = max(next_second + 1.0, now)
             if connected != bus.connected:
                 connected = not connected
-                text = "the link to %s is back" if connected else "the link to %s is broken: waiting for it"
+                text = "the link to %s is back" if connected else "the link to %s is lost: still trying"
                 event = "link-back" if connected else "link-broken"
                 _log.warning(text, " or ".join(bus.routers), extra=about(event))
             each_second()
@@ -59,5 +61,5 @@ def follow(
 
 
 def write_notice(subscription: Subscription) -> None:
-    """Report on stderr that nothing has arrived on a subscription so far."""
-    write_stderr(f"nothing on {subscription.name} yet, waiting; 'nedbus list' shows what is published")
+    """Write a notice to stderr that a subscription has not received a message yet."""
+    write_stderr(f"nothing on {subscription.name} yet, still waiting; 'nedbus list' shows the published streams")

@@ -1,4 +1,4 @@
-"""The options that commands share: how to connect, which streams, how many; errors as one line and an exit code."""
+"""Options shared by commands, and the translation of errors into one line and an exit code."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import inspect
 import itertools
 import logging
+import re
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -21,22 +22,22 @@ from nedbus.settings import Settings, load_settings
 from nedbus.transport import DEFAULT_ENDPOINT
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_PREFIX, DEFAULT_TOPIC, MESSAGES, TOPICS, Selection
 
-from .output.streams import MAX_TEXT, discard_stdout, logs_for_programs, to_text, write_stderr
+from .output.streams import MAX_TEXT, discard_stdout, is_log_structured, to_text, write_stderr
 
 _log = logging.getLogger("nedbus")
 
-_ROUTER: Final = f"Router to join (default: {DEFAULT_ENDPOINT})"
+_ROUTER: Final = f"Router to connect to; repeatable (default: {DEFAULT_ENDPOINT})"
 _TOPIC: Final = f'Topic, "*" for all (default: {DEFAULT_TOPIC} for echo and get, else all)'
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: nedbus.toml if there)")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="Settings file (default: ./nedbus.toml)")]
 ConnectOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ROUTER)]
-PrefixOption = Annotated[str | None, typer.Option(help=f"First chunks of every key (default: {DEFAULT_PREFIX})")]
-TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="Authority of tls/ routers, PEM")]
-TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="This client's certificate, PEM")]
-TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of that certificate, PEM")]
+PrefixOption = Annotated[str | None, typer.Option(help=f"Key prefix (default: {DEFAULT_PREFIX})")]
+TlsCaOption = Annotated[Path | None, typer.Option("--tls-ca", help="CA certificate for tls/ routers, PEM")]
+TlsCertificateOption = Annotated[Path | None, typer.Option("--tls-certificate", help="Client certificate, PEM")]
+TlsKeyOption = Annotated[Path | None, typer.Option("--tls-key", help="Key of the client certificate, PEM")]
 TopicArgument = Annotated[
     str | None,
     typer.Argument(
-        metavar="TOPIC", help="TOPIC, or what nedbus list prints: VEHICLE/TOPIC/INSTANCE", show_default=False
+        metavar="TOPIC", help="TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list", show_default=False
     ),
 ]
 FileArgument = Annotated[
@@ -45,27 +46,27 @@ FileArgument = Annotated[
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]
 VehicleOption = Annotated[str, typer.Option("--vehicle", "-v", help='Vehicle, "*" for all')]
-InstanceOption = Annotated[int | None, typer.Option("--instance", "-i", help="Of topics that have some (default: all)")]
-FieldOption = Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Only these fields: x,y,z")]
-JsonOption = Annotated[bool, typer.Option("--json", help="JSON, for programs")]
-CsvOption = Annotated[bool, typer.Option("--csv", help="CSV, with a line of names first")]
-WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait for a router that is not there yet")]
-CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="End after this many samples")]
-DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="End after this many seconds")]
+InstanceOption = Annotated[int | None, typer.Option("--instance", "-i", help="Instance of the topic (default: all)")]
+FieldOption = Annotated[str | None, typer.Option("--field", metavar="NAME,NAME,...", help="Fields to show: x,y,z")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Write JSON")]
+CsvOption = Annotated[bool, typer.Option("--csv", help="Write CSV with a header line")]
+WaitOption = Annotated[bool, typer.Option("--wait", "-w", help="Wait until the router is reachable")]
+CountOption = Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after this number of samples")]
+DurationOption = Annotated[float | None, typer.Option("--duration", "-d", min=0.0, help="Duration in seconds")]
 
 
 ALL: Final = Selection()
-"""The default of commands that show all topics."""
+"""Default selection of commands that show all topics."""
 
 POSITIONS: Final = Selection(DEFAULT_TOPIC)
-"""The default of commands that show positions."""
+"""Default selection of commands that show positions."""
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function, whose errors become one line and an exit code.
+    """Turn a function into a command; its errors become one line on stderr and an exit code.
 
-    The command has the options to make parameters `bus`, an open one, `open_bus` and `read_settings`, functions, and
-    `selection` of; the default of `selection` has its default topic.
+    Some parameters are replaced by the options they are made from: `bus` (an open bus), `open_bus` and `read_settings`
+    (functions), and `selection`, whose default supplies the default topic.
     """
     parameters = inspect.signature(function, eval_str=True).parameters
     makers = {name: maker for name, maker in _MAKERS.items() if name in parameters}
@@ -86,11 +87,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     options = sorted([*own, *itertools.chain(*taken.values())], key=lambda each: each.kind)
     run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined] # Typer reads both
     run.__annotations__ = {each.name: each.annotation for each in options}
+    run.__doc__ = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.getdoc(function) or "")  # rich would keep the line breaks
     return run
 
 
 def _options_of(maker: Callable[..., object]) -> list[inspect.Parameter]:
-    """Return the parameters that have defaults; `**settings_options` stands for those of `_read_settings`."""
+    """Return the parameters with defaults; `**settings_options` expands to those of `_read_settings`."""
     parameters = [*inspect.signature(maker, eval_str=True).parameters.values()]
     own = [each for each in parameters if each.default is not each.empty]
     return [*_options_of(_read_settings), *own] if parameters[-1].kind is inspect.Parameter.VAR_KEYWORD else own
@@ -98,8 +100,8 @@ def _options_of(maker: Callable[..., object]) -> list[inspect.Parameter]:
 
 @contextmanager
 def _exit_on_errors() -> Iterator[None]:
-    """Turn errors into one line and an exit code: 1 failure, 2 usage, 130 interrupt."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as `main` left it while everything was imported
+    """Report errors in one line and exit: 1 for a failure, 2 for wrong usage, 130 for an interrupt."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # set by `main` for the imports
         signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
@@ -110,20 +112,20 @@ def _exit_on_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         raise typer.Exit(130) from None
     except BrokenPipeError:
-        # The reader of a pipe is gone (`| head`): nothing can be written, at exit either.
+        # The reader of the pipe has gone (`| head`): the flush at exit would fail, too.
         discard_stdout()
         raise typer.Exit(0) from None
     except OSError as exc:
         where = f"{exc.filename}: " if exc.filename else ""
         raise _exit_with(NedbusError(f"{where}{(exc.strerror or str(exc)).lower()}"), 1) from exc
     except BaseException as exc:
-        if type(exc).__name__ != "PanicException":  # of Zenoh's; it cannot be imported
+        if type(exc).__name__ != "PanicException":  # raised by Zenoh; it cannot be imported
             raise
-        hint = "is the clock set, is there memory, are enough open files allowed ('ulimit -n')?"
-        raise _exit_with(NedbusError(f"Zenoh cannot go on ({exc}): {hint}"), 1) from exc
+        hint = "check the system clock, free memory and the limit of open files ('ulimit -n')"
+        raise _exit_with(NedbusError(f"Zenoh failed ({exc}): {hint}"), 1) from exc
     finally:
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)  # only the exit is left, which needs no traceback
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback for Ctrl-C during the exit
 
 
 def _read_settings(
@@ -140,7 +142,7 @@ def _read_settings(
 
 
 def _open_bus(*, wait: WaitOption = False, **settings_options: Any) -> Bus:
-    """Connect with the settings; with `wait` for as long as it takes."""
+    """Connect to the router; with `wait`, retry until it answers."""
     settings = _read_settings(**settings_options)
     try:
         return connect_with(settings, timeout=1.0)
@@ -159,14 +161,14 @@ def _select(
     instance: InstanceOption = None,
     default: str,
 ) -> Selection:
-    """Return the selection of the options, or of an argument as `nedbus list` prints it: [VEHICLE/]TOPIC[/INSTANCE].
+    """Return the selection from the options, or from an argument [VEHICLE/]TOPIC[/INSTANCE] as `nedbus list` prints it.
 
-    Raises ConfigError when both give a topic, AddressError for a selection that is invalid.
+    Raises ConfigError if both name a topic, AddressError for an invalid selection.
     """
     if topic is None:
         return Selection(default if topic_option is None else topic_option, vehicle, instance)
     if topic_option is not None:
-        raise ConfigError("--topic", f"the topic is given as {topic!r} already: remove one of the two")
+        raise ConfigError("--topic", f"the argument already names the topic {topic!r}: remove one of the two")
     chunks = topic.strip("/").split("/")
     if chunks[0] not in {*TOPICS, ANY} and len(chunks) > 1:
         vehicle = chunks.pop(0)
@@ -181,28 +183,28 @@ _MAKERS: Final[Mapping[str, Callable[..., Any]]] = {
 
 
 def require_one(flags: Mapping[str, bool]) -> None:
-    """Raise ConfigError when more than one of these flags is set."""
+    """Raise ConfigError if more than one of these flags is set."""
     given = [name for name, is_set in flags.items() if is_set]
     if len(given) > 1:
         raise ConfigError(given[1], f"cannot be combined with {given[0]}: remove one of the two")
 
 
 def parse_fields(text: str | None, selection: Selection) -> list[str]:
-    """Return the names in `x,y,z`; raise ConfigError for one that no field of the selected messages has."""
+    """Split `x,y,z` into field names; raise ConfigError for a name that no selected message has."""
     names = [name.strip() for name in text.split(",") if name.strip()] if text else []
     known = list(MESSAGES.values()) if selection.topic == ANY else [BY_TOPIC.get(selection.topic)]
     for name in names:
-        first = known[0]  # an undeclared message may have any fields
+        first = known[0]  # None for an undeclared message, which may have any field
         if first is not None and not any(each and name in each.types for each in known):
             raise ConfigError("--field", first.explain_unknown_field(name))
     return names
 
 
 def _exit_with(error: NedbusError, code: int) -> typer.Exit:
-    """Return the exit for an error that is reported in one line; raise the error itself with --debug."""
+    """Report an error in one line and return the exit; with --debug, raise the error itself."""
     if logging.getLogger("nedbus").isEnabledFor(logging.DEBUG):
         raise error
-    if logs_for_programs():
+    if is_log_structured():
         _log.error("%s", error, extra=about("error"))
     else:
         write_stderr(to_text(f"nedbus: {error}", MAX_TEXT))

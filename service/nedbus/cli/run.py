@@ -1,4 +1,4 @@
-"""Run a command in a thread until it ends or a signal comes, also as the first process of a container."""
+"""Run the body of a command in a thread until it ends or a signal arrives; works as PID 1 of a container, too."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from nedbus.log_event import about
 
 _log = logging.getLogger("nedbus")
 
-_END_TIMEOUT: Final = 1.6  # s after a signal by which the process has ended
+_END_TIMEOUT: Final = 1.6  # s between a signal and a forced exit
 
 
 def _ignore_hangup() -> None:
-    _log.info("SIGHUP is ignored: SIGTERM or Ctrl-C ends this process", extra=about("reload"))
+    _log.info("SIGHUP ignored: stop this process with SIGTERM or Ctrl-C", extra=about("reload"))
 
 
 def run_until_stopped(
@@ -32,11 +32,10 @@ def run_until_stopped(
     on_tick: Callable[[], object] = lambda: None,
     on_hangup: Callable[[], object] = _ignore_hangup,
 ) -> None:
-    """Run a body in a thread until it ends, or until Ctrl-C or SIGTERM sets its event.
+    """Run `body` in a thread until it returns; Ctrl-C or SIGTERM set its stop event.
 
-    `on_stop` is called when the event is set, in the handler of the signal; `on_tick` ten times a second meanwhile, and
-    `on_hangup` after SIGHUP, both in the main thread, which only waits: signals are handled at once, even while Zenoh
-    blocks.
+    `on_stop` is called from the signal handler, `on_tick` ten times a second and `on_hangup` after SIGHUP from the main
+    thread. The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
@@ -53,7 +52,7 @@ def run_until_stopped(
 
     def on_signal(number: int, _: FrameType | None) -> None:
         if signals:
-            os._exit(130 if number == signal.SIGINT else 1)  # a second signal ends the process at once
+            os._exit(130 if number == signal.SIGINT else 1)  # the second signal exits at once
         signals.append(number)
         stop.set()
         on_stop()
@@ -70,10 +69,12 @@ def run_until_stopped(
         on_tick()
         thread.join(0.1)
     if signals:
-        _log.info("ending: %s", signal.Signals(signals[0]).name, extra=about("ending"))
+        _log.info("stopping on %s", signal.Signals(signals[0]).name, extra=about("ending"))
     thread.join(_END_TIMEOUT)
     if thread.is_alive():
-        text = "not everything ended in time, perhaps because of a reader that is stuck: unsent messages are lost"
+        text = (
+            f"shutdown took more than {_END_TIMEOUT:g} s, maybe because of a blocked reader: unsent messages are lost"
+        )
         _log.error(text, extra=about("ending"))
         sys.stderr.flush()
         os._exit(1)

@@ -1,4 +1,4 @@
-"""Messages to systemd about a service with Type=notify: ready, status, reloading, stopping, and the watchdog."""
+"""sd_notify messages of a service with Type=notify: ready, status, reloading, stopping, watchdog."""
 
 from __future__ import annotations
 
@@ -18,45 +18,45 @@ from .output.streams import MAX_TEXT, counted, to_text
 
 _log = logging.getLogger("nedbus")
 
-_ROUTER_TIMEOUT: Final = 30.0  # s after which a client counts as started without its router, so that the boot goes on
-_STATUS_INTERVAL: Final = 1.0  # s between two texts of the status
+_ROUTER_TIMEOUT: Final = 30.0  # s until a client without its router reports READY, to let the boot continue
+_STATUS_INTERVAL: Final = 1.0  # s between two status texts
 _START_INTERVAL: Final = 0.1  # s between two checks until the service is ready
 
 
 class NotifySocket:
-    """Datagrams to NOTIFY_SOCKET, as sd_notify(3) describes it; without one, sending does nothing.
+    """Datagrams to NOTIFY_SOCKET, see sd_notify(3); without such a socket, sending does nothing.
 
-    Raises nothing and never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not say
-    whether a datagram was taken.
+    Never raises and never blocks. The package `sdnotify` blocks while systemd's queue is full, and does not report
+    whether a datagram was accepted.
     """
 
     def __init__(self, address: str) -> None:
         self.active = address.startswith(("/", "@"))
-        self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: an abstract address
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address  # @: abstract socket
 
     def send(self, **fields: object) -> bool:
-        """Send these fields as one datagram; return whether it was taken."""
+        """Send these fields as one datagram; return True if it was accepted."""
         if not self.active:
             return False
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
             try:
                 sender.sendto("\n".join(f"{name}={value}" for name, value in fields.items()).encode(), self._address)
-            except OSError as exc:  # no reader, or its queue is full: READY and STATUS are sent again
-                _log.debug("systemd cannot be notified: %s", exc)
+            except OSError as exc:  # no reader, or a full queue: READY and STATUS are sent again
+                _log.debug("cannot notify systemd: %s", exc)
                 return False
         return True
 
 
 class Notifier:
-    """Notify systemd of the states of a daemon while this is entered; without NOTIFY_SOCKET do nothing.
+    """Report the state of a daemon to systemd in a `with` block; without NOTIFY_SOCKET do nothing.
 
-    READY is sent when `daemon.ready` is set: the router listens, or the session is open, and all sources have begun.
-    Silent sources do not delay it; the text of the status names them.
-    A client whose router does not answer counts as started after `patience` [s].
+    READY is sent once `daemon.ready` is set: the router listens, or the session is open, and all sources have started.
+    Silent sources do not delay it; the status text names them.
+    A client whose router does not answer reports READY after `patience` [s].
 
-    WATCHDOG proves that all of it works: Zenoh answers the number of sessions, the main thread has called `tick` since
-    the last ping, and no source has worked on one message for half of systemd's limit.
-    It is sent from a thread of its own, so that the main thread reacts to signals while Zenoh blocks.
+    WATCHDOG is sent only while everything works: Zenoh returns the number of sessions, the main thread has called
+    `tick` since the last ping, and no source has spent half of systemd's limit on one message.
+    It is sent from a separate thread: the main thread has to handle signals even while Zenoh blocks.
     """
 
     def __init__(
@@ -66,8 +66,8 @@ class Notifier:
         self._socket = NotifySocket(environment.get("NOTIFY_SOCKET", ""))
         self._watchdog = watchdog_interval(environment)
         self._router_deadline = time.monotonic() + patience
-        self._counted = time.monotonic(), 0  # a time, and the number of messages published by then
-        self._is_ready = self._ticked = False  # READY was taken; the main thread works
+        self._counted = time.monotonic(), 0  # time, and messages published until then
+        self._is_ready = self._ticked = False  # READY was accepted; the main thread is alive
         self._rejected = ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="nedbus-systemd", daemon=True)
@@ -80,28 +80,28 @@ class Notifier:
     def __exit__(self, *exc: object) -> None:
         self.stopping()
         if self._thread.is_alive():
-            self._thread.join(1.0)  # a thread inside Zenoh at the end of the interpreter would abort it
+            self._thread.join(1.0)  # the interpreter aborts at exit if a thread is inside Zenoh
 
     def tick(self) -> None:
-        """Note that the main thread works; to be called ten times a second."""
+        """Record that the main thread is alive; call it ten times a second."""
         self._ticked = True
 
     def stopping(self) -> None:
-        """Report STOPPING, once; callable from a signal handler."""
+        """Report STOPPING once; safe in signal handlers."""
         if not self._stop.is_set():
             self._stop.set()
-            self._socket.send(STOPPING=1, STATUS="ends")
+            self._socket.send(STOPPING=1, STATUS="stopping")
 
     @contextmanager
     def reloading(self) -> Iterator[None]:
-        """Report RELOADING, and afterwards READY; an error stays in the text of the status until the next reload."""
+        """Report RELOADING, then READY; an error stays in the status text until the next reload."""
         now = time.clock_gettime_ns(time.CLOCK_MONOTONIC) // 1000
-        self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reads the configuration again")
+        self._socket.send(RELOADING=1, MONOTONIC_USEC=now, STATUS="reloading the configuration")
         self._rejected = ""
         try:
             yield
         except Exception as exc:
-            self._rejected = f"the new configuration is rejected, the old one works on: {exc}"
+            self._rejected = f"new configuration rejected, the old one stays active: {exc}"
             raise
         finally:
             self._is_ready = False  # the thread sends READY
@@ -112,7 +112,7 @@ class Notifier:
             now = time.monotonic()
             has_waited = self._daemon.role == "client" and now >= self._router_deadline
             if not self._is_ready and (self._daemon.ready.is_set() or has_waited):
-                self._is_ready = True  # before it is sent: a reload may unset it at any moment
+                self._is_ready = True  # set before sending: a reload may unset it at any moment
                 if not self._socket.send(READY=1, STATUS=self._status()):
                     self._is_ready = False
             elif now >= next_status:
@@ -131,7 +131,7 @@ class Notifier:
         daemon = self._daemon
         if not daemon.ready.is_set():
             where = " or ".join(daemon.endpoints)
-            return f"waits for a router at {where}" if daemon.role == "client" else f"starts a router on {where}"
+            return f"waiting for a router at {where}" if daemon.role == "client" else f"starting a router on {where}"
         now, sources = time.monotonic(), daemon.sources
         published = sum(source.published for source in sources)
         since, before = self._counted
@@ -146,7 +146,7 @@ class Notifier:
 
 
 def watchdog_interval(environment: Mapping[str, str]) -> float | None:
-    """Return the interval of watchdog pings [s], half of systemd's limit; None if it wants none."""
+    """Return the interval of watchdog pings [s], half of systemd's limit; None if the watchdog is off."""
     limit = environment.get("WATCHDOG_USEC", "")
     if not limit.isdecimal() or int(limit) == 0 or environment.get("WATCHDOG_PID", "") not in {"", str(os.getpid())}:
         return None

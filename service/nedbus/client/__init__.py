@@ -1,4 +1,4 @@
-"""The client: connect to a router, subscribe, ask for last messages, publish; blocking and with asyncio."""
+"""The client API: connect to a router, subscribe, query last messages, publish; blocking and asyncio."""
 
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,7 @@ from .subscription import AsyncSubscription, Subscription
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 else:
-    # NumPy takes longer to load than all the rest.
+    # Lazy, as importing NumPy takes longer than everything else.
     __getattr__ = lazy_exports(__name__, {"Batch": ("", "receiving.batch")})
 
 __all__ = [

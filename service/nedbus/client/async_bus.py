@@ -1,4 +1,4 @@
-"""The bus and its publishers for asyncio: the twins of Bus and Publisher."""
+"""AsyncBus and AsyncPublisher, the asyncio versions of Bus and Publisher."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .publishing.publisher import Publisher
 from .sample import Mode
 from .subscription import AsyncSubscription
 
-_WAKE_INTERVAL: Final = 1.0  # s between two looks for a Ctrl-C while connecting
+_WAKE_INTERVAL: Final = 1.0  # s between checks for Ctrl-C while connecting
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -30,7 +30,7 @@ _T = TypeVar("_T")
 def _awaited(
     method: Callable[Concatenate[Any, _P], _T], *, waits: Callable[[Any], bool] = lambda _: True
 ) -> Callable[Concatenate[Any, _P], Coroutine[Any, Any, _T]]:
-    """Return a method of the blocking twin for asyncio; it runs in a thread if it may wait."""
+    """Wrap a method of the blocking class as a coroutine; it runs in a thread if `waits` returns True."""
 
     @wraps(method)
     async def call(twin: Any, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
@@ -42,9 +42,9 @@ def _awaited(
 
 
 class AsyncBus:
-    """The twin of Bus for asyncio, from `connect_async`: the same methods, awaited where they wait.
+    """A Bus for asyncio, from `connect_async`: the same methods, awaited if they wait.
 
-    Of `open_session` there is no twin, as Zenoh's sessions block.
+    It has no `open_session`, because Zenoh sessions are blocking.
     """
 
     def __init__(self, open_bus: Callable[[threading.Event], Bus]) -> None:
@@ -59,17 +59,17 @@ class AsyncBus:
 
     @property
     def connected(self) -> bool:
-        """True while there is a link to a router."""
+        """True if the bus is connected to a router."""
         return self._blocking.connected
 
     @property
     def prefix(self) -> str:
-        """The first chunks of every key."""
+        """The prefix of all keys."""
         return self._blocking.prefix
 
     @property
     def routers(self) -> tuple[str, ...]:
-        """The endpoints that it joins."""
+        """The endpoints of the routers."""
         return self._blocking.routers
 
     @by_topic_async
@@ -82,13 +82,13 @@ class AsyncBus:
         mode: Mode = "latest",
         max_rate: float | None = None,
     ) -> AsyncSubscription[Any]:
-        """Subscribe as `Bus.subscribe` does, for `async for`; it opens when it is first waited on."""
+        """Return a subscription for `async for`; see `Bus.subscribe`. It opens with the first wait."""
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
     ) -> AsyncSubscription[Any]:
-        """Subscribe to a selection of addresses, as `subscribe` does."""
+        """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
         name = selection.key_expr(prefix=bus.prefix)
@@ -109,12 +109,12 @@ class AsyncBus:
         lossless: bool = False,
         source: str | None = None,
     ) -> AsyncPublisher:
-        """Return a publisher as `Bus.publisher` does, whose methods are awaited."""
+        """Return a publisher with awaitable methods; see `Bus.publisher`."""
         call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance)
         return AsyncPublisher(await asyncio.to_thread(call, lossless=lossless, source=source))
 
     async def close(self) -> None:
-        """Close the bus as `Bus.close` does."""
+        """Close the bus; see `Bus.close`."""
         if self._bus is not None:
             await asyncio.to_thread(self._bus.close)
 
@@ -122,12 +122,12 @@ class AsyncBus:
         cancelled = threading.Event()
         opening = asyncio.create_task(asyncio.to_thread(self._open_bus, cancelled))
         try:
-            while not opening.done():  # asyncio may sleep through a Ctrl-C that comes as it falls asleep: wake it
+            while not opening.done():  # asyncio can miss a Ctrl-C just before it blocks, so it wakes up regularly
                 await asyncio.wait({opening}, timeout=_WAKE_INTERVAL)
             self._bus = opening.result()
         except asyncio.CancelledError:
-            cancelled.set()  # the thread would keep trying, and Python waits for it
-            opening.cancel()  # its result is not needed
+            cancelled.set()  # else the thread keeps trying, and blocks the exit of the interpreter
+            opening.cancel()
             raise
         return self
 
@@ -144,17 +144,17 @@ def connect_async(
     tls: Tls | None = None,
     config: str | Path | None = None,
 ) -> AsyncBus:
-    """Return a bus for asyncio, to be opened with `async with`; arguments and errors are those of `connect`."""
+    """Return a bus for asyncio, opened with `async with`; arguments and errors as in `connect`."""
     load = partial(load_settings, config, connect=endpoint, prefix=prefix)
     return AsyncBus(lambda stop: connect_with(load(), timeout=timeout, tls=tls, stop=stop))
 
 
 class AsyncPublisher:
-    """Publish the messages of one address from asyncio; get one from `await bus.publisher(...)`.
+    """A Publisher for asyncio; get one from `await bus.publisher(...)`.
 
-    The twin of Publisher, with the same attributes and errors, and its methods awaited.
-    What may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) waits in a thread, and other
-    tasks of the event loop go on; await one call before the next.
+    Attributes and errors are those of Publisher; all methods are awaited.
+    Methods that may wait for readers (a lossless `publish`, `publish_many`, `flush`, `close`) run in a thread and do
+    not block the event loop. Await each call before the next one.
     """
 
     def __init__(self, publisher: Publisher) -> None:
@@ -164,7 +164,7 @@ class AsyncPublisher:
 
     @property
     def published(self) -> int:
-        """Messages published so far."""
+        """The number of messages published."""
         return self._blocking.published
 
     publish = _awaited(Publisher.publish, waits=attrgetter("lossless"))

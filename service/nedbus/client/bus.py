@@ -1,4 +1,4 @@
-"""The bus as scripts see it: connect, subscribe, ask, publish; blocking."""
+"""The blocking API: connect, subscribe, query, publish."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from .subscription import Subscription
 class Bus:
     """A connection to a router, from `connect`.
 
-    Topics and vehicles are selected by name, instances by number; "*" and None stand for any; vehicle 7 is "7".
-    Without a topic it is vehicle_local_position.
-    All methods may be called from any thread; an invalid name raises AddressError, a closed bus ClosedError.
+    Topics and vehicles are selected by name, instances by number; "*" and None match any. Vehicle 7 is vehicle "7".
+    The default topic is vehicle_local_position.
+    Thread-safe. Methods raise AddressError for an invalid name, and ClosedError once the bus is closed.
     """
 
     def __init__(self, session: Session, *, routers: Sequence[str], prefix: str, tls: Tls | None) -> None:
@@ -48,7 +48,7 @@ class Bus:
         self._directory = VehicleDirectory(prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
-        closing = ExitStack()  # the last one first; an open query for layouts ends with the session
+        closing = ExitStack()  # in reverse order; closing the session ends an open query for layouts
         for close in (self._layouts.close, session.close, self._housekeeping.close, self._queries.close):
             closing.callback(close)
         closing.callback(_close_all, self._receivers)
@@ -56,7 +56,7 @@ class Bus:
 
     @property
     def connected(self) -> bool:
-        """True while there is a link to a router."""
+        """True if the bus is connected to a router."""
         return bool(self._session.info.routers_zid())
 
     @by_topic
@@ -69,25 +69,25 @@ class Bus:
         mode: Mode = "latest",
         max_rate: float | None = None,
     ) -> Subscription[Any]:
-        """Subscribe, and iterate over what arrives: first the last message of each key, if there is one.
+        """Return a subscription to iterate over, which starts with the last message of each key.
 
-        The messages are those of the topic: a VehicleAttitude of "vehicle_attitude"; of "*" they are of all kinds.
-        `mode="latest"`: the newest sample of each key wins when this reader is slower than the data.
-        `mode="every"`: every sample in order; what the network lost is recovered from the publisher for about 20 s, and
-        65,536 samples wait for a slow reader, which loses the oldest beyond.
-        Either way `counts` has what was lost, dropped or invalid, and no other reader has to wait.
-        `max_rate`: the messages a second of each stream at most, downsampled by its publisher, for slow links.
-        The publisher sends 1, 2, 5, 10, 20, 50 or 100 a second, the greatest not above; below 1 this reader thins them
-        further. Messages left out are neither lost nor dropped.
+        The type of messages depends on the topic: "vehicle_attitude" has VehicleAttitude, "*" has all types.
+        `mode="latest"`: only the newest sample of each key, if the reader is slower than the data.
+        `mode="every"`: all samples in order. Samples lost on the network are recovered from the publisher, which keeps
+        about 20 s. Up to 65,536 samples are queued for a slow reader; beyond that the oldest are dropped.
+        In both modes `counts` has the samples lost, dropped or invalid, and a slow reader does not delay other readers.
+        `max_rate`: maximum number of messages per second of each stream, downsampled by its publisher, for slow links.
+        The publisher sends 1, 2, 5, 10, 20, 50 or 100 per second, the highest rate up to `max_rate`; rates below 1 are
+        downsampled further by the reader. Messages left out by downsampling count as neither lost nor dropped.
 
-        Raises ConfigError for a `max_rate` that is no finite number above 0.
+        Raises ConfigError if `max_rate` is not a finite number above 0.
         """
         return self.subscribe_to(Selection(topic, vehicle_name(vehicle), instance), mode=mode, max_rate=max_rate)
 
     def subscribe_to(
         self, selection: Selection, *, mode: Mode = "latest", max_rate: float | None = None
     ) -> Subscription[Any]:
-        """Subscribe to a selection of addresses, as `subscribe` does."""
+        """Subscribe to a selection of addresses; see `subscribe`."""
         pending_queue = self._make_queue(selection, mode, max_rate)
         receiver = self._open_receiver(selection, pending_queue)
         return Subscription(receiver, pending_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
@@ -96,10 +96,10 @@ class Bus:
     def latest(
         self, topic: str = DEFAULT_TOPIC, *, vehicle: str | int = ANY, instance: int | None = None, timeout: float = 2.0
     ) -> list[Sample[Any]]:
-        """Return the last sample of each key, sorted by address; `latency` is then its age.
+        """Query the last sample of each key, sorted by address; its `latency` is its age.
 
-        It waits for the answers of all publishers, at most `timeout` seconds; invalid messages are left out and logged.
-        The answer of a publisher is preferred to that of a storage, whose samples are `stored`.
+        Waits up to `timeout` seconds for the replies of all publishers; invalid messages are logged and left out.
+        Samples from a storage have `stored` set, and are only returned without a reply of the publisher.
         """
         key_expr = Selection(topic, vehicle_name(vehicle), instance).key_expr(prefix=self.prefix)
         decoder = Decoder(self._layouts, prefix=self.prefix)
@@ -112,27 +112,28 @@ class Bus:
                 if sample is not None:
                     sample.stored = raw.attachment is None or raw.attachment.to_bytes() != LIVE
                     samples.append(sample)
-        samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))  # the last one of each address counts
-        newest = {sample.address: sample for sample in samples}
+        samples.sort(key=lambda sample: (not sample.stored, sample.sent or 0))
+        newest = {sample.address: sample for sample in samples}  # the last one of each address wins
         return [newest[address] for address in sorted(newest)]
 
     def vehicles(self, *, timeout: float = 2.0) -> dict[str, list[Address]]:
-        """Return the vehicles that are published now, and the addresses of each; `latest` has their messages.
+        """Return the published addresses by vehicle; use `latest` for their messages.
 
-        The first call asks, and waits at most `timeout` seconds; from then on the bus follows their liveliness tokens.
+        The first call queries the router and waits up to `timeout` seconds; later calls use the liveliness tokens that
+        the bus has subscribed to.
         """
         return self._directory.vehicles(self._session, timeout=timeout)
 
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
-        """Return the status of every nedbus service on this network, as it reports it."""
+        """Query the status of all nedbus services on this network."""
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
 
     def accounts(self, *, within: float = 600.0, timeout: float = 2.0) -> list[AccountReport]:
-        """Return the account of each nedbus service: events of the last `within` seconds, states of vehicles."""
+        """Query the accounts of all nedbus services: events of the last `within` seconds, and states of vehicles."""
         return find_accounts(self._session, prefix=self.prefix, within=within, timeout=timeout)
 
     def rejections(self) -> Rejections:
-        """Follow the reports of messages that services on this network reject from now on."""
+        """Subscribe to the reports of messages that services on this network reject."""
         return Rejections(self._session, prefix=self.prefix, owner=self)
 
     def publisher(
@@ -144,27 +145,30 @@ class Bus:
         lossless: bool = False,
         source: str | None = None,
     ) -> Publisher:
-        """Return a publisher of one address; raise AddressInUseError if this bus has one already.
+        """Return a publisher for one address.
 
-        The router knows it then: a reader that subscribes from now on gets the last message, be there only one.
-        `lossless` is for replays as fast as readers take them: while a reader of mode "every" has more than 2,000
-        messages to read, `publish` waits for it, and sends 10 a second meanwhile; `close` waits until they have all.
-        `source` is where the messages come from, for `sample.source`: 1 to 32 of a-z 0-9 _ -.
+        Its declarations have reached the router: readers that subscribe after this call get the last message.
+        `lossless`: flow control for replays at the speed of the readers. `publish` waits while a reader of mode "every"
+        has more than 2,000 unread messages, and sends 10 messages per second meanwhile; `close` waits until the readers
+        have all messages.
+        `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
+
+        Raises AddressInUseError if this bus already has a publisher for the address.
         """
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # a router that answers knows all earlier declarations
+        self._publishers.is_alive(address)  # a round trip: the router has processed all earlier declarations
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:
-        """Open another Zenoh session at the same routers, or at another one; the caller closes it."""
+        """Open another Zenoh session, at the same routers or at `endpoint`; the caller closes it."""
         return open_client([endpoint] if endpoint else self.routers, timeout=timeout, tls=self._tls)
 
     def close(self) -> None:
-        """Close the bus, its subscriptions and its publishers; a second call does nothing.
+        """Close the bus with its subscriptions and publishers. Idempotent.
 
-        Lossless publishers flush before; not so where a `with` block ends by an exception.
+        Lossless publishers are flushed first, unless a `with` block ends with an exception.
         """
         if self._finalizer.alive:
             with suppress(NedbusError):
@@ -191,7 +195,7 @@ class Bus:
             raise ClosedError
 
     def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> PendingQueue:
-        """Return the queue of a new subscription; AsyncBus uses it too."""
+        """Return the queue of a new subscription; also used by AsyncBus."""
         self._require_open()
         decoder, name = Decoder(self._layouts, prefix=self.prefix), selection.key_expr(prefix=self.prefix)
         if max_rate is None:
@@ -199,7 +203,7 @@ class Bus:
         return MaxRateQueue(mode, decoder, max_rate=max_rate, name=name)
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:
-        """Open Zenoh's side of a subscription; AsyncBus does so in a thread."""
+        """Open the receiver of a subscription; AsyncBus calls this in a thread."""
         session, prefix, housekeeping = self._session, self.prefix, self._housekeeping
         receiver: Receiver
         if isinstance(pending_queue, MaxRateQueue):
@@ -207,7 +211,7 @@ class Bus:
         else:
             receiver = Receiver(session, selection.key_expr(prefix=prefix), pending_queue, housekeeping=housekeeping)
         self._receivers.add(receiver)
-        if not self._finalizer.alive:  # closed meanwhile, by another thread
+        if not self._finalizer.alive:  # closed by another thread
             receiver.close()
             raise ClosedError
         return receiver
@@ -221,14 +225,14 @@ def connect(
     tls: Tls | None = None,
     config: str | Path | None = None,
 ) -> Bus:
-    """Connect to a router and return a bus; use it as a context manager, or drop it: it closes itself.
+    """Connect to a router and return a bus. Use it as a context manager; it also closes when it is garbage-collected.
 
-    `endpoint` is Zenoh's, such as tcp/192.168.1.5:7447, or several of which the first that answers is taken.
-    Without it, NEDBUS_CONNECT or `connect` in nedbus.toml decides, else it is the router of this host's `nedbus serve`.
-    `timeout` is how long to try [s]; None waits until Ctrl-C. Later breaks of the link are reconnected by themselves.
-    `tls` is for tls/ endpoints; without it, the settings decide. `config` names a file instead of nedbus.toml.
+    `endpoint`: a Zenoh endpoint such as tcp/192.168.1.5:7447, or several; the first one that answers is used.
+    The default is NEDBUS_CONNECT, `connect` in nedbus.toml, or else the router of `nedbus serve` on this host.
+    `timeout`: seconds to wait for a router; None waits until Ctrl-C. A broken link is reconnected automatically.
+    `tls`: for tls/ endpoints, by default from the settings. `config`: the path of a file to use for nedbus.toml.
 
-    Raises ConnectError when nothing answers, ConfigError for an invalid setting.
+    Raises ConnectError if no router answers, ConfigError for an invalid setting.
     """
     return connect_with(load_settings(config, connect=endpoint, prefix=prefix), timeout=timeout, tls=tls)
 
@@ -236,9 +240,9 @@ def connect(
 def connect_with(
     settings: Settings, *, timeout: float | None, tls: Tls | None = None, stop: threading.Event | None = None
 ) -> Bus:
-    """Connect as settings say, with `tls` in place of theirs if it is given; errors are those of `connect`.
+    """Connect with these settings; `tls` overrides theirs. Errors as in `connect`.
 
-    Setting `stop` ends the wait for a router, with ConnectError.
+    Setting `stop` ends the wait for a router with ConnectError.
     """
     tls = tls or settings.tls
     session = open_client(settings.routers, timeout=timeout, tls=tls, stop=stop)
@@ -246,6 +250,6 @@ def connect_with(
 
 
 def _close_all(receivers: Iterable[Receiver]) -> None:
-    with ExitStack() as closing:  # if one fails, the others are closed as well
+    with ExitStack() as closing:  # closes all of them, even if one fails
         for receiver in list(receivers):
             closing.callback(receiver.close)

@@ -1,4 +1,4 @@
-"""Decorators that type `subscribe` and `latest` by their topic, for type checkers, in the stub beside this file."""
+"""Decorators that give `subscribe` and `latest` a type for each topic, defined in the stub beside this file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finalizers: close what a script forgot, never in the thread that collects garbage, and before the process ends."""
+"""Finalizers: close unreferenced objects on a separate thread, and all open ones before the process exits."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from nedbus.transport import is_forked
 
 _log = logging.getLogger(__name__)
 
-_DRAIN: Final = 2.0  # s that the end of a process waits for what is being closed
-_pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # may be filled in the midst of anything
+_DRAIN: Final = 2.0  # s that the exit of the process waits for pending closes
+_pending: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()  # a SimpleQueue, as `put` has to be reentrant
 _owners: weakref.WeakSet[object] = weakref.WeakSet()
 _start = threading.Lock()
-_closer: list[threading.Thread] = []  # made when it is started: a fork marks a thread as stopped
+_closer: list[threading.Thread] = []  # empty until started: a fork marks threads as stopped
 
 
 class Finalizer:
-    """Call `close` once: by `close_now`, when the owner is garbage, or at the end of the process.
+    """Call `close` once: from `close_now`, after garbage collection of the owner, or at exit of the process.
 
-    Garbage may be collected in any thread at any moment, also while that thread holds a lock that `close` needs, and
-    closing waits for Zenoh: so a thread of its own closes then.
-    `close` must not refer to the owner.
+    The garbage collector runs on any thread, perhaps one that holds a lock `close` needs, and closing waits for Zenoh:
+    a separate thread therefore closes collected objects.
+    `close` must not reference the owner.
     """
 
     def __init__(self, owner: object, close: Callable[[], object]) -> None:
@@ -42,11 +42,11 @@ class Finalizer:
 
     @property
     def alive(self) -> bool:
-        """True until it has been called."""
+        """True until `close` has been called."""
         return self._finalize.alive
 
     def close_now(self) -> None:
-        """Close in this thread; a second call does nothing."""
+        """Close on this thread; a second call does nothing."""
         if self._finalize.detach():
             self._close()
 
@@ -56,7 +56,7 @@ def _close_later(close: Callable[[], object]) -> None:
         return  # the session belongs to the parent process
     if threading.main_thread().is_alive():
         _pending.put(close)
-    else:  # the process ends, and does not wait for threads any more
+    else:  # the process is exiting and no longer waits for threads
         close()
 
 
@@ -65,13 +65,13 @@ def _run() -> None:
         close = _pending.get()
         try:
             close()
-        except Exception:  # noqa: BLE001 - what cannot be closed must not keep all else open
-            _log.debug("something that was no longer referenced could not be closed", exc_info=True)
+        except Exception:  # noqa: BLE001 - one failed close must not stop the others
+            _log.debug("cannot close an unreferenced object", exc_info=True)
 
 
 @atexit.register
 def _drain() -> None:
-    """Wait for the thread: one that is inside Zenoh when the interpreter ends aborts the process."""
+    """Wait for pending closes: a thread still in Zenoh at interpreter exit aborts the process."""
     if _closer and _closer[0].is_alive():
         drained = threading.Event()
         _pending.put(drained.set)
@@ -79,7 +79,7 @@ def _drain() -> None:
 
 
 def _after_fork() -> None:
-    """Never drop what a forked process inherited: Zenoh's objects hang when they are dropped there."""
+    """Leak inherited objects in a forked process: dropping Zenoh's objects there would hang."""
     for owner in list(_owners):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
 

@@ -1,4 +1,4 @@
-"""Discovery of peers: vehicles, services and their status, layouts, rejected messages. No peer is trusted."""
+"""Discovery of vehicles, services, accounts, layouts and rejected messages; peers are not trusted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pydantic_core import PydanticUseDefault
 from nedbus.client.closing import Finalizer
 from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas
-from nedbus.events import QUESTION, AccountReport, from_json
+from nedbus.events import ACCOUNT_PARAMETER, AccountReport, from_json
 from nedbus.log_event import about
 from nedbus.transport import AliveTokens, RawSample, Session, query, while_open
 from nedbus_msgs import (
@@ -37,42 +37,42 @@ from nedbus_msgs import (
 
 _log = logging.getLogger(__name__)
 
-_MAX_FIELDS: Final = 256  # of a layout
-_MAX_LAYOUTS: Final = 32  # of an answer; there are five
-_MAX_TEXT: Final = 300  # characters of a key that are logged, and of a reason that are kept
-_MAX_ANSWER_BYTES: Final = 2**18
-_MAX_ACCOUNT_BYTES: Final = 2**20  # of an answer about a thousand vehicles
+_MAX_FIELDS: Final = 256  # per layout
+_MAX_LAYOUTS: Final = 32  # per reply; five exist
+_MAX_TEXT: Final = 300  # characters of a logged key, and of the reason of a rejection
+_MAX_REPLY_BYTES: Final = 2**18
+_MAX_ACCOUNT_BYTES: Final = 2**20  # enough for a thousand vehicles
 _MAX_REPORT_BYTES: Final = 2**16
-_MAX_MEMORY: Final = 2**28  # bytes of all parsed answers, about: JSON takes up to 32 times its length
-_MAX_REPORTS: Final = 1000  # that wait; beyond, the oldest are dropped
-_SCHEMA_TIMEOUT: Final = 2.0  # s: time for a busy publisher to answer
-_POLL: Final = 0.002  # s between two polls for tokens
+_MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes up to 32 times its length
+_MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
+_SCHEMA_TIMEOUT: Final = 2.0  # s for a busy publisher to reply
+_POLL: Final = 0.002  # s between polls for tokens
 
 
 class VehicleDirectory:
-    """The addresses that are published, from the first query on."""
+    """The published addresses, by their liveliness tokens; it subscribes to them at the first call."""
 
     def __init__(self, *, prefix: str) -> None:
         self._prefix = prefix
         self._lock = threading.Lock()
-        self._addresses: dict[str, Address] = {}  # by the key of the token
+        self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
 
     def vehicles(self, session: Session, *, timeout: float) -> dict[str, list[Address]]:
-        """Return the addresses of each vehicle, both sorted; the first call waits up to `timeout` seconds."""
+        """Return the addresses by vehicle, both sorted; the first call waits up to `timeout` seconds."""
         with self._lock:
             if self._tokens is None:
                 self._tokens = AliveTokens(session, Selection().alive_key_expr(prefix=self._prefix))
                 self._tokens.ask()
-            self._take(self._tokens, timeout)
+            self._poll(self._tokens, timeout)
             while self._tokens.is_asking:
                 time.sleep(_POLL)
-                self._take(self._tokens, timeout)
-            self._take(self._tokens, timeout)  # what the subscriber was told before the last answer
+                self._poll(self._tokens, timeout)
+            self._poll(self._tokens, timeout)  # changes that the subscriber received before the last reply
             addresses = sorted(self._addresses.values())
         return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
 
-    def _take(self, tokens: AliveTokens, timeout: float) -> None:
+    def _poll(self, tokens: AliveTokens, timeout: float) -> None:
         for key, alive in tokens.take(timeout=timeout):
             if not alive:
                 self._addresses.pop(key, None)
@@ -80,19 +80,19 @@ class VehicleDirectory:
             try:
                 self._addresses[key] = address_of_alive_key(key, prefix=self._prefix)
             except AddressError:
-                _log.debug("%r: a liveliness token that is not one of nedbus", key[:200])
+                _log.debug("%r: ignored a liveliness token that is not from nedbus", key[:200])
 
 
 @dataclass(frozen=True, slots=True)
 class StreamStatus:
-    """The health of one stream that is published."""
+    """The health of one published stream."""
 
     address: str
     health: Health
 
 
 class _FromPeer:
-    """Fields of an answer from the network: an invalid value becomes the default, and invalid rows are left out."""
+    """Base of untrusted replies: an invalid value becomes the default, and invalid rows of a list are dropped."""
 
     __slots__ = ()
 
@@ -114,15 +114,15 @@ class _FromPeer:
 class SourceStatus(_FromPeer):
     """The status of one source.
 
-    `state`: starting, waiting, running, retrying, done or failed; empty if the service does not say.
-    `published` and `rejected` count messages since the service started; `done` of `total` is this run's progress.
-    `lost`: messages that were lost before they reached a live source, as far as it can count; `reboots` of vehicles.
-    `stale`: addresses that a live source published, until nothing arrived for 3 s.
-    `not_carried`: messages that vehicles publish and this source has no definition of; `silent`: addresses that they
-    announce, and of which nothing arrives while others do.
-    `rejections`: the number of messages that each rule rejected.
-    `retries`: restarts after a failure; `error`: the reason of the last failure.
-    `streams`: the health of each stream that is published, of up to 100 of them.
+    `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
+    `published`, `rejected`: messages since the service started. `done`, `total`: progress of this run.
+    `lost`: messages lost before they reached a live source, if it can detect them. `reboots`: reboots of vehicles.
+    `stale`: addresses of a live source without a message for 3 s.
+    `not_carried`: messages of vehicles that this source has no definition for. `silent`: addresses that vehicles
+    announce but do not send, while others arrive.
+    `rejections`: the number of rejected messages by rule.
+    `retries`: restarts after a failure. `error`: the reason of the last failure.
+    `streams`: the health of each published stream, 100 at most.
     """
 
     source: str = ""
@@ -146,7 +146,7 @@ class SourceStatus(_FromPeer):
 
     @property
     def ended(self) -> bool:
-        """True once it will publish no more."""
+        """True if the source will not publish again."""
         return self.state in {"done", "failed"}
 
 
@@ -154,10 +154,10 @@ class SourceStatus(_FromPeer):
 class ServiceStatus(_FromPeer):
     """The status of a service, from `bus.services()`.
 
-    `service` is its id; `host` the name of its host, or of its container; `role` "router" or "client".
-    Times are seconds since the epoch by its clock.
-    `refused`: vehicles that its router's access rules keep from all readers.
-    The answer of a peer may be of any version: absent and invalid fields have their defaults.
+    `service`: its id. `host`: the name of its host or container. `role`: "router" or "client".
+    `started`, `now`: seconds since the epoch by its clock.
+    `refused`: vehicles whose messages the access rules of its router drop.
+    Services may have any version: absent and invalid fields have their default.
     """
 
     service: str = ""
@@ -190,24 +190,24 @@ _LAYOUT: Final = TypeAdapter(_Layout)
 
 
 def find_services(session: Session, *, prefix: str, timeout: float) -> list[ServiceStatus]:
-    """Return the status of every nedbus service; answers that would fill the memory are left out."""
-    answers = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
+    """Query the status of all nedbus services; replies that are too large are ignored."""
+    replies = query(session, status_key(ANY, prefix=prefix), timeout=timeout)
     return [
         replace(_STATUS.validate_python(content), service=key.split("/")[-2])
-        for key, content in _parse(answers)
+        for key, content in _parse(replies)
         if isinstance(content, dict)
     ]
 
 
 def find_accounts(session: Session, *, prefix: str, within: float, timeout: float) -> list[AccountReport]:
-    """Return the accounts of services of the last `within` seconds; invalid or too large answers are left out."""
-    answers = query(session, f"{status_key(ANY, prefix=prefix)}?{QUESTION}={within:g}", timeout=timeout)
-    found = (from_json(content) for _, content in _parse(answers, limit=_MAX_ACCOUNT_BYTES))
+    """Query the accounts of all services for the last `within` seconds; invalid and too large replies are ignored."""
+    replies = query(session, f"{status_key(ANY, prefix=prefix)}?{ACCOUNT_PARAMETER}={within:g}", timeout=timeout)
+    found = (from_json(content) for _, content in _parse(replies, limit=_MAX_ACCOUNT_BYTES))
     return [report for report in found if report is not None]
 
 
 def find_schemas(messages: Collection[str], *, session: Session, prefix: str) -> Schemas:
-    """Ask publishers for the fields of all layouts of these messages; of different answers for one the first counts."""
+    """Query publishers for the fields of all layouts of these messages; the first reply for a layout wins."""
     found: dict[str, dict[int, dict[str, str]]] = {}
     keys = [schema_key(name, prefix=prefix) for name in messages]
     for key, content in _parse(query(session, *keys, timeout=_SCHEMA_TIMEOUT, newest=False)):
@@ -225,8 +225,8 @@ def find_schemas(messages: Collection[str], *, session: Session, prefix: str) ->
 class RejectionReport:
     """A message that a service rejected.
 
-    `received`: when the report arrived here, ns since the epoch.
-    `reason`: the service's words, at most 300 characters: a peer wrote them, and may have written anything.
+    `reason`: untrusted text of the service, at most 300 characters.
+    `received`: time at which the report arrived, ns since the epoch.
     """
 
     address: Address
@@ -235,14 +235,14 @@ class RejectionReport:
 
 
 class Rejections:
-    """The reports that arrive; get one from `bus.rejections()`.
+    """A subscription to rejection reports; get one from `bus.rejections()`.
 
-    It is closed when it is no longer referenced, and with the bus.
+    It closes with the bus, or when it is garbage-collected.
     """
 
     def __init__(self, session: Session, *, prefix: str, owner: object) -> None:
         self._prefix = prefix
-        self._owner = owner  # keeps the bus open as long as it may be read
+        self._owner = owner  # keeps the bus open
         channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_REPORTS)
         with while_open():
             subscriber = session.declare_subscriber(rejected_key_expr(prefix=prefix), channel)
@@ -250,13 +250,13 @@ class Rejections:
         self._finalizer = Finalizer(self, subscriber.undeclare)
 
     def take(self) -> list[RejectionReport]:
-        """Return the reports that have arrived since the last call, at most 1000, without waiting."""
+        """Return the reports received since the last call, at most 1000, without waiting."""
         with while_open():
             samples = list(iter(self._handler.try_recv, None))
         return [report for report in map(self._read, samples) if report is not None]
 
     def close(self) -> None:
-        """End the subscription; a second call does nothing."""
+        """End the subscription. Idempotent."""
         self._finalizer.close_now()
 
     def _read(self, sample: zenoh.Sample) -> RejectionReport | None:
@@ -269,12 +269,12 @@ class Rejections:
         return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
 
 
-def _parse(answers: Iterable[RawSample], *, limit: int = _MAX_ANSWER_BYTES) -> Iterator[tuple[str, object]]:
-    """Yield key and content of the answers that are JSON and fit in memory; one line of the log tells of the others."""
+def _parse(replies: Iterable[RawSample], *, limit: int = _MAX_REPLY_BYTES) -> Iterator[tuple[str, object]]:
+    """Yield key and content of JSON replies within the memory limit; log all others in one line per reason."""
     room, too_large, invalid = _MAX_MEMORY, 0, ""
-    for raw in answers:
+    for raw in replies:
         key, text = str(raw.key_expr), raw.payload.to_bytes()
-        # Memory when it is parsed, at most, about: measured with CPython 3.11.
+        # Upper estimate of its memory when parsed, measured with CPython 3.11.
         size = 4 * len(text) + 150 * text.count(b"{") + 60 * text.count(b"[") + 40 * text.count(b",")
         if len(text) > limit or size > room:
             too_large += 1
@@ -287,7 +287,7 @@ def _parse(answers: Iterable[RawSample], *, limit: int = _MAX_ANSWER_BYTES) -> I
         else:
             yield key, content
     if too_large:
-        _log.warning("%d answers are left out: they are too large", too_large, extra=about("incomplete"))
+        _log.warning("ignored %d replies that are too large", too_large, extra=about("incomplete"))
     if invalid:
         extra = about("invalid", reason="no JSON")
-        _log.warning("%r: an answer that is not JSON", invalid[:_MAX_TEXT], extra=extra)
+        _log.warning("%r: ignored a reply that is not JSON", invalid[:_MAX_TEXT], extra=extra)

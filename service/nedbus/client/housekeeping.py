@@ -1,4 +1,4 @@
-"""Threads that call periodic jobs: heartbeats, retransmission requests, acknowledgements; answers to queries."""
+"""Housekeeping thread for periodic jobs: heartbeats, retransmission, acknowledgements and answers to queries."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from nedbus.log_event import about
 
 _log = logging.getLogger(__name__)
 
-_SHORTEST: Final = 0.002  # s between two turns
-_FAILED: Final = 1.0  # s until a job that failed is called again
-_JOIN_TIMEOUT: Final = 10.0  # s that a turn has to get out of Zenoh
+_MIN_PAUSE: Final = 0.002  # s between two rounds
+_RETRY_PAUSE: Final = 1.0  # s until the retry of a failed job
+_JOIN_TIMEOUT: Final = 10.0  # s for a round to return from Zenoh
 
 Job = Callable[[float], float]
-"""Do what is due at this time, in monotonic seconds; return the seconds until the next call, at the latest.
+"""Job: takes the time in monotonic seconds and returns the seconds until its next call is due.
 
-It is called earlier where others are, and must never wait.
+It may be called earlier, along with other jobs, and must never block.
 """
 
 
 class Housekeeping:
-    """Call all jobs in one thread, when the first of them is due; it starts with the first job."""
+    """Call all jobs on one thread whenever one of them is due; the first job starts the thread."""
 
     def __init__(self, *, name: str = "nedbus-housekeeping") -> None:
         self.closed = False
         self._name = name
         self._jobs: list[Job] = []
         self._starting = threading.Lock()
-        self._turn = threading.RLock()  # held while jobs are called
-        # One item, or none. The methods of an Event are Python: a Ctrl-C amid one leaves its lock taken for good.
+        self._round = threading.RLock()  # held during a round
+        # At most one item. Not an Event, which is written in Python: Ctrl-C inside one leaves its lock held forever.
         self._woken: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
 
     def add(self, job: Job) -> Callable[[], None]:
-        """Call a job from now on; return a function that ends that, and waits until it has ended."""
+        """Add a job; return a function that removes it and waits until it no longer runs."""
         with self._starting:
             self._jobs.append(job)
             if self._thread is None and not self.closed:
@@ -50,35 +50,35 @@ class Housekeeping:
         return partial(self._remove, job)
 
     def wake(self) -> None:
-        """Call all jobs now."""
+        """Call all jobs soon, without waiting for the next due time."""
         if self._woken.empty():
             self._woken.put(None)
 
     def close(self) -> None:
-        """Call no job any more; one that is inside Zenoh when the interpreter ends would abort the process."""
+        """Stop the thread and wait for it: a thread still in Zenoh at interpreter exit aborts the process."""
         self.closed = True
         self.wake()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_TIMEOUT)
 
     def _remove(self, job: Job) -> None:
-        with self._turn, suppress(ValueError):
+        with self._round, suppress(ValueError):
             self._jobs.remove(job)
 
     def _run(self) -> None:
         failed: set[int] = set()
         while not self.closed:
-            with self._turn:
+            with self._round:
                 pauses = [self._call(job, failed) for job in tuple(self._jobs)]
             with suppress(queue.Empty):
-                self._woken.get(timeout=max(_SHORTEST, min(pauses, default=_FAILED)))
+                self._woken.get(timeout=max(_MIN_PAUSE, min(pauses, default=_RETRY_PAUSE)))
 
     @staticmethod
     def _call(job: Job, failed: set[int]) -> float:
         try:
             return job(time.monotonic())
-        except BaseException:  # noqa: BLE001 - Zenoh's panics are such; the others must not end with it
+        except BaseException:  # noqa: BLE001 - includes Zenoh's panics; other jobs must go on
             if id(job) not in failed:
                 failed.add(id(job))
-                _log.exception("an unexpected error, which is logged once", extra=about("bug"))
-            return _FAILED
+                _log.exception("unexpected error in a background job (logged once)", extra=about("bug"))
+            return _RETRY_PAUSE

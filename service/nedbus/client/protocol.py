@@ -1,6 +1,6 @@
-"""The protocol of publishers and readers of nedbus beside messages.
+"""The acknowledgement protocol between publishers and readers.
 
-A lossless publisher requests acknowledgements of the readers of mode `every` with the query
+A lossless publisher requests acknowledgements from readers of mode `every` with the query
 `<key>/@ack?publisher=<id>;number=<sequence number>;read=<0 or 1>`.
 """
 
@@ -10,21 +10,24 @@ from collections.abc import Callable
 from typing import Final
 
 LIVE: Final = b"live"
-"""Attachment of a publisher's answer with its last message, which that of a storage does not have."""
+"""Attachment of a publisher's reply with its last message; replies of a storage do not have it."""
 
 CLOSED: Final = b"closed"
-"""The acknowledgement of a reader that is closed; that of any other is empty."""
+"""Payload of the acknowledgement of a closed reader; other acknowledgements are empty."""
 
 _MAX_DIGITS: Final = 10  # of a sequence number
 
 
 def write_parameters(publisher: str, number: int, *, read: bool) -> str:
-    """Return the parameters of the query that requests an acknowledgement."""
+    """Return the parameters of an acknowledgement request."""
     return f"publisher={publisher};number={number};read={read:d}"
 
 
 def read_parameters(get: Callable[[str], str | None]) -> tuple[str, int, bool] | None:
-    """Return publisher, number and `read` of a query; `get` returns its parameters by name. None for others."""
+    """Return publisher, number and `read` of an acknowledgement request, None if it is invalid.
+
+    `get` returns a parameter by name.
+    """
     publisher, number = get("publisher"), get("number") or ""
     if publisher is None or not number.isdecimal() or len(number) > _MAX_DIGITS:
         return None

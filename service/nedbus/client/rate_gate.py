@@ -1,4 +1,4 @@
-"""Downsampling: the rates that publishers offer, and the gate that lets messages pass at a rate. Pure."""
+"""Downsampling: the rates that publishers offer, and the gate that limits a stream to a rate; no I/O."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from typing import Final
 from nedbus.errors import ConfigError
 
 RATES: Final = (1, 2, 5, 10, 20, 50, 100)
-"""Messages a second to which a publisher downsamples a stream for its readers, each on a key of its own."""
+"""Rates [Hz] to which publishers downsample a stream, each on its own key."""
 
 
 class RateGate:
-    """Let at most `rate` messages a second pass: in T seconds rate x (T + 2.5 ms) + 2, two at once after a pause.
+    """Rate limiter: passes at most rate x (T + 2.5 ms) + 2 messages in T seconds, two at once after a pause.
 
-    The clock is the caller's.
+    The caller provides the clock.
     """
 
     def __init__(self, rate: float) -> None:
         self._period = math.ceil(1e9 / rate)  # ns
-        # Messages are due up to 2.5 ms before they come: of 100 Hz to 5 Hz each 20th passes, whatever their jitter.
+        # Due times are up to 2.5 ms early, so jitter has no effect: from 100 Hz to 5 Hz every 20th message passes.
         self._early = min(2_500_000, self._period // 10)
         self._due = math.inf
 
     def passes(self, now: int) -> bool:
-        """Return whether a message at `now`, in nanoseconds of any clock, passes."""
+        """Return True if a message at `now`, in ns of any clock, passes."""
         due = self._due
         if due - 2 * self._period <= now < due:
             return False
-        if now < due:  # the first, or the clock was set back: a vehicle restarted
+        if now < due:  # the first message, or the clock was set back, as when a vehicle restarts
             self._due = now + self._period - self._early
         else:
-            # Not a period after this message: of 100 Hz to 30 Hz pass 30 a second, 30 or 40 ms apart.
+            # One period after the due time, not after this message: 100 Hz at 30 Hz gives 30 Hz, 30 or 40 ms apart.
             self._due = max(due + self._period, now - self._early)
         return True
 
 
 def check_max_rate(max_rate: object) -> None:
-    """Raise ConfigError for what is no number of messages a second."""
+    """Raise ConfigError unless `max_rate` is a finite number above 0."""
     if isinstance(max_rate, bool) or not isinstance(max_rate, int | float) or not 0 < max_rate < math.inf:
-        raise ConfigError("max_rate", f"{max_rate!r} is invalid: messages a second, a finite number above 0")
+        raise ConfigError("max_rate", f"{max_rate!r} is invalid: expected messages per second, a finite number above 0")
 
 
 def rate_step(max_rate: float) -> int:
-    """Return the rate to request of publishers: the greatest of RATES that is not above, or else the least."""
+    """Return the rate to request from publishers: the highest of RATES up to `max_rate`, or the lowest."""
     return max((rate for rate in RATES if rate <= max_rate), default=RATES[0])

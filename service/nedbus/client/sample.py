@@ -1,4 +1,4 @@
-"""Sample, one message that arrived, and Counts of a subscription."""
+"""Sample, a received message with its metadata, and Counts, the statistics of a subscription."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from nedbus_msgs import Address, Message, Provenance, VehicleLocalPosition
 if TYPE_CHECKING:
     import zenoh
 
-Mode = Literal["latest", "every"]  # of each key a slow reader gets the newest message, or every message
+Mode = Literal["latest", "every"]  # a slow reader gets the newest message of each key, or every message
 M_co = TypeVar("M_co", bound=Message, default=VehicleLocalPosition, covariant=True)
 
 _UNKNOWN: Final = Provenance()
@@ -20,15 +20,15 @@ _UNKNOWN: Final = Provenance()
 
 @dataclass(slots=True, eq=False)
 class Sample(Generic[M_co]):
-    """One message that arrived.
+    """A received message with its metadata.
 
-    `message`: the validated message; from `rows()` a Row, which has the same fields.
-    `address`: vehicle, topic and instance, also as attributes of their own.
-    `received`: when it was decoded here, ns since the epoch.
-    `stamp`: Zenoh's timestamp, with the id of the clock; None without one, and in a copy.
-    `lost`: messages of this key that were lost in transit just before this one.
-    `provenance`: the source and the fields that it did not provide, also as `source` and `missing`.
-    `stored`: from `bus.latest()` only: no publisher answers for this address, but a storage that kept its last message.
+    `message`: the validated message; from `rows()`, a Row with the same fields.
+    `address`: vehicle, topic and instance, also available as attributes.
+    `received`: time of decoding, ns since the epoch.
+    `stamp`: Zenoh's timestamp with its clock id; None if the publisher sent none, and in copies.
+    `lost`: messages of this key lost in transit just before this one.
+    `provenance`: the source and the fields it did not provide, also available as `source` and `missing`.
+    `stored`: True if it came from a storage, as no publisher answered for the address; `bus.latest()` only.
     """
 
     message: M_co
@@ -38,11 +38,11 @@ class Sample(Generic[M_co]):
     lost: int = 0
     provenance: Provenance = _UNKNOWN
     stored: bool = False
-    _sent: int | None = None  # of a copy, as Zenoh's timestamp cannot be pickled
+    _sent: int | None = None  # in copies, as Zenoh's timestamp cannot be pickled
 
     @property
     def sent(self) -> int | None:
-        """When its publisher sent it, ns since the epoch by the publisher's clock; None without a timestamp."""
+        """Time of sending, ns since the epoch by the publisher's clock; None without a timestamp."""
         return self._sent if self.stamp is None else self.stamp.get_time_as_ntp64().as_nanos()
 
     @property
@@ -57,30 +57,30 @@ class Sample(Generic[M_co]):
 
     @property
     def instance(self) -> int | None:
-        """The uORB instance, where the topic has instances."""
+        """The uORB instance; None for a topic without instances."""
         return self.address.instance
 
     @property
     def source(self) -> str | None:
-        """The kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if its publisher set none."""
+        """The kind of source, such as `sim`, `ulog`, `px4-zenoh` or `mavlink`; None if the publisher set none."""
         return self.provenance.source
 
     @property
     def missing(self) -> frozenset[str]:
         """The fields that the source did not provide; they hold NaN, false or 0."""
         message = self.message
-        if isinstance(message, Message):  # of an older layout perhaps, by another encoder
+        if isinstance(message, Message):  # another encoder may have used an older layout
             return self.provenance.missing | (message.DEFINITION.all_fields - message.model_fields_set)
         return self.provenance.missing
 
     @property
     def latency(self) -> float | None:
-        """Seconds from sent to received, None without a timestamp; as good as the two hosts' clocks agree."""
+        """Seconds from sending to receiving, None without a timestamp; includes the offset between the two clocks."""
         sent = self.sent
         return None if sent is None else (self.received - sent) / 1e9
 
     def __eq__(self, other: object) -> bool:
-        """Compare everything; NaN equals NaN in a Message."""
+        """Compare all fields; NaN equals NaN in a Message."""
         return self._state() == other._state() if isinstance(other, Sample) else NotImplemented
 
     def __hash__(self) -> int:
@@ -95,13 +95,13 @@ class Sample(Generic[M_co]):
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """Counts of the messages of a subscription.
+    """Message counts of a subscription.
 
-    `received`: handed to the reader.
-    `lost`: lost in transit, and not recovered.
-    `dropped`: arrived, but not read in time: superseded in mode "latest", beyond 65,536 that wait in mode "every".
-    `invalid`: not a valid message, or not a valid key; the log gives the reason once for each key.
-    `discarded`: came twice, or too late, as another process sends under the id of a publisher, perhaps.
+    `received`: returned to the caller.
+    `lost`: lost in transit and not recovered.
+    `dropped`: arrived but not read in time: superseded in mode "latest", beyond 65,536 unread in mode "every".
+    `invalid`: invalid message or key; the log gives the reason once per key.
+    `discarded`: duplicate or too late, for example because two processes publish under the same id.
     """
 
     received: int = 0

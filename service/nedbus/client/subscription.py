@@ -1,4 +1,4 @@
-"""A subscription as a reader iterates over it: blocking, or with asyncio."""
+"""Subscription and AsyncSubscription: iterate over the samples of a bus, blocking or with asyncio."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from .sample import Counts, M_co, Sample
 if TYPE_CHECKING:
     from .receiving.batch import Batch
 
-_YIELD_AFTER: Final = 64  # samples after which other tasks of the event loop run
+_YIELD_AFTER: Final = 64  # samples between two turns for other tasks of the event loop
 _T = TypeVar("_T")
 
 
 class _SubscriptionBase(Generic[M_co]):
-    """Name, counts and the forms of a message: all but the waiting."""
+    """State shared by both subscriptions: name, counts and queue."""
 
     def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
         self.name = name
@@ -41,44 +41,44 @@ class _SubscriptionBase(Generic[M_co]):
 
     @property
     def waiting(self) -> int:
-        """Messages that have arrived and wait to be read."""
+        """Number of messages that have arrived and are unread."""
         return self._queue.waiting
 
 
 class Subscription(_SubscriptionBase[M_co]):
-    """Iterate over the samples of a subscription; get one from `bus.subscribe(...)`.
+    """Iterator over received samples; `bus.subscribe(...)` returns one.
 
     Iteration waits for the next sample and ends when the subscription or the bus is closed.
-    It is closed when it is no longer referenced, and at the end of the process.
+    The subscription closes itself when it is no longer referenced and when the process exits.
     """
 
     def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, name: str, owner: object) -> None:
         super().__init__(pending_queue, name=name)
         self._receiver = receiver
-        self._owner = owner  # keeps the bus open as long as it may be read
+        self._owner = owner  # keeps the bus open while the subscription is in use
         self._finalizer = Finalizer(self, receiver.close)
 
     def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it.
 
-        Raises NoDataError when none came within `timeout` seconds, ClosedError when the subscription is closed.
+        Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed.
         """
         return self._next(self._queue.pop, timeout)
 
     def receive_batch(self, timeout: float | None = None) -> Batch:
-        """Wait for at least one message, and return all that have arrived, as one array; errors as of `receive`."""
+        """Wait for at least one message and return all unread ones as arrays; raises the errors of `receive`."""
         return self._next(self._queue.pop_batch, timeout)
 
     def rows(self) -> Iterator[Sample[M_co]]:
-        """Iterate over the same samples with a Row, a named tuple, as `message`: faster, with the same checks."""
+        """Iterate over samples with a Row, a named tuple, as `message`: faster, with the same validation."""
         return self._each(self._pop_row)
 
     def batches(self) -> Iterator[Batch]:
-        """Iterate over NumPy arrays of what arrived meanwhile, up to 4096 messages at once, with the same checks."""
+        """Iterate over batches of up to 4096 unread messages as NumPy arrays, with the same validation."""
         return self._each(self._queue.pop_batch)
 
     def close(self) -> None:
-        """End the subscription; a second call does nothing."""
+        """Close the subscription; a second call does nothing."""
         self._finalizer.close_now()
 
     def __iter__(self) -> Iterator[Sample[M_co]]:
@@ -100,7 +100,7 @@ class Subscription(_SubscriptionBase[M_co]):
         require_unforked()
         deadline = None if timeout is None or timeout == math.inf else time.monotonic() + timeout
         if self._queue.newest_only:
-            self._receiver.receive()  # what is queued may not be the newest any more
+            self._receiver.receive()  # newer samples may be in the ring
         while True:
             if self._queue.ended:
                 raise ClosedError
@@ -117,10 +117,10 @@ class Subscription(_SubscriptionBase[M_co]):
 
 
 class AsyncSubscription(_SubscriptionBase[M_co]):
-    """Iterate over the samples of a subscription from asyncio; get one from `bus.subscribe(...)`.
+    """Asynchronous iterator over received samples; `bus.subscribe(...)` returns one.
 
-    The twin of Subscription, with `async for`, `await receive()` and `await close()`; it opens at its first use, and
-    belongs to the event loop of that moment.
+    Like Subscription, with `async for`, `await receive()` and `await close()`.
+    It opens on first use and is bound to the event loop running at that time.
     """
 
     def __init__(self, open_receiver: Callable[[], Receiver], pending_queue: PendingQueue, *, name: str) -> None:
@@ -129,14 +129,14 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         self._finalizer: Finalizer | None = None
         self._opening: asyncio.Task[None] | None = None
         self._arrival = asyncio.Event()
-        self._taken = 0
+        self._received = 0
 
     async def receive(self, timeout: float | None = None) -> Sample[M_co]:
-        """Wait for the next sample and return it; `timeout` and errors are those of `Subscription.receive`."""
+        """Wait for the next sample and return it; `timeout` and errors as in `Subscription.receive`."""
         return await self._next(self._queue.pop, timeout)
 
     async def receive_batch(self, timeout: float | None = None) -> Batch:
-        """Wait for at least one message, and return all, as `Subscription.receive_batch` does."""
+        """Wait for at least one message and return all unread ones, as `Subscription.receive_batch` does."""
         return await self._next(self._queue.pop_batch, timeout)
 
     def rows(self) -> AsyncIterator[Sample[M_co]]:
@@ -148,7 +148,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         return self._each(self._queue.pop_batch)
 
     async def close(self) -> None:
-        """End the subscription; a second call does nothing."""
+        """Close the subscription; a second call does nothing."""
         self._queue.end()
         if self._opening is not None:
             await asyncio.wait([self._opening])
@@ -172,9 +172,9 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
         await self.close()
 
     async def _next(self, pop: Callable[[], _T | None], timeout: float | None = None) -> _T:
-        self._taken += 1
-        if self._taken % _YIELD_AFTER == 0:
-            await asyncio.sleep(0)  # a reader that always finds a sample would never yield to other tasks
+        self._received += 1
+        if self._received % _YIELD_AFTER == 0:
+            await asyncio.sleep(0)  # else a reader that never has to wait would starve other tasks
         try:
             async with asyncio.timeout(timeout):
                 await self._open()
@@ -195,16 +195,16 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
                 yield await self._next(pop)
 
     async def _open(self) -> None:
-        """Wait until it is open; giving up the wait does not end the opening, which others, or `close`, wait for."""
+        """Open on first use and wait until open; cancelling the wait does not cancel the opening."""
         require_unforked()
         loop, opening = asyncio.get_running_loop(), self._opening
         if opening is not None and opening.get_loop() is not loop:
-            raise RuntimeError(f"the subscription to {self.name} belongs to another event loop: subscribe in this one")
+            raise RuntimeError(f"the subscription to {self.name} is bound to another event loop: subscribe in this one")
         if self._finalizer is not None or self._queue.ended:
             return
         if opening is None or opening.done():
             opening = self._opening = loop.create_task(self._open_in(loop))
-            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # perhaps not awaited
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may never be awaited
         await asyncio.shield(opening)
 
     async def _open_in(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -215,6 +215,6 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
 
 
 def _wake(loop: asyncio.AbstractEventLoop, arrival: asyncio.Event) -> None:
-    """Wake the reader, from any thread; a method would keep the subscription alive."""
+    """Wake the reader from any thread; a function, as a bound method would keep the subscription alive."""
     with suppress(RuntimeError):  # the loop is closed
         loop.call_soon_threadsafe(arrival.set)

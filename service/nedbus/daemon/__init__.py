@@ -1,4 +1,4 @@
-"""The service: a Daemon runs a Worker for each source, and answers with its status."""
+"""The service: a Daemon runs one Worker per source, and answers queries for its status."""
 
 from .daemon import Daemon
 from .plan import Planned, plan_sources

@@ -1,4 +1,4 @@
-"""The service: sources in, validated messages out, its status on demand, a clean end."""
+"""The service: publishes validated messages from sources, answers status queries, reloads and shuts down."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Final, Literal
 
 from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
-from nedbus.events import QUESTION, Account, AccountReport, report_of
+from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
@@ -29,17 +29,17 @@ from .write_permission import WritePermission, watch_permission
 
 _log = logging.getLogger(__name__)
 
-_GRACE: Final = 1.0  # s that a source has to end
+_GRACE: Final = 1.0  # s for sources to stop at shutdown
 _POLL: Final = 1.0  # s between two polls of silent streams and of the link
 _RELOADED: Final = frozenset({"source", "vehicle"})  # settings that can change while the service runs
 
 
 class Daemon:
-    """Publish the sources of the settings until they are done or `stop` is called.
+    """Publish the configured sources until they have ended or `stop` is called.
 
-    `run` blocks and is meant for a thread of its own, so that signals always reach the main thread.
+    `run` blocks; call it in a separate thread, to keep the main thread free for signals.
 
-    Raises ConfigError at once for an invalid source.
+    The constructor raises ConfigError for an invalid source.
     """
 
     def __init__(self, settings: Settings, *, version: str) -> None:
@@ -49,14 +49,14 @@ class Daemon:
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: Sequence[Worker] = ()
-        self._planning = threading.Lock()  # held while workers are started or stopped
+        self._planning = threading.Lock()  # held while workers start or stop
         self._registry: PublisherRegistry | None = None
         self._session: Session | None = None
         self._permission: WritePermission | None = None
         self.account = Account()
-        # In containers every service may be process 1 of the same host name.
+        # Random, because services in containers may all be PID 1 on hosts of the same name.
         self.id = re.sub(r"[^A-Za-z0-9_-]", "-", f"{socket.gethostname()}-{os.getpid()}-{os.urandom(3).hex()}")
-        self.max_sessions: int | None = None  # of the embedded router, when it is open
+        self.max_sessions: int | None = None  # of the embedded router, once it is open
         self.ready = threading.Event()
         self.role: Literal["router", "client"] = "client" if settings.is_client else "router"
         self.endpoints = settings.connect if settings.is_client else settings.router_endpoints
@@ -64,12 +64,12 @@ class Daemon:
 
     @property
     def until_done(self) -> bool:
-        """True if it ends when its finite sources have ended."""
+        """True if the service stops once its finite sources have ended."""
         return self._settings.until_done
 
     @property
     def status(self) -> ServiceStatus:
-        """The status of the service now."""
+        """Current status of the service."""
         return ServiceStatus(
             service=self.id,
             host=socket.gethostname(),
@@ -84,31 +84,31 @@ class Daemon:
 
     @property
     def sources(self) -> tuple[SourceStatus, ...]:
-        """The status of each source now."""
+        """Current status of each source."""
         return tuple(worker.status for worker in self._workers)
 
     @property
     def refused(self) -> Mapping[str, bool]:
-        """The router's verdict on each published vehicle, where it is known: true if access rules refuse it."""
+        """Known verdicts of the router by published vehicle: True if access rules refuse it."""
         return {} if self._permission is None else self._permission.refused
 
     @property
     def measures(self) -> list[SourceMeasures]:
-        """Measurements of each source, for metrics."""
+        """Measurements of each source for metrics."""
         return [worker.measures for worker in self._workers]
 
     @property
     def busy(self) -> float:
-        """Age of the longest turn of a source's loop [s]: for a watchdog."""
+        """Longest time that a source has spent on its current turn [s], for watchdogs."""
         return max((worker.busy for worker in self._workers), default=0.0)
 
     @property
     def sessions(self) -> int:
-        """Number of connected sessions: of the embedded router, or of this client to its router."""
+        """Number of sessions connected to the embedded router, or of links of this client to its router."""
         return 0 if self._session is None else len(self._session.info.transports())
 
     def look(self, measures: Sequence[SourceMeasures] | None = None) -> Account:
-        """Update the account of events, and return it; `measures`: those of this moment, if they are known."""
+        """Update and return the account of events; `measures`: current measurements, if the caller has them."""
         measured: dict[str, str] = {}
         for source in self.measures if measures is None else measures:
             measured |= source.states
@@ -116,16 +116,16 @@ class Daemon:
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         is_cut = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
-        self.account.look(time.time(), states, link=link)
+        self.account.update(time.time(), states, link=link)
         return self.account
 
     def report(self, *, within: float = 0.0) -> AccountReport:
-        """Return the events of the last `within` seconds, and the state of each vehicle now."""
+        """Return the events of the last `within` seconds and the current state of each vehicle."""
         return report_of(self.look(), self.id, socket.gethostname(), time.time(), within=within)
 
     def _answer(self, parameter: Callable[[str], str | None]) -> dict[str, object]:
-        """Return the status, or the account if the query asks for that."""
-        within = parameter(QUESTION)
+        """Answer a query with the status, or with the events if it has the parameter for them."""
+        within = parameter(ACCOUNT_PARAMETER)
         if within is None:
             return asdict(self.status)
         with suppress(ValueError):
@@ -133,24 +133,24 @@ class Daemon:
         return asdict(self.report())
 
     def stop(self) -> None:
-        """Stop `run`; callable from any thread, and from signal handlers."""
+        """Stop `run`; safe in any thread and in signal handlers."""
         self._stop.set()
         self._changed.set()
 
     def reload(self, settings: Settings) -> str:
-        """Start new sources, stop removed ones, leave all others alone; return a summary for the log.
+        """Start new sources, stop removed ones and leave all others running; return a summary for the log.
 
-        Raises ConfigError, and changes nothing, for a source that is invalid, or another setting than source and
-        vehicle that differs.
+        Raises ConfigError without any change if a source is invalid, or if settings other than source and vehicle
+        differ.
         """
         for name in type(settings).model_fields:
             if name not in _RELOADED and getattr(settings, name) != getattr(self._settings, name):
-                raise locate_setting(settings, name, f"{name} cannot change while the service runs: restart it")
+                raise locate_setting(settings, name, f"{name} cannot be changed by a reload: restart the service")
         plan = self._make_plan(settings)
         with self._planning:
             self._settings, self._plan = settings, plan
             if self._registry is None:
-                return "nothing runs yet"
+                return "no source is running yet"
             before, make_worker = self._workers, partial(self._make_worker, self._registry)
             self._workers = apply_plan(plan, before, make_worker)
         self._changed.set()
@@ -158,9 +158,9 @@ class Daemon:
         return f"{len(plan) - kept} started, {len(before) - kept} stopped, {kept} unchanged"
 
     def run(self) -> bool:
-        """Publish until done or stopped; return whether no source failed for good.
+        """Publish until done or stopped; return False if a source has failed.
 
-        Raises ListenError when the embedded router cannot listen, ConfigError for a mistake in its file.
+        Raises ListenError if the embedded router cannot listen, ConfigError for a mistake in its file.
         """
         session = self._session = self._open()
         if session is None:
@@ -197,14 +197,14 @@ class Daemon:
         )
 
     def _make_plan(self, settings: Settings) -> list[Planned]:
-        """Return the sources of these settings, opened; raise ConfigError, with its place, for the first mistake."""
+        """Open the sources of these settings; raise ConfigError for the first mistake, with its location."""
         plan, mistakes = plan_sources(settings, self.endpoints)
         if mistakes:
             raise mistakes[0]
         return plan
 
     def _open(self) -> Session | None:
-        """Open the session; a client waits for its router, and returns None if it is stopped meanwhile."""
+        """Open the session; a client waits for its router. Return None if stopped before it answers."""
         settings, endpoints = self._settings, ", ".join(self.endpoints)
         if self.role == "router":
             session = open_router(
@@ -218,7 +218,7 @@ class Daemon:
             _log.info("router on %s%s", endpoints, joining, extra=about("router"))
             return session
         setter = settings.set_by("connect")  # NEDBUS_CONNECT may be set for scripts
-        hint = "" if setter == "connect" else f", as set by {setter}: it starts no router of its own without --listen"
+        hint = "" if setter == "connect" else f", set by {setter}; use --listen to run a router instead"
         _log.info("client of %s%s", endpoints, hint, extra=about("client"))
         logged = False
         while not self._stop.is_set():
@@ -231,13 +231,13 @@ class Daemon:
         return None
 
     def _wait(self, registry: PublisherRegistry, uplinks: Uplinks | None) -> None:
-        """Wait for `stop`, or until all finite sources have ended and their readers have all messages."""
+        """Wait for `stop`, or until all finite sources have ended and their messages are acknowledged."""
         watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
                 if all(worker.status.ended for worker in finite):
-                    # A reader that missed the very last message learns it from a heartbeat.
+                    # Heartbeats tell readers of the last message, in case they missed it.
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return

@@ -1,4 +1,4 @@
-"""The output of one source: validate its messages, publish or reject them, and keep the health of each stream."""
+"""Output of a source: validates, publishes or rejects its messages, and tracks the health of each stream."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ _log = logging.getLogger(__name__)
 
 _STALE: Final = 3.0  # s without a message after which a live address is no longer published
 _MAX_ADDRESSES: Final = 1000  # of one live source
-_MAX_WARNINGS: Final = 50  # rejections that are remembered, one for each `where`
-_MAX_TEXT: Final = 300  # characters of a rejection that are logged: any peer may have sent it
-_MAX_LOGGED: Final = 5  # invalid messages of a source that are logged
-_MAX_RULES: Final = 50  # that are counted one by one
+_MAX_WARNINGS: Final = 50  # rejections kept and logged, one for each `where`
+_MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may have sent
+_MAX_LOGGED: Final = 5  # logged invalid messages of a source
+_MAX_RULES: Final = 50  # with a counter of their own
 _NO_MESSAGE: Final = "input that is no message"
 _DURATIONS: Final = (1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 1e-1, 1.0)  # s
 
 
 @dataclass(slots=True, eq=False)
 class _Stream:
-    """One address: its health, its publisher while it is published, and its last message from a live source."""
+    """State of one address: health, publisher while published, and last message of a live source."""
 
     health: StreamHealth
     publisher: Publisher | None = None
@@ -42,7 +42,7 @@ class _Stream:
 class SourceOutput:
     """Publish the messages of a source.
 
-    `name`: of the source in the log; `text`: as the user wrote it; `now`: a monotonic clock [s].
+    `name`: name of the source in the log; `text`: the source as configured; `now`: monotonic clock [s].
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class SourceOutput:
     ) -> None:
         self.published = self.rejected = self.lost = self.reboots = 0
         self.rejections: Counter[str] = Counter()
-        """Number of messages that each rule rejected."""
+        """Number of rejected messages by violated rule."""
         self.absence = Absence()
-        """Messages that vehicles publish and a live source does not deliver now."""
+        """Topics that vehicles publish and a live source does not deliver now."""
         self.durations = Histogram(_DURATIONS)
         """Time to validate, encode and send a message [s]."""
         self._name = name
@@ -63,12 +63,12 @@ class SourceOutput:
         self._account = account
         self._streams: dict[Address, _Stream] = {}
         self._warnings: dict[str, str] = {}  # by `where`
-        self._silent: set[str] = set()  # those that were logged
+        self._silent: set[str] = set()  # addresses logged as silent
         self._invalid = self._live = 0
 
     @property
     def addresses(self) -> list[Address]:
-        """Addresses that are published now."""
+        """Currently published addresses."""
         return [address for address, stream in list(self._streams.items()) if stream.publisher is not None]
 
     @property
@@ -84,13 +84,13 @@ class SourceOutput:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The first reason for a rejection of each origin."""
+        """The first rejection of each origin."""
         return tuple(self._warnings.values())
 
     def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
-        """Claim all addresses of a run, or none: two sources must not keep each other from starting.
+        """Claim all addresses of a run or none: otherwise two sources could block each other.
 
-        Raises AddressInUseError if another source of ours has one of them.
+        Raises AddressInUseError if another source of this service publishes one of them.
         """
         own = set(self.addresses)
         for address in run.addresses:
@@ -100,19 +100,19 @@ class SourceOutput:
             self.claim(address, definition, lossless=lossless)
 
     def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address, if need be; raise AddressInUseError if another source has one."""
+        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             return
         if self._registry.is_alive(address):
-            text = f"{address} is published by another process too: readers get both"
+            text = f"{address} is also published by another process: readers receive both"
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:
-        """Close the publishers of all addresses but those to keep."""
+        """Close the publishers of all addresses except `keep`."""
         kept = set(keep)
         for address, stream in self._streams.items():
             if address not in kept and stream.publisher is not None:
@@ -120,7 +120,7 @@ class SourceOutput:
                 stream.publisher = None
 
     def publish(self, message: SourceMessage) -> None:
-        """Validate a message whose address is claimed, and publish or reject it."""
+        """Validate a message of a claimed address, and publish or reject it."""
         stream = self._streams[message.address]
         if stream.publisher is None:
             raise KeyError(message.address)
@@ -140,7 +140,7 @@ class SourceOutput:
         self._account.add(message.address, fields, time.time(), lost=message.lost)
 
     def publish_live(self, message: SourceMessage) -> None:
-        """Publish a message of a live source, and claim its address if need be."""
+        """Publish a message of a live source; claim its address first if necessary."""
         self.lost += message.lost
         self.reboots += message.rebooted
         address = message.address
@@ -148,7 +148,7 @@ class SourceOutput:
         if stream is None or stream.publisher is None:
             back = stream is not None and stream.heard is not None
             if not back and self._live >= _MAX_ADDRESSES:
-                self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is left out"))
+                self.reject(Rejection("vehicles", f"more than {_MAX_ADDRESSES} addresses: {address} is ignored"))
                 return
             try:
                 self.claim(address, message.definition)
@@ -163,9 +163,9 @@ class SourceOutput:
         self.publish(message)
 
     def expire_stale(self) -> bool:
-        """Stop publishing live addresses that were silent for 3 s; return whether any is left.
+        """Stop publishing live addresses that have been silent for 3 s; return True if any is left.
 
-        Topics without a rate are published for as long as any other message of their vehicle arrives.
+        Topics without a rate stay published while other messages of their vehicle arrive.
         """
         now = self._now()
         fresh = {
@@ -177,13 +177,13 @@ class SourceOutput:
         fresh |= {each for each in self._streams if each.vehicle in heard and not get_topic(each.topic).rate}
         for address in self.addresses:
             if address not in fresh:
-                text = f"{address} is stale: nothing arrived for {_STALE:.0f} s"
+                text = f"{address} is stale: no message for {_STALE:.0f} s"
                 _log.warning("%s: %s", self._name, text, extra=about("stale", address, source=self._name))
         self.release(keep=fresh)
         return bool(fresh)
 
     def reject(self, rejection: Rejection) -> None:
-        """Count input that is no message, log it once for each origin, and report it if it has an address."""
+        """Count invalid input, log it once per origin, and publish a report if it has an address."""
         self._count_rejected(_NO_MESSAGE, rejection.count)
         where, reason = rejection.where[:_MAX_TEXT], rejection.reason[:_MAX_TEXT]
         if where not in self._warnings and len(self._warnings) < _MAX_WARNINGS:
@@ -196,17 +196,17 @@ class SourceOutput:
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, absence: Absence) -> None:
-        """Keep the absences of a live source, and log each silent address once."""
+        """Store the absent topics of a live source; log each silent address once."""
         self.absence = absence
         if new := [address for address in absence.silent if address not in self._silent]:
             self._silent.update(new)
-            text = f"announced, and nothing arrives: {', '.join(new)}; 'nedbus doctor' says more"
+            text = f"announced, but no message arrives: {', '.join(new)}; see 'nedbus doctor'"
             _log.warning("%s: %s", self._name, text, extra=about("silent", source=self._name))
 
     def _bring_back(self, message: SourceMessage) -> None:
-        """Publish the topics without a rate of a vehicle that is back again, as it would not repeat them.
+        """Republish the topics without a rate of a vehicle that is back: it would not repeat them.
 
-        After a reboot they no longer hold.
+        After a reboot they are outdated, and are dropped.
         """
         vehicle = message.address.vehicle
         known = [
@@ -237,7 +237,7 @@ class SourceOutput:
         self._count_rejected(rule)
         self._invalid += 1
         if self._invalid <= _MAX_LOGGED:
-            last = "; further ones are only counted" if self._invalid == _MAX_LOGGED else ""
+            last = "; further ones are counted, not logged" if self._invalid == _MAX_LOGGED else ""
             text = f"{message.address} rejected: {reason}{last}"
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
@@ -251,6 +251,6 @@ def _time_of(message: SourceMessage) -> int:
 
 
 def _rule_of(error: InvalidMessageError) -> str:
-    """Return the first rule that a message violates: its field, and the rule without any value."""
+    """Return the first violated rule: the field, and the rule without values."""
     field, rule = error.violations[0]
     return f"{field}: {rule.partition(' (')[0]}"

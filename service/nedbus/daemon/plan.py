@@ -1,4 +1,4 @@
-"""Plan of a service: the sources of its settings, opened, or the mistakes in them."""
+"""Plan of a service: its opened sources, or the mistakes in their settings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TLS: Final = ("tls_key", "tls_certificate", "tls_ca")
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A source as it is configured, `index` among others: after a reload one with this text and vehicle goes on."""
+    """A configured source, number `index` in the settings; a reload leaves it running if text and vehicle are equal."""
 
     index: int = field(compare=False)
     text: str
@@ -25,11 +25,11 @@ class Planned:
 
 
 def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Planned], list[ConfigError]]:
-    """Return the sources of these settings, for a service with these endpoints, and the first mistake in each."""
+    """Open the sources for a service with these endpoints; also return the mistakes, at most one per source."""
     plan: list[Planned] = []
     mistakes: list[ConfigError] = []
     if not settings.source and "source" not in settings.left_out:
-        reason = "nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"
+        reason = "no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"
         mistakes.append(ConfigError("source", reason))
     tls = None
     try:
@@ -49,11 +49,11 @@ def plan_sources(settings: Settings, endpoints: Sequence[str]) -> tuple[list[Pla
         else:
             plan.append(Planned(index, spec.text, settings.vehicle, source))
     if settings.until_done and plan and not mistakes and not any(is_finite(planned.source) for planned in plan):
-        reason = "no source ever ends: give sim: a duration, or take loop=1 from ulog:"
+        reason = "no source ever ends: give sim: a duration, or remove loop=1 from ulog:"
         mistakes.append(ConfigError("until_done", reason))
     return plan, mistakes
 
 
 def is_finite(source: Source) -> bool:
-    """Return whether a source ends by itself."""
+    """Return True if a source ends by itself."""
     return not isinstance(source, LiveSource) and source.finite

@@ -1,4 +1,4 @@
-"""Workers run the sources of a service: each replays messages when they are due, or listens to vehicles."""
+"""Worker threads of a service: each runs one source, a replay or a live source."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from .plan import Planned
 
 _log = logging.getLogger(__name__)
 
-_BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a source that failed is started again
-_MIN_RUN: Final = 0.1  # s that a run takes at least: a log of one message must not be read thousands of times a second
-_MAX_DELAY: Final = 1.0  # s: a replay that is later than this goes on from where it is, and does not hurry
+_BACKOFF: Final = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)  # s before a failed source is restarted
+_MIN_RUN: Final = 0.1  # s, minimum of a looped run: a log of one message must not be read thousands of times a second
+_MAX_DELAY: Final = 1.0  # s: a replay that is later than this shifts its schedule instead of catching up
 _STALE_POLL: Final = 0.5  # s between two checks for stale streams
 _READER_POLL: Final = 0.05  # s between two checks for a reader
-_RETIRE_TIMEOUT: Final = 5.0  # s that a source which is gone from the configuration has to end
-_MAX_STREAMS: Final = 100  # in a status: it must fit a message
+_RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
+_MAX_STREAMS: Final = 100  # in a status, which must fit into one message
 
 _Item = SourceMessage | Rejection | Absence | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
@@ -37,7 +37,7 @@ STATES: Final[tuple[State, ...]] = get_args(State)
 
 @dataclass(frozen=True, slots=True)
 class SourceMeasures:
-    """Measurements of one source, for metrics: its status, all its streams, and the time that publishing takes [s]."""
+    """Measurements of one source for metrics: status, all streams, and times to publish a message [s]."""
 
     status: SourceStatus
     streams: tuple[StreamStatus, ...]
@@ -45,7 +45,7 @@ class SourceMeasures:
 
     @property
     def states(self) -> dict[str, str]:
-        """The state of each stream by address; silence after the end of the source is no fault."""
+        """State of each stream by address; silence after the end of the source is ok."""
         if self.status.ended:
             return {stream.address: "ok" for stream in self.streams}
         published = frozenset(self.status.addresses)
@@ -53,7 +53,7 @@ class SourceMeasures:
 
 
 class Clock:
-    """Monotonic time, and waiting that ends early when the worker is stopped; a test gives another one."""
+    """Monotonic time, and waits that end early when the worker is stopped; replaced in tests."""
 
     def __init__(self) -> None:
         self._event = threading.Event()
@@ -63,15 +63,15 @@ class Clock:
 
     @property
     def stopped(self) -> bool:
-        """True once the worker has to end."""
+        """True once the worker has to stop."""
         return self._event.is_set()
 
 
 class Worker:
-    """Run one source in a thread of its own, until it ends or is stopped; its publishers stay open until then.
+    """Run one source in its own thread until the worker is stopped; publishers stay open after the source has ended.
 
-    With `retry` a replay that fails is started again, with growing pauses, as a live source always is.
-    `router`: the service's router, for its live sources; `on_end` is called when the source has ended.
+    With `retry`, a failed replay is restarted with exponential backoff; a live source always is.
+    `router`: the embedded router, for live sources; `on_end`: called when the source has ended.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class Worker:
         on_end: Callable[[], object],
     ) -> None:
         self.planned, self.source = planned, planned.source
-        self.text = planned.text.encode(errors="backslashreplace").decode()  # a file name may hold what no text can
+        self.text = planned.text.encode(errors="backslashreplace").decode()  # a file name may not be valid UTF-8
         self.thread = threading.Thread(target=self._run_and_release, name=self.text, daemon=True)
         self._name = self.text.rstrip(":")  # in the log
         self._registry = registry
@@ -99,23 +99,23 @@ class Worker:
         self._state: State = "starting"
         self._error: str | None = None
         self._done = self._retries = 0
-        self._turn: float | None = None  # begin of the current turn; None while a turn may take any time
+        self._turn: float | None = None  # start of the current turn; None while it may take any time
         self._release = False
 
     @property
     def busy(self) -> float:
-        """Age of the current turn of its loop [s]; 0 while it opens a source, or waits for a due message."""
+        """Age of the current turn of its loop [s]; 0 while it opens a source or waits for the next message."""
         since = self._turn
         return 0.0 if since is None else self._clock.now() - since
 
     @property
     def status(self) -> SourceStatus:
-        """The status of the source now."""
+        """Current status of the source."""
         return self._status(self._output.streams(_MAX_STREAMS))
 
     @property
     def measures(self) -> SourceMeasures:
-        """Measurements of the source, for metrics."""
+        """Measurements of the source for metrics."""
         streams = self._output.streams()
         return SourceMeasures(self._status(streams[:_MAX_STREAMS]), streams, self._output.durations)
 
@@ -143,17 +143,17 @@ class Worker:
         )
 
     def run(self) -> None:
-        """Run the source, again if it loops or fails, until it is done or stopped; it never raises."""
+        """Run the source until it is done or stopped; repeat it if it loops, restart it if it fails; never raise."""
         try:
             self._run_until_done()
         except BaseException as exc:  # noqa: BLE001 - the state must not stay "running" when the thread ends
-            _log.exception("%s: an unexpected error ended it", self._name, extra=about("failed", source=self._name))
+            _log.exception("%s: stopped by an unexpected error", self._name, extra=about("failed", source=self._name))
             self._state, self._error = "failed", _describe(exc)
         finally:
             self._on_end()
 
     def stop(self, *, release: bool) -> None:
-        """Stop the source; with `release` its thread then closes its publishers, which may wait for slow readers."""
+        """Stop the source; with `release`, its thread closes the publishers, which may wait for slow readers."""
         self._release = release
         self._clock.stop()
 
@@ -162,7 +162,7 @@ class Worker:
         self._clock.wait(None)
         if self._release:
             self._output.release()
-            _log.info("%s: ended, as it is not configured any more", self.text, extra=about("reload"))
+            _log.info("%s: stopped, no longer configured", self.text, extra=about("reload"))
 
     def _run_until_done(self) -> None:
         failures = 0
@@ -178,8 +178,8 @@ class Worker:
                 return
             except NedbusError as exc:
                 self._fail(str(exc))
-            except BaseException as exc:  # noqa: BLE001 - of one source, not of the service; a panic of Rust is no Exception
-                _log.exception("%s: an unexpected error", self._name, extra=about("retrying", source=self._name))
+            except BaseException as exc:  # noqa: BLE001 - only this source fails, not the service; a panic in Rust is not an Exception
+                _log.exception("%s: unexpected error", self._name, extra=about("retrying", source=self._name))
                 self._fail(_describe(exc))
             else:
                 if isinstance(self.source, LiveSource) or not self.source.loop:
@@ -194,7 +194,7 @@ class Worker:
                 self._end("failed", self._error)
                 return
             if self._clock.now() - start > _BACKOFF[-1]:
-                failures = 0  # it worked for a while
+                failures = 0  # it ran well before this failure
             self._clock.wait(_BACKOFF[min(failures, len(_BACKOFF) - 1)])
             failures += 1
 
@@ -219,23 +219,22 @@ class Worker:
                 early = start + message.due / source.speed - self._clock.now()
                 if early < -_MAX_DELAY:
                     extra = about("late", source=self._name)
-                    _log.warning("%s: %.1f s late, going on from here", self._name, -early, extra=extra)
+                    _log.warning("%s: %.1f s late, shifting the schedule", self._name, -early, extra=extra)
                     start -= early
                 elif early > 0:
                     self._clock.wait(early)
             if self._clock.stopped:
                 return
-            self._turn = (
-                None if source.speed is None else self._clock.now()
-            )  # a lossless publisher waits for its readers
+            # A lossless publisher may wait for its readers.
+            self._turn = None if source.speed is None else self._clock.now()
             self._output.publish(message)
             self._turn = None
             self._done += 1
         self._error = run.damage
 
     def _listen(self, source: LiveSource) -> None:
-        """Publish what a live source delivers; it yields None several times a second while nothing arrives."""
-        with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # each is a generator
+        """Publish the messages of a live source; it yields None several times a second while no message arrives."""
+        with closing(cast("Generator[_Item]", source.listen(self._router))) as items:  # live sources are generators
             next_poll = 0.0
             for item in items:
                 now = self._turn = self._clock.now()
@@ -266,7 +265,7 @@ class Worker:
             _log.info("%s: %s", self._name, text, extra=about(event, source=self._name, reason=reason))
 
     def _fail(self, reason: str) -> None:
-        """Note the reason, and release all addresses: another source may need them meanwhile."""
+        """Store the reason and release all addresses: another source may need them meanwhile."""
         self._state, self._error = "retrying", reason
         self._retries += 1
         event = "retrying" if self._retry else "failed"
@@ -275,13 +274,13 @@ class Worker:
 
 
 def _describe(error: BaseException) -> str:
-    return f"an unexpected {type(error).__name__}: {error}"
+    return f"unexpected {type(error).__name__}: {error}"
 
 
 def apply_plan(
     plan: Iterable[Planned], workers: Sequence[Worker], make_worker: Callable[[Planned], Worker]
 ) -> list[Worker]:
-    """Start new sources, stop removed ones, and return the workers of the plan in its order."""
+    """Start new sources, stop removed ones, and return the workers in the order of the plan."""
     left, ordered = list(workers), []
     for planned in plan:
         same = next((worker for worker in left if worker.planned == planned), None)
@@ -290,10 +289,10 @@ def apply_plan(
         ordered.append(same or make_worker(planned))
     stop_workers(left, _RETIRE_TIMEOUT, release=True)
     for worker in left:
-        if worker.thread.is_alive():  # giving an address back may take as long as its slowest reader
-            text = "%s: does not end, perhaps because of a slow reader; it goes on until then"
-            _log.warning(text, worker.text, extra=about("reload"))
-    for worker in ordered:  # new sources may need the addresses of those that are gone
+        if worker.thread.is_alive():  # a lossless publisher waits for its slowest reader
+            text = "%s: still stopping after %.0f s, maybe because of a slow reader"
+            _log.warning(text, worker.text, _RETIRE_TIMEOUT, extra=about("reload"))
+    for worker in ordered:  # after the others have stopped: they may use the same addresses
         if worker not in workers:
             worker.thread.start()
     return ordered

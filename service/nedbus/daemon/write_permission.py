@@ -1,7 +1,7 @@
-"""Write permission at the router: access rules drop messages without telling the sender.
+"""Write permission at the router, whose access rules drop messages without an error at the sender.
 
-Only services with a certificate are checked, as access rules go by it: with a second session for a moment, soon after a
-link is up or a vehicle appears, and then rarely. Rules change when a router restarts.
+Only services with a certificate are checked, because access rules refer to it. A check opens a second session for a
+moment: soon after a link is up or a new vehicle appears, then rarely. Rules change only when a router restarts.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from nedbus.transport import Session, Tls, Verdict, open_client, probe_writes, w
 
 _log = logging.getLogger(__name__)
 
-_FIRST: Final = (1.0, 5.0)  # s, drawn: the vehicles of a fleet come back together when their router does
+_FIRST: Final = (1.0, 5.0)  # s, random: all vehicles of a fleet reconnect at once after their router restarted
 _CONFIRM: Final = 1.0  # s until a denial is checked again
-_BELIEVED: Final = 3  # denials in a row that are a refusal: a slow or restarting router is none
+_BELIEVED: Final = 3  # consecutive denials that count as a refusal: a slow or restarting router causes fewer
 _UNSURE_PAUSE: Final = 60.0  # s until the next check while a vehicle is refused or unknown
-_PAUSE: Final = 600.0  # s until the next check when all are allowed
+_PAUSE: Final = 600.0  # s until the next check if all vehicles are allowed
 _POLL: Final = 1.0  # s between two polls of the link
-_OPEN: Final = 5.0  # s for a session
-_ARRIVED: Final = 3.0  # s for a message that is allowed
+_OPEN: Final = 5.0  # s to open a session
+_ARRIVED: Final = 3.0  # s for an allowed message to arrive
 _GRACE: Final = 5.0  # s to end
-_MAX_NAMED: Final = 20  # vehicles in a line of the log
+_MAX_NAMED: Final = 20  # vehicles named in a log line
 
 
 def watch_permission(session: Session, settings: Settings, registry: PublisherRegistry) -> WritePermission | None:
-    """Start the checks, if the service has a certificate that access rules may go by."""
+    """Start the checks if the service has a certificate; else return None."""
     endpoints = [endpoint for endpoint in settings.connect if endpoint.startswith(("tls/", "quic/"))]
     if settings.tls is None or settings.tls.certificate is None or not endpoints:
         return None
@@ -48,7 +48,7 @@ def watch_permission(session: Session, settings: Settings, registry: PublisherRe
 
 
 class WritePermission:
-    """Check in a thread of its own whether the router refuses any of the vehicles that `vehicles` returns.
+    """Check repeatedly, in a separate thread, that the router accepts all vehicles returned by `vehicles`.
 
     `session` publishes them, as a client of one of the endpoints or as a router that joins them.
     """
@@ -62,21 +62,21 @@ class WritePermission:
         self._prefix = prefix
         self._vehicles = vehicles
         self._stop = threading.Event()
-        self._denials: dict[str, int] = {}  # in a row, of each vehicle of which anything is known
+        self._denials: dict[str, int] = {}  # consecutive ones by vehicle; 0 if allowed, no entry if unknown
         self._thread = threading.Thread(target=self._run, name="nedbus-permission", daemon=True)
 
     @property
     def refused(self) -> dict[str, bool]:
-        """The router's verdict on each vehicle, where it is known: true if access rules refuse it."""
+        """Known verdicts of the router by vehicle: True if access rules refuse it."""
         known = self._denials.copy().items()
         return {vehicle: number > 0 for vehicle, number in known if not 0 < number < _BELIEVED}
 
     def start(self) -> None:
-        """Check when the link changes, when a vehicle is new, and rarely in between."""
+        """Start the thread; it checks after changes of the link, for new vehicles, and rarely in between."""
         self._thread.start()
 
     def close(self) -> None:
-        """End; best after the session, which ends a check that is under way."""
+        """Stop the thread; close the session first to abort a running check."""
         self._stop.set()
         self._thread.join(_GRACE)
 
@@ -95,12 +95,12 @@ class WritePermission:
                 due = now + self.check()
 
     def check(self) -> float:
-        """Check once, and return the seconds until the next check."""
+        """Check once; return the time until the next check [s]."""
         vehicles = self._vehicles()
         try:
             verdicts = self._probe(vehicles)
-        except NedbusError as exc:  # the link or the session has gone, or a file is being replaced
-            _log.debug("the write permission is unknown: %s", exc)
+        except NedbusError as exc:  # link or session closed, or a file being replaced
+            _log.debug("write permission unknown: %s", exc)
             verdicts = {}
         before = self.refused
         self._denials = {vehicle: number for vehicle, number in self._denials.items() if vehicle in vehicles}
@@ -110,7 +110,7 @@ class WritePermission:
                 self._denials[vehicle] = 0
             elif verdict == "denied":
                 self._denials[vehicle] = number + 1
-            elif not number:  # else the router was slow: rules do not change under a link
+            elif not number:  # else the router was slow: rules do not change while a link is up
                 self._denials.pop(vehicle, None)
         self._log_changes(before)
         if any(verdict == "denied" and self._denials[vehicle] < _BELIEVED for vehicle, verdict in verdicts.items()):
@@ -119,7 +119,7 @@ class WritePermission:
         return _PAUSE if is_well else _UNSURE_PAUSE
 
     def _probe(self, vehicles: set[str]) -> Mapping[str, Verdict]:
-        """Return the verdict on each vehicle; none without a router to which both sessions have a link."""
+        """Return the verdict on each vehicle; empty if the two sessions share no router."""
         routers = _routers_of(self._session)
         for endpoint in self._endpoints if vehicles else ():
             try:
@@ -130,7 +130,7 @@ class WritePermission:
                 if not (there := _routers_of(reader)) or not there <= routers:
                     continue
                 verdicts = probe_writes(reader, self._session, vehicles, prefix=self._prefix, timeout=_ARRIVED)
-                # A probe that did not arrive counts only if no link was broken meanwhile.
+                # A missing probe counts only if no link was lost meanwhile.
                 return verdicts if _routers_of(reader) == there and _routers_of(self._session) == routers else {}
         return {}
 
@@ -138,18 +138,18 @@ class WritePermission:
         now = self.refused
         if new := [vehicle for vehicle, refused in now.items() if refused and not before.get(vehicle)]:
             _log.warning(
-                "the router refuses %s: its messages reach no reader; do its access rules name it, with the"
-                " certificate %s? ('nedbus pki rules', docs/security.md); still trying",
+                "the router refuses %s: its messages reach no reader; check that its access rules name it, and that"
+                " %s is its certificate ('nedbus pki rules', docs/security.md); checking again",
                 _name(new),
                 self._tls.certificate,
                 extra=about("refused"),
             )
         if mended := [vehicle for vehicle, refused in before.items() if refused and now.get(vehicle) is False]:
-            _log.info("the router takes %s now: all is well again", _name(mended), extra=about("accepted"))
+            _log.info("the router accepts %s now", _name(mended), extra=about("accepted"))
 
 
 def _routers_of(session: Session) -> set[str]:
-    """Return the routers to which a session has a link."""
+    """Return the ids of the routers that a session is linked to."""
     try:
         with while_open():
             return {str(zid) for zid in session.info.routers_zid()}

@@ -1,4 +1,4 @@
-"""The doctor: checks of settings, routers, certificates, permissions, vehicles and clocks, when nothing arrives."""
+"""The doctor: checks of settings, routers, certificates, permissions, vehicles and clocks."""
 
 from .check import check_router_file, check_service
 from .examination import examine

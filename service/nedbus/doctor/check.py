@@ -1,4 +1,4 @@
-"""Mistakes in settings and router files, with file, line and column: for `nedbus check` and `nedbus serve --check`."""
+"""Checks of settings and router files for `nedbus check` and `nedbus serve --check`: mistakes with their location."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ _log = logging.getLogger(__name__)
 def check_service(
     file: str | Path | None = None, given: Mapping[str, object] | None = None, *, offline: bool = False
 ) -> list[ConfigError]:
-    """Return all mistakes in the settings of a service, as `load_settings` would read them with `given`.
+    """Return all mistakes in the settings of a service; `file` and `given` as in `load_settings`.
 
-    `offline`: check the text only, without the files, certificates and endpoints of this host.
+    `offline`: check only the text, not the files, certificates and endpoints of this host.
     """
     settings, mistakes = find_mistakes(file, **(given or {}))
     endpoints = settings.connect if settings.is_client else settings.listen
@@ -55,7 +55,7 @@ def check_router_file(
 ) -> list[ConfigError]:
     """Return all mistakes in a router's configuration file; `offline` as in `check_service`.
 
-    `replaced`: of `listen` and `connect` those that are given elsewhere, in place of the file's.
+    `replaced`: `listen` or `connect` if other settings override the file's.
     """
     try:
         config = read_router_config(path)
@@ -63,11 +63,11 @@ def check_router_file(
         return [exc]
     if offline:
         return []
-    found: list[tuple[str, str]] = []  # a value of the file and the reason against it
+    found: list[tuple[str, str]] = []  # a value in the file, and its mistake or ""
     for name, endpoints, probe in (("listen", config.listen, _try_listen), ("connect", config.connect, reach_endpoint)):
         for endpoint in endpoints if name not in replaced else ():
             try:
-                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:  # others have no HOST:PORT
+                if endpoint.partition("/")[0] in {"tcp", "tls", "udp", "ws", "quic"}:  # the others have no HOST:PORT
                     check_endpoints([endpoint], where=name)
                 found.append((endpoint, _reason(probe(endpoint))))
             except ConfigError as exc:
@@ -81,7 +81,7 @@ def check_router_file(
 
 
 def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool = False) -> Iterator[ConfigError]:
-    """Yield each source that cannot be opened by a service with these endpoints, or publishes an address twice."""
+    """Yield a mistake for each source that cannot be opened, or publishes an address of another source."""
     plan, mistakes = plan_sources(settings, tuple(endpoints))
     yield from mistakes
     publishers: dict[Address, Planned] = {}
@@ -93,7 +93,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
         same = next((address for address in addresses if address in publishers), None)
         if same is not None and "vehicle" not in settings.left_out:
             other = publishers[same].text
-            reason = f"it publishes {same}, as source {other!r} does: give one of the two another vehicle"
+            reason = f"publishes {same}, like source {other!r}: give one of them another vehicle"
         if reason:
             yield locate_source(settings, planned.index, ConfigError(f"source {planned.text!r}", reason))
         for address in addresses:
@@ -101,7 +101,7 @@ def check_sources(settings: Settings, endpoints: Iterable[str], *, offline: bool
 
 
 def _addresses(planned: Planned, *, offline: bool) -> Collection[Address]:
-    """Return the addresses of a replay, or of the vehicles that a live source names."""
+    """Return the addresses of a replay, or the positions of vehicles named by a live source."""
     spec = parse_source(planned.text)
     if isinstance(planned.source, LiveSource):
         named = {getattr(spec.options, "vehicle", None), *getattr(spec.options, "vehicles", {}).values()}
@@ -109,12 +109,12 @@ def _addresses(planned: Planned, *, offline: bool) -> Collection[Address]:
     if offline and SOURCE_KINDS[spec.kind].target == "FILE":
         return ()
     run = planned.source.open()
-    with closing(run.messages):  # type: ignore[type-var] # each is a generator
+    with closing(run.messages):  # type: ignore[type-var] # replays are generators
         return run.addresses
 
 
 def _try_listen(endpoint: str) -> Finding | None:
-    """Return a finding if the address is none of this host; its port may be taken by the service to be replaced."""
+    """Return a finding if the address is not of this host; ignore the port, which a running service may occupy."""
     parts = split_endpoint(endpoint)
     if parts is None:  # a socket in the file system
         return None
@@ -123,12 +123,12 @@ def _try_listen(endpoint: str) -> Finding | None:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
             probe.bind((host, 0))
     except (OSError, UnicodeError):
-        return Finding("endpoint", endpoint, "wrong", f"{host} is no address of this host")
+        return Finding("endpoint", endpoint, "wrong", f"{host} is not an address of this host")
     return None
 
 
 def _reason(finding: Finding | None) -> str:
-    """Return the text of a mistake in the settings, "" for none; a missing package is none, and is logged."""
+    """Return a finding as the text of a mistake, "" for none; a missing package is only logged."""
     if finding is None or finding.state == "ok":
         return ""
     subject = f"{finding.subject}: " if finding.check == "endpoint" or finding.state == "unknown" else ""

@@ -1,4 +1,4 @@
-"""The examination: all checks in order, each with a time limit."""
+"""The examination: runs all checks, each with a time limit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .prober import check_endpoint, check_tls_files
 
 Check = Callable[[], Iterable[Finding]]
 _LISTEN: Final = 3.0  # s
-_ENDPOINTS_TIMEOUT: Final = 9.0  # s for all checks before a router is joined, side by side
+_ENDPOINTS_TIMEOUT: Final = 9.0  # s for the checks before joining a router, which run in parallel
 _NETWORK_TIMEOUT: Final = 12.0  # s
 _OPEN_TIMEOUT: Final = 1.5  # s
 _MAX_ROUTERS: Final = 8
@@ -32,12 +32,12 @@ _MAX_ROUTERS: Final = 8
 def examine(
     settings: Settings, *, version: str, vehicle: str | None = None, mavlink: str | None = None, listen: float = _LISTEN
 ) -> list[Finding]:
-    """Return the findings of all checks with these settings, the worst last; within 10 s where nothing answers.
+    """Run all checks and return their findings, the worst last; takes up to 10 s if no router answers.
 
-    `version` is that of this nedbus; `vehicle` is probed for whether it may be written; `mavlink` is a link to listen
-    to, such as `udpin:0.0.0.0:14550`; `listen`: seconds for which messages and packets are awaited.
+    `version`: of this nedbus. `vehicle`: examine only this one, and test the permission to write it. `mavlink`: link
+    to listen to, such as `udpin:0.0.0.0:14550`. `listen`: time to wait for messages and packets [s].
 
-    Raises ConfigError for a link that is invalid.
+    Raises ConfigError for an invalid link.
     """
     tls_findings, tls = check_tls_files(settings)
     findings = [*_describe_settings(settings), *(finding for _, finding in tls_findings)]
@@ -50,7 +50,7 @@ def examine(
     findings += _run_together(checks, _ENDPOINTS_TIMEOUT)
     answering = [each.subject for each in findings if (each.check, each.state) == ("endpoint", "ok")]
     if answering:
-        for index, each in enumerate(findings):  # one router is joined: no other one is a reason for silence
+        for index, each in enumerate(findings):  # one router is enough: the others do not explain silence
             if each.check == "endpoint" and each.state == "wrong":
                 findings[index] = replace(each, state="warning")
         seen = Observation(settings.prefix, version, vehicle)
@@ -60,21 +60,21 @@ def examine(
 
 
 def _describe_settings(settings: Settings) -> Iterator[Finding]:
-    """Yield the routers to join and the other settings, with the flag, variable or file that sets each."""
+    """Yield the routers and the other settings, each with the flag, variable or file that sets it."""
     setters = {name: setter for name in Settings.model_fields if (setter := settings.set_by(name))}
     setters = {name: f"--{name.replace('_', '-')}" if setter == name else setter for name, setter in setters.items()}
     setter = next((setters[name] for name in ("connect", "listen", "router_config") if name in setters), "")
-    text = f"set by {setter}" if setter else "the default: nothing sets connect"
-    advice = "" if setter else "a router on another host is named with --connect, NEDBUS_CONNECT or in nedbus.toml"
+    text = f"set by {setter}" if setter else "the default"
+    advice = "" if setter else "for a router on another host, use --connect, NEDBUS_CONNECT or nedbus.toml"
     yield Finding("settings", "connect", "ok", f"{' or '.join(settings.routers)}, {text}", advice)
     if others := ", ".join(f"{name} by {setter}" for name, setter in setters.items() if name != "connect"):
         yield Finding("settings", "others", "ok", f"set: {others}")
 
 
 def _check_sources(settings: Settings) -> Iterator[Finding]:
-    """Yield the mistakes in the sources, in the words of `nedbus check`."""
+    """Yield the mistakes in the sources, as reported by `nedbus check`."""
     for mistake in check_sources(settings, settings.routers) if settings.source else ():
-        yield Finding("settings", mistake.where, "wrong", mistake.reason, "correct it, then start the service again")
+        yield Finding("settings", mistake.where, "wrong", mistake.reason, "correct it and restart the service")
 
 
 def check_network(seen: Observation, router: str, tls: Tls | None, listen: float) -> Iterator[Finding]:
@@ -89,9 +89,9 @@ def check_network(seen: Observation, router: str, tls: Tls | None, listen: float
 
 
 def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> list[Finding]:
-    """Run checks, by name and subject, each in a thread, and return their findings, in the order of the checks.
+    """Run checks, by name and subject, in parallel threads; return the findings in the order of the checks.
 
-    A check that fails, or takes longer, is a finding itself; its thread ends with its own timeouts.
+    A check that fails, or takes longer than `seconds`, becomes a finding itself; its thread ends by its own timeouts.
     """
     found: dict[tuple[str, str], list[Finding]] = {}
 
@@ -99,7 +99,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         try:
             found[name] = list(check())
         except (NedbusError, OSError) as exc:
-            found[name] = [Finding(*name, "wrong", f"could not be examined: {exc}")]
+            found[name] = [Finding(*name, "wrong", f"check failed: {exc}")]
 
     threads = [
         threading.Thread(target=run, args=each, name=f"nedbus-{each[0][0]}", daemon=True) for each in checks.items()
@@ -109,7 +109,7 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
         thread.start()
     for thread in threads:
         thread.join(max(0.0, end - time.monotonic()))
-    late, advice = f"no result within {seconds:g} s", "try again; if it stays so, a name server may not answer"
+    late, advice = f"no result within {seconds:g} s", "try again; if it persists, a DNS server may not be answering"
     for name in checks:
         found.setdefault(name, [Finding(*name, "wrong" if name[0] == "endpoint" else "unknown", late, advice)])
     return [each for name in checks for each in found[name]]

@@ -1,4 +1,4 @@
-"""Check of a MAVLink link: nothing, no MAVLink, heartbeats only, or positions. Needs the extra `mavlink`."""
+"""Check of a MAVLink link for packets, messages and positions; needs the extra `mavlink`."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _SYSTEM: Final = 245  # ours, as in the source
 
 
 def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
-    """Listen to a link for `listen` seconds and yield the findings; raise ConfigError for an invalid one."""
+    """Listen to a link for `listen` seconds and yield the findings; raise ConfigError for an invalid link."""
     try:
         with closing(open_link(link, baud=_BAUD)) as opened:
             senders, systems = _listen(opened, listen)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
-        advice = "check the link: address, port or device, and permissions"
+        advice = "check address, port or device, and permissions"
         if is_taken:
-            advice = "if 'nedbus serve' has the port all is well, else stop what 'ss -ulpn' names, or take another port"
+            advice = "fine if 'nedbus serve' uses the port; else stop the process shown by 'ss -ulpn', or use another"
         yield Finding("mavlink", link, "warning" if is_taken else "wrong", exc.reason, advice)
         return
     if not senders:
-        advice = "does the vehicle send to this host and port ('mavlink status' in PX4's shell)? a firewall, a router?"
-        yield Finding("mavlink", link, "wrong", f"nothing arrives within {listen:g} s", advice)
+        advice = "check that the vehicle sends to this host and port ('mavlink status' in PX4's shell), and firewalls"
+        yield Finding("mavlink", link, "wrong", f"no packet within {listen:g} s", advice)
     elif not systems:
-        seen = f"{senders.total()} packets from {list_names(sorted(senders))} that are not MAVLink"
-        advice = "does another program send there? take another port, or the baud rate of the vehicle"
+        seen = f"{senders.total()} packets from {list_names(sorted(senders))}, none of them MAVLink"
+        advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
     yield from limit_findings(
         _judge_system(f"{link} system {system}", link, counts, listen) for system, counts in sorted(systems.items())
@@ -48,7 +48,7 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
 
 
 def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter[str]]]:
-    """Return the number of packets by sender, and of messages by system and type."""
+    """Count packets by sender, and messages by system and type."""
     senders: Counter[str] = Counter()
     systems: dict[int, Counter[str]] = {}
     end, next_heartbeat = time.monotonic() + seconds, 0.0
@@ -58,7 +58,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
         dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
     )
     while (now := time.monotonic()) < end:
-        if link.peer is not None and now >= next_heartbeat:  # a peer that does not know us sends nothing
+        if link.peer is not None and now >= next_heartbeat:  # the peer sends only to known addresses
             next_heartbeat = now + 1.0
             link.send(heartbeat.pack(sender), link.peer)
         for data, peer in link.read(_READ_TIMEOUT):
@@ -68,7 +68,7 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
             if not link.stream:
                 parser = _new_parser()
             for message in parser.parse_buffer(data) or []:
-                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # which have no header
+                if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
                     systems.setdefault(message.get_srcSystem(), Counter())[message.get_type()] += 1  # 255 at most
     return senders, systems
 
@@ -77,12 +77,12 @@ def _judge_system(name: str, link: str, counts: Counter[str], seconds: float) ->
     types = list_names(type_ for type_, _ in counts.most_common())
     if counts[_POSITION]:
         seen = f"{_POSITION} at {counts[_POSITION] / seconds:.0f} Hz, of {types}"
-        advice = "" if counts["ODOMETRY"] else "without ODOMETRY evh and evv are not provided: the source requests it"
+        advice = "" if counts["ODOMETRY"] else "evh and evv need ODOMETRY, which 'nedbus serve' requests"
         return Finding("mavlink", name, "ok", seen, advice)
     seen = "HEARTBEAT only" if set(counts) == {"HEARTBEAT"} else f"no {_POSITION}: {types}"
     advice = (
-        f"'nedbus serve --source mavlink:{link}' requests it; if it stays so, PX4 has no estimate yet, or"
-        f" 'mavlink stream -s {_POSITION} -r 30' in its shell switches it on"
+        f"'nedbus serve --source mavlink:{link}' requests it; if none arrives, PX4 may have no estimate yet, or needs"
+        f" 'mavlink stream -s {_POSITION} -r 30' in its shell"
     )
     return Finding("mavlink", name, "warning", seen, advice)
 

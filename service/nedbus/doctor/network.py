@@ -1,4 +1,4 @@
-"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks, keys of others."""
+"""Checks of the network behind a router: sessions, permissions, services, vehicles, clocks, other keys."""
 
 from __future__ import annotations
 
@@ -12,113 +12,113 @@ from nedbus_msgs import Address, get_topic
 from .finding import Finding, State, brief, list_names
 from .observation import Observation
 
-_NEARLY_FULL: Final = 0.8  # of the sessions that a router accepts
+_NEARLY_FULL: Final = 0.8  # fraction of a router's max_sessions
 _ACCESS_RULES: Final = "see access_control in the router's file (config/router-secure.json5), and docs/security.md"
-_MAX_TEXT: Final = 300  # characters of a text from a peer
-_SILENT_PERIODS: Final = 3.0  # of a topic, without a message
+_MAX_TEXT: Final = 300  # characters of text from a peer
+_SILENT_PERIODS: Final = 3.0  # periods of a topic without a message
 _CLOCK_WARNING: Final = 0.5  # s
 _CLOCK_WRONG: Final = 5.0  # s
-_SYNCHRONISE: Final = "run NTP or PTP on both hosts: 'timedatectl' says whether a clock is synchronised"
+_SYNCHRONISE: Final = "run NTP or PTP on both hosts; check them with 'timedatectl'"
 
 
 def check_routers(seen: Observation) -> Iterator[Finding]:
-    """Yield the number of sessions of each router; a warning if it is nearly full."""
+    """Yield the number of sessions of each router; warn if it is nearly full."""
     if not seen.routers:
-        yield Finding("router", "", "ok", "joined; its other sessions are not shown to this client")
+        yield Finding("router", "", "ok", "connected; its other sessions are not visible to this client")
     for router in seen.routers:
-        text = f"sessions that are connected: {router.sessions:,}"
+        text = f"connected sessions: {router.sessions:,}"
         if router.max_sessions is not None:
             text = f"{router.sessions:,} of {router.max_sessions:,} sessions"
         is_nearly_full = router.load is not None and router.load >= _NEARLY_FULL
-        advice = "raise max_sessions and its limit of open files, or run a second router: docs/hosts.md"
+        advice = "raise max_sessions and the limit of open files, or run a second router: docs/hosts.md"
         state: State = "warning" if is_nearly_full else "ok"
         yield Finding("router", router.zid, state, text, advice if is_nearly_full else "")
 
 
 def check_permissions(seen: Observation) -> Iterator[Finding]:
-    """Yield the permission to read, by the messages that arrive, and to write a vehicle, by a probe."""
+    """Yield the read permission, derived from received messages, and the write permission, tested by a probe."""
     reading = _check_reading(seen)
     yield reading
     vehicle = seen.vehicle
     if vehicle is None:
         advice = "test it with 'nedbus doctor --vehicle 1'"
-        yield Finding("write", "", "unknown", "write access was not tested", advice)
+        yield Finding("write", "", "unknown", "write permission not tested", advice)
     elif seen.verdict == "allowed":
-        yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe came back")
-    elif seen.verdict == "denied":  # no fault of a reader
+        yield Finding("write", vehicle, "ok", f"this client may publish vehicle {vehicle}: a probe arrived")
+    elif seen.verdict == "denied":  # not a fault of a reader
         state: State = "warning" if reading.state == "unknown" else "ok" if reading.state == "ok" else "wrong"
-        text = f"the router drops what this client publishes as vehicle {vehicle}, without an error"
-        advice = f"a reader needs no more; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
+        text = f"the router silently drops messages that this client publishes as vehicle {vehicle}"
+        advice = f"fine for a reader; to publish, use the certificate of that vehicle; {_ACCESS_RULES}"
         yield Finding("write", vehicle, state, text, advice)
     else:
-        text = f"cannot be told: the router does not let this client read a probe of vehicle {vehicle}"
-        advice = f"allow {seen.prefix}/*/@doctor/* as config/router-secure.json5 does, or look from a reader"
+        text = f"unknown: the router does not let this client read a probe of vehicle {vehicle}"
+        advice = f"allow {seen.prefix}/*/@doctor/* like config/router-secure.json5, or run the doctor as a reader"
         yield Finding("write", vehicle, "unknown", text, advice)
 
 
 def _check_reading(seen: Observation) -> Finding:
     if seen.flowing or seen.ages:
-        return Finding("read", "", "ok", "this client may read: messages arrive")
+        return Finding("read", "", "ok", "this client may read: it receives messages")
     published = _published(seen)
     if not published:
-        return Finding("read", "", "unknown", "whether this client may read cannot be told: nothing is published")
-    text = f"services say that they publish {list_names(published)}, and nothing of it arrives here"
+        return Finding("read", "", "unknown", "read permission not tested: nothing is published")
+    text = f"services report that they publish {list_names(published)}, but no message arrives here"
     if seen.verdict == "allowed":
-        advice = "a vehicle's certificate is for writing: look with that of a reader"
+        advice = "a vehicle's certificate is for writing: use that of a reader"
         return Finding("read", "", "warning", text, advice)
-    advice = f"may those services write these vehicles, and may this client read? {_ACCESS_RULES}"
+    advice = f"check that these services may write, and this client may read these vehicles; {_ACCESS_RULES}"
     return Finding("read", "", "wrong", text, advice)
 
 
 def check_services(seen: Observation) -> Iterator[Finding]:
     """Yield the findings on the version and the sources of each service."""
     for service in (each.status for each in seen.services):
-        name = f"service {brief(service.service)}"
+        name = brief(service.service)
         theirs = brief(service.version or "unknown")
         if theirs.split(".")[:2] != seen.version.split(".")[:2]:
-            advice = "install the same version on both sides; docs and CHANGELOG say what changed on the wire"
-            yield Finding("version", name, "warning", f"it is nedbus {theirs}, this is {seen.version}", advice)
+            advice = "install the same version on both sides; CHANGELOG.md lists changes of the wire format"
+            yield Finding("version", name, "warning", f"nedbus {theirs} there, {seen.version} here", advice)
         findings = [finding for source in service.sources for finding in _check_source(source)]
         yield from findings
         if all(finding.state == "ok" for finding in findings):
             host = brief(service.host or "an unknown host")
-            text = f"nedbus {theirs} on {host}, its sources have no fault: {len(service.sources)}"
+            text = f"nedbus {theirs} on {host}, sources without faults: {len(service.sources)}"
             yield Finding("service", name, "ok", text)
     if not seen.services:
-        advice = "'nedbus serve' is one; a script that publishes by itself is none"
+        advice = "start one with 'nedbus serve'; publishing scripts do not count as services"
         yield Finding("service", "", "unknown", "no nedbus service answers", advice)
 
 
 def _published(seen: Observation) -> list[str]:
-    """Return the addresses that services say they publish."""
+    """Return the addresses that services report as published."""
     return sorted({brief(address) for source in seen.sources for address in source.addresses})
 
 
 def _check_source(source: SourceStatus) -> Iterator[Finding]:
     name, state = brief(source.source), source.state
-    error = (source.error or "it does not say why")[:_MAX_TEXT]
+    error = (source.error or "unknown reason")[:_MAX_TEXT]
     if state in {"failed", "retrying"}:
-        ends = "it has ended" if state == "failed" else "it is tried again"
-        yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; the log of its service says more")
+        ends = "it has stopped" if state == "failed" else "it is being restarted"
+        yield Finding("source", name, "wrong", f"{state}: {error}", f"{ends}; see the log of its service")
     elif state in {"waiting", "starting"}:
-        advice = "is its vehicle on, does it send here? for MAVLink see 'nedbus doctor --mavlink LINK' on its host"
-        yield Finding("source", name, "warning", f"{state}: nothing has arrived yet", advice)
+        advice = "check that its vehicle is on and sends here; for MAVLink run 'nedbus doctor --mavlink LINK' there"
+        yield Finding("source", name, "warning", f"{state}: no message yet", advice)
     if source.silent:
-        advice = "if the vehicle has them, its PX4 loses them: no line of its zenoh/pub.csv may have rel=: docs/live.md"
-        seen = f"announced, and nothing arrives while other topics do: {list_names(source.silent, 20)}"
+        advice = "PX4 may be losing them: remove rel= from all lines of its zenoh/pub.csv, see docs/live.md"
+        seen = f"announced, but silent while other topics arrive: {list_names(source.silent, 20)}"
         yield Finding("source", name, "warning", seen, advice)
     if source.not_carried:
-        advice = "to carry them, give PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
-        seen = f"vehicles publish messages that it does not carry: {list_names(source.not_carried, 20)}"
+        advice = "to carry them, pass PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
+        seen = f"published by vehicles, but not carried: {list_names(source.not_carried, 20)}"
         yield Finding("source", name, "ok", seen, advice)
     if stale := [address for address in source.stale if address not in source.silent]:
-        advice = "is the vehicle on, is its link up? they come back by themselves"
-        seen = f"nothing arrives any more of {list_names(stale)}"
+        advice = "check that the vehicle is on and its link is up; they recover by themselves"
+        seen = f"no more messages of {list_names(stale)}"
         yield Finding("source", name, "warning", seen, advice)
     if source.rejected > 0:
         why = f": {list_names(source.rejections)}" if source.rejections else ""
-        advice = "'nedbus echo' shows nothing of these; reasons are in the log of the service and on @rejected keys"
-        yield Finding("source", name, "warning", f"{source.rejected} messages were rejected{why}", advice)
+        advice = "rejected messages are not published; the log of the service and @rejected keys have the reasons"
+        yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:
@@ -131,28 +131,28 @@ def check_vehicles(seen: Observation) -> Iterator[Finding]:
     yield from _check_states(seen)
     shown = set(map(str, known))
     hidden = [each for each in _published(seen) if each not in shown and vehicle in (None, each.partition("/")[0])]
-    for each in hidden if arrived or seen.ages else ():  # else nothing at all may be read
-        advice = "may that service write this vehicle? a router drops what its rules do not allow: docs/security.md"
-        yield Finding("vehicle", each, "wrong", "a service says that it publishes it, and nothing arrives", advice)
+    for each in hidden if arrived or seen.ages else ():  # else this client may read nothing at all
+        advice = "check that the router's access rules allow that service to write this vehicle: docs/security.md"
+        yield Finding("vehicle", each, "wrong", "reported as published by a service, but no message arrives", advice)
     if flowing := [address for address in known if address in arrived]:
         vehicles = {address.vehicle for address in flowing}
         yield Finding("vehicle", "", "ok", f"messages arrive; vehicles: {len(vehicles)}, topics: {len(flowing)}")
     if not known and not hidden:
         advice = "start its source: 'nedbus serve --source ...'"
         if seen.services:
-            advice = "a service answers: what is said of its sources is the reason, or they publish other vehicles"
-        text = f"{'no vehicle is' if vehicle is None else 'it is not'} seen under {seen.prefix}/"
+            advice = "a service answers: see the findings on its sources; they may publish other vehicles"
+        text = f"{'no vehicle' if vehicle is None else 'not'} seen under {seen.prefix}/"
         state: State = "warning" if vehicle is None else "wrong"
         yield Finding("vehicle", vehicle or "", state, text, advice)
 
 
 def _check_states(seen: Observation) -> Iterator[Finding]:
-    """Yield the vehicles that services know to be bad, or to be watched."""
+    """Yield the vehicles that services report with severity bad or watch."""
     for name, (now, told) in sorted(merge_vehicles(seen.accounts).items()):
         if seen.vehicle not in (None, name) or told.severity == "info" or told.is_forgotten(now):
             continue
         state: State = "wrong" if told.severity == "bad" else "warning"
-        advice = f"'nedbus why --vehicle {name}' says what preceded it"
+        advice = f"see the events before it with 'nedbus why --vehicle {name}'"
         yield Finding("vehicle", name, state, f"{told.text[:_MAX_TEXT]}{since_text(told.since, now)}", advice)
 
 
@@ -161,30 +161,30 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
     stream = seen.streams.get(key)
     age, rate = seen.ages.get(address), get_topic(address.topic).rate
     if not flows and rate and (seen.listened if age is None else age) > _SILENT_PERIODS / rate:
-        last = "it has sent nothing yet" if address not in seen.ages else "its last message has no timestamp"
+        last = "no message yet" if address not in seen.ages else "its last message has no timestamp"
         if age is not None:
             last = f"its last message is {to_age(age)} old"
-        advice = "its publisher runs: look at what it reads, the source of a service or the loop of a script"
-        state: State = "wrong" if address in seen.ages else "warning"  # of a replay some begin later
+        advice = "its publisher is running: check its input, the source of a service or the loop of a script"
+        state: State = "wrong" if address in seen.ages else "warning"  # topics of a replay may begin later
         yield Finding("vehicle", name, state, f"alive, but silent for {seen.listened:.0f} s: {last}", advice)
     if stream is not None and stream.error:
-        advice = "is the publisher of this key nedbus? a newer layout needs a newer nedbus here"
-        yield Finding("vehicle", name, "wrong", f"a payload that cannot be decoded: {stream.error[:_MAX_TEXT]}", advice)
+        advice = "check that the publisher of this key is nedbus; a newer layout needs a newer nedbus here"
+        yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {stream.error[:_MAX_TEXT]}", advice)
     if stream is not None and len(stream.publishers) > 1:
-        advice = "their messages alternate for every reader: give one of the two another --vehicle, or stop it"
+        advice = "readers receive a mixture of both: give one of them another --vehicle, or stop it"
         yield Finding("vehicle", name, "wrong", f"{len(stream.publishers)} publishers of this address", advice)
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:
-    """Yield the clocks that are off; where all others agree and this host's does not, it is this host's."""
-    clocks = {  # how far each is ahead of ours, and how well that is known [s]
+    """Yield the clocks that are off; if all others agree with each other, that of this host is off."""
+    clocks = {  # offset from the clock of this host, and its uncertainty [s]
         f"service {brief(each.status.service)} on {brief(each.status.host)}": (each.offset, each.error)
         for each in seen.services
         if each.offset is not None
     }
     for stream in seen.streams.values():
         if stream.address is not None and stream.delay is not None:
-            error = 0.0 if stream.delay < 0 else _CLOCK_WARNING  # the network delays messages, too
+            error = 0.0 if stream.delay < 0 else _CLOCK_WARNING  # a positive delay includes that of the network
             clocks[f"publisher of {stream.address}"] = (-stream.delay, error)
     off = {name: offset for name, (offset, error) in clocks.items() if abs(offset) > _CLOCK_WARNING + error}
     if len(off) > 1 and len(off) == len(clocks) and max(off.values()) - min(off.values()) < _CLOCK_WARNING:
@@ -192,9 +192,9 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         others = f"{len(off)} others, which agree with each other"
         yield _judge_clock("this host", "this host's clock", -middle, others, _SYNCHRONISE)
         return
-    blame = "the others agree with this host: set its clock."
+    blame = "the other clocks agree with this host: set this one."
     if len(clocks) == len(off):
-        blame = "which of the two is off cannot be told from here."
+        blame = "either of the two may be off."
     for name, offset in off.items():
         yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:
@@ -208,27 +208,29 @@ def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: s
 
 
 def check_other_keys(seen: Observation) -> Iterator[Finding]:
-    """Yield the prefixes and the topics of ROS 2 that readers of this prefix do not receive."""
+    """Yield other prefixes and topics of ROS 2, which readers of this prefix do not receive."""
     prefixes = sorted({prefix for key in seen.elsewhere if (prefix := _prefix_of(key))})
     for prefix in prefixes[:5]:
-        advice = f"to read them: --prefix {prefix}, or NEDBUS_PREFIX={prefix}; else give their publisher our prefix"
-        text = f"messages are published under {prefix}/, and this looks under {seen.prefix}/"
+        advice = (
+            f"to read them, use --prefix {prefix} or NEDBUS_PREFIX={prefix}, or correct the prefix of the publisher"
+        )
+        text = f"messages are published under {prefix}/, but the prefix here is {seen.prefix}/"
         yield Finding("prefix", prefix, "warning", text, advice)
     if seen.ros2 and not any(each.source.startswith("px4-zenoh:") for each in seen.sources):
         topics = list_names(sorted({f"/{token.key.topic}" for token in seen.ros2}))
         advice = "'nedbus serve --source px4-zenoh:' bridges them"
-        yield Finding("ros2", "", "warning", f"ROS 2 or a PX4 publishes {topics}, and no service bridges it", advice)
+        yield Finding("ros2", "", "warning", f"ROS 2 or PX4 publishes {topics}, but no service bridges it", advice)
 
 
 def _prefix_of(key: str) -> str:
-    """Return the prefix of a key of nedbus: the chunks before vehicle and topic."""
+    """Return the prefix of a nedbus key: the chunks before vehicle and topic."""
     vehicle, alive, _ = key.partition("/@alive/")
     before = vehicle.split("/")[: -1 if alive else -2]
-    # `<domain>/fmu/out/vehicle_local_position` and the like belong to ROS 2.
+    # Keys such as `<domain>/fmu/out/vehicle_local_position` belong to ROS 2.
     return "" if not before or before[0].isdecimal() else "/".join(before)
 
 
 NETWORK_CHECKS: Final = (
     check_routers, check_permissions, check_services, check_vehicles, check_clocks, check_other_keys,
 )  # fmt: skip
-"""The checks of the network behind a router; those before it are called in `examine`."""
+"""Checks of the network behind a router; `examine` calls those before it."""

@@ -1,4 +1,4 @@
-"""Observe a network for a few seconds: services, tokens, messages, routers; the checks judge it."""
+"""Observation of a network for a few seconds: services, tokens, messages and routers, input of the checks."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address, DecodeError, Selection
 
 T = TypeVar("T")
 
-_MIN_LISTEN: Final = 1.0  # s after all queries, for the delay of messages
-_POLL: Final = 0.02  # s; it makes a message look that much older
+_MIN_LISTEN: Final = 1.0  # s after all queries, to measure the delay of messages
+_POLL: Final = 0.02  # s; also the error of that delay
 _QUERY_TIMEOUT: Final = 1.0  # s
-_MAX_TIME: Final = 1e11  # s since the epoch that a service may report
+_MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
 _MAX_SERVICES: Final = 20  # any peer may claim to be a service
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
 _MAX_PUBLISHERS: Final = 8  # of each key
-_RING: Final = 16_384  # samples of a subscription that wait
+_RING: Final = 16_384  # samples buffered per subscription
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """The status of a service as it reports it, and its clock: ahead of ours by `offset` +- `error` [s]."""
+    """The status reported by a service, and its clock: `offset` +- `error` ahead of ours [s]."""
 
     status: ServiceStatus
     offset: float | None
@@ -53,11 +53,11 @@ class Service:
 
 @dataclass(slots=True)
 class Stream:
-    """The messages and heartbeats on one key; `address` is None for a key that is not one of nedbus.
+    """Messages and heartbeats on one key; `address` is None for a key that is not a nedbus key.
 
     `flows`: True once a message has arrived.
-    `delay`: the least time from sent to received, by the clocks of both hosts [s], None without timestamps.
-    `publishers`: those that say so. `error`: why the last message that cannot be decoded cannot.
+    `delay`: minimum time from sent to received, by the clocks of both hosts [s]; None without timestamps.
+    `publishers`: names from messages and heartbeats. `error`: the last decoding error.
     """
 
     address: Address | None
@@ -67,7 +67,7 @@ class Stream:
     error: str = ""
 
     def add(self, sample: RawSample) -> None:
-        """Add a message that has just arrived."""
+        """Add a received message."""
         self.flows = True
         age, info = _age_of(sample), sample.source_info
         if age is not None:
@@ -82,20 +82,20 @@ class Stream:
                 self.error = str(exc)
 
     def add_publisher(self, name: str) -> None:
-        """Add a publisher, by its message or its heartbeat."""
+        """Add the publisher of a message or heartbeat."""
         if len(self.publishers) < _MAX_PUBLISHERS:
             self.publishers.add(name)
 
 
 @dataclass(slots=True)
 class Observation:
-    """A network as this client sees it, and the question to the doctor.
+    """A network as seen by this client, and the scope of the examination.
 
-    `version`: of this nedbus; `vehicle`: the one to look at, None for all; `verdict`: whether it may be written.
-    `alive`: addresses with a liveliness token; `ages`: of the last message that a publisher answers with [s].
-    `streams`: messages and heartbeats by key; `listened`: for how long [s].
-    `elsewhere`: keys of nedbus under other prefixes; `ros2`: publishers of ROS 2's keys.
-    `routers`: those that tell this client of their sessions; `accounts`: vehicles as services remember them.
+    `version`: of this nedbus; `vehicle`: the one to examine, None for all; `verdict`: its write permission.
+    `alive`: addresses with a liveliness token; `ages`: age of the last message returned by a publisher [s].
+    `streams`: messages and heartbeats by key; `listened`: duration of the observation [s].
+    `elsewhere`: nedbus keys under other prefixes; `ros2`: publishers of ROS 2 topics.
+    `routers`: routers that disclose their sessions; `accounts`: histories of vehicles kept by services.
     """
 
     prefix: str
@@ -119,11 +119,11 @@ class Observation:
 
     @property
     def flowing(self) -> set[Address]:
-        """The addresses of which messages have arrived."""
+        """Addresses with at least one received message."""
         return {each.address for each in self.streams.values() if each.flows and each.address is not None}
 
     def observe(self, session: Session, *, listen: float) -> None:
-        """Listen and ask, for little more than `listen` seconds."""
+        """Query and listen for little more than `listen` seconds."""
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
@@ -143,7 +143,7 @@ class Observation:
         others = {key for key in tokens if not key.startswith("@")}
         self._add_messages(take_messages())
         for stream in self.streams.values():
-            stream.delay = None  # these have waited for the queries above, and are older than they look
+            stream.delay = None  # these messages waited during the queries, and appear delayed
         end = max(start + listen, time.monotonic() + _MIN_LISTEN)
         while time.monotonic() < end:
             time.sleep(_POLL)
@@ -162,7 +162,7 @@ class Observation:
                 stream.add(sample)
 
     def _stream(self, key: str) -> Stream | None:
-        """Return the stream on a key, None for one too many."""
+        """Return the stream of a key; None beyond the limit of keys."""
         if key not in self.streams and len(self.streams) < _MAX_KEYS and len(key) <= _MAX_KEY_LENGTH:
             self.streams[key] = Stream(next(iter(_parse_each(self._address_of, [key])), None))
         return self.streams.get(key)
@@ -172,7 +172,7 @@ class Observation:
 
 
 def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSample]]:
-    """Return a function that takes the samples that have arrived, at most a full ring; dropping it ends the stream."""
+    """Return a function that drains received samples, at most one full ring; deleting it ends the subscription."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_RING)
     with while_open():
         subscriber = session.declare_subscriber(key_expr, channel)
@@ -180,7 +180,7 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
 
 
 def _ask_services(session: Session, prefix: str) -> list[Service]:
-    """Return the services that answer; they read their clocks within the round trip."""
+    """Return the answering services; they read their clocks within the round-trip time."""
     before = time.time()
     statuses = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)
     error = (time.time() - before) / 2
@@ -192,13 +192,13 @@ def _ask_services(session: Session, prefix: str) -> list[Service]:
 
 
 def _age_of(sample: RawSample) -> float | None:
-    """Return the age of a sample by the clock of its publisher [s], None without a timestamp."""
+    """Return the age of a sample by its publisher's clock [s]; None without a timestamp."""
     stamp = sample.timestamp
     return None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:
-    """Parse keys, without those that cannot be parsed."""
+    """Parse keys; skip invalid ones."""
     parsed = []
     for key in keys:
         with suppress(ValueError):  # AddressError or DecodeError

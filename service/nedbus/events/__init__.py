@@ -1,52 +1,21 @@
-"""Events of vehicles from their messages, live or of a file, and the answer to why; no I/O.
+"""Vehicle events and their explanations, derived from messages, live or from a file; no I/O.
 
-A new kind of event is a row of KINDS in `event.py`, its flags or thresholds in `rules.py`, and a finding of a detector
-in `detectors.py` or `position.py`.
+To add a kind of event: a row in KINDS (`event.py`), its flags or thresholds (`rules.py`), and a detector that yields
+the finding (`detectors.py` or `position.py`).
 """
 
 from .account import KEPT, Account
 from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State
 from .faults import VALID, Expectation, faults_of, merge_vehicles
-from .report import FORGOTTEN, QUESTION, AccountReport, VehicleReport, by_vehicle, from_json, report_of
+from .report import ACCOUNT_PARAMETER, FORGOTTEN, AccountReport, VehicleReport, by_vehicle, from_json, report_of
 from .rules import FIXES, MODES, RECENT
-from .story import Span, Story, about, spans_of, state_at, tell
+from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import Times, since_text, to_age, to_clock
 from .vehicle import Vehicle
 
 __all__ = [
-    "ALL",
-    "FIXES",
-    "FORGOTTEN",
-    "KEPT",
-    "KINDS",
-    "MODES",
-    "QUESTION",
-    "RECENT",
-    "SEVERITIES",
-    "VALID",
-    "WINDOW",
-    "Account",
-    "AccountReport",
-    "Condition",
-    "Event",
-    "Expectation",
-    "Severity",
-    "Span",
-    "State",
-    "Story",
-    "Times",
-    "Vehicle",
-    "VehicleReport",
-    "about",
-    "by_vehicle",
-    "faults_of",
-    "from_json",
-    "merge_vehicles",
-    "report_of",
-    "since_text",
-    "spans_of",
-    "state_at",
-    "tell",
-    "to_age",
-    "to_clock",
-]
+    "ACCOUNT_PARAMETER", "ALL", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MODES", "RECENT", "SEVERITIES", "VALID",
+    "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Severity", "Span", "State", "Story",
+    "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json", "merge_vehicles", "report_of",
+    "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age", "to_clock",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Event detectors: the changes of flags, modes, receivers and batteries that mean an event."""
+"""Event detectors for flags, flight modes, GNSS receivers and batteries."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _UNKNOWN_SATELLITES: Final = 255
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The meaning of a change of one message; the vehicle makes an event of it.
+    """A change detected in one message; Vehicle turns it into an event.
 
-    `on_ground`: its severity while the vehicle is disarmed, where that is another.
-    `first`: the text of an end where the condition has held since the first message.
-    `initial`: it held at the first message: a condition, and no event.
+    `on_ground`: the severity while the vehicle is disarmed, None if it is the same.
+    `first`: the text of an end if the condition has held since the first message.
+    `initial`: it already held in the first message, and becomes a condition without an event.
     """
 
     kind: str
@@ -37,7 +37,7 @@ class Finding:
 
 
 class FieldReader:
-    """Read fields of messages fast, from a model, a row, or fields by name, which may lack some: these are `absent`."""
+    """Fast access to fields of a model, a row, or a dict; fields that a dict lacks have the value `absent`."""
 
     def __init__(self, names: Sequence[str], absent: float | None = None) -> None:
         self.names, self._absent = tuple(names), absent
@@ -45,7 +45,7 @@ class FieldReader:
         self._of_fields: Callable[[Mapping[str, object]], tuple[Any, ...]] = itemgetter(*names)
 
     def __call__(self, message: object) -> tuple[Any, ...]:
-        """Return the values, in the order of the names."""
+        """Return the values in the order of `names`."""
         if type(message) is not dict:
             return self._of_message(message)
         try:
@@ -55,11 +55,11 @@ class FieldReader:
 
 
 class ChangeDetector:
-    """Detect the events of one stream; fast while none of the `compared` fields changes.
+    """Detector of one stream; fast as long as none of the `compared` fields changes.
 
-    `detect` yields findings from two messages, as fields by name: None for those that were not provided, and no fields
-    before the first message. `told` are fields that it gets beside the compared ones.
-    `stamp` and `earlier` are the timestamps of the last two messages [us].
+    `detect(before, after)` yields findings from the fields of two messages, by name: None for fields that were not
+    provided; `before` is empty at the first message. `context`: names of further fields that `detect` gets.
+    `stamp`, `earlier`: the timestamps of the last message and of the one before [us].
     """
 
     def __init__(
@@ -67,10 +67,10 @@ class ChangeDetector:
         compared: Sequence[str],
         detect: Callable[[Fields, Fields], Iterator[Finding]],
         *,
-        told: Sequence[str] = (),
+        context: Sequence[str] = (),
     ) -> None:
         self._read = FieldReader(("timestamp", *compared))
-        self._read_all = FieldReader(("timestamp", *compared, *told))
+        self._read_all = FieldReader(("timestamp", *compared, *context))
         self._detect = detect
         self._last: object = None
         self._state: tuple[Any, ...] = ()
@@ -78,7 +78,7 @@ class ChangeDetector:
         self.stamp = self.earlier = 0
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Add a message, of which `missing` fields were not provided; return None while nothing changes."""
+        """Return the findings of a message whose `missing` fields were not provided; None if nothing has changed."""
         values = self._read(message)
         self.earlier, self.stamp, state = self.stamp, values[0], values[1:]
         last, self._last = self._last, message
@@ -88,8 +88,8 @@ class ChangeDetector:
         self._state, self._missing = state, missing
         return self._detect(before, self._by_name(message, missing))
 
-    def forget(self) -> None:
-        """Begin anew: the vehicle has rebooted."""
+    def reset(self) -> None:
+        """Discard the state after a reboot of the vehicle."""
         self._last, self._state = None, ()
         self.stamp = self.earlier = 0
 
@@ -99,18 +99,18 @@ class ChangeDetector:
 
 
 class GpsDetector(ChangeDetector):
-    """Detect the events of a GNSS receiver: its fix, satellites, jamming and spoofing."""
+    """Detector of a GNSS receiver: fix, satellites, jamming and spoofing."""
 
     _NAMES: Final = ("fix_type", "satellites_used", "jamming_state", "jamming_indicator", "spoofing_state")
 
     def __init__(self) -> None:
         super().__init__(self._NAMES, self._detect_gps)
-        self._levels: dict[str, bool] = {}  # whether a value is beyond its threshold, by kind
+        self._active: dict[str, bool] = {}  # level conditions by kind
 
-    def forget(self) -> None:
-        """Begin anew: the vehicle has rebooted."""
-        super().forget()
-        self._levels.clear()
+    def reset(self) -> None:
+        """Discard the state after a reboot of the vehicle."""
+        super().reset()
+        self._active.clear()
 
     def _detect_gps(self, before: Fields, after: Fields) -> Iterator[Finding]:
         fix, was = after["fix_type"], before.get("fix_type")
@@ -143,19 +143,19 @@ class GpsDetector(ChangeDetector):
         yield from self._detect_level("spoofing", spoofed > 1, spoofed <= 1, text, {"state": spoofed})
 
     def _detect_level(self, kind: str, begins: bool, ends: bool, text: str, numbers: Fields) -> Iterator[Finding]:
-        """Yield a condition that begins beyond one threshold, and ends beyond another; the first value may begin it."""
-        initial, held = kind not in self._levels, self._levels.get(kind, False)
-        holds = self._levels[kind] = begins or (held and not ends)
+        """Yield the begin or end of a condition with hysteresis; it is initial if the first value begins it."""
+        initial, held = kind not in self._active, self._active.get(kind, False)
+        holds = self._active[kind] = begins or (held and not ends)
         if holds and not held:
-            calm = initial and kind == "few_satellites"  # a vehicle without GNSS has none
-            yield Finding(kind, "begin", "info" if calm else "watch", text, numbers=numbers, initial=initial)
+            is_info = initial and kind == "few_satellites"  # a vehicle may have no GNSS at all
+            yield Finding(kind, "begin", "info" if is_info else "watch", text, numbers=numbers, initial=initial)
         elif held and not holds:
             text = text if kind == "few_satellites" else f"{text}: over"
             yield Finding(kind, "end", "info", text, numbers=numbers)
 
 
 def make_detector(message: str) -> ChangeDetector | None:
-    """Return the detector of a stream of a message, None for one of which no change is an event."""
+    """Return a detector for a message type, None if it has no events."""
     flag_rules = rules.RULES.get(message, ())
     flags = [flag for rule in flag_rules for flag in rule.flags]
     match message:
@@ -166,16 +166,16 @@ def make_detector(message: str) -> ChangeDetector | None:
         case "SensorGps":
             return GpsDetector()
         case "BatteryStatus":
-            return ChangeDetector(["warning", "connected"], detect_battery, told=["remaining"])
+            return ChangeDetector(["warning", "connected"], detect_battery, context=["remaining"])
         case "VehicleLandDetected":
             return ChangeDetector(["landed"], detect_landing)
     return None
 
 
 def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the flags that begin and end; one that was not known, or is not known any more, is no event."""
+    """Yield the conditions that begin or end; a change from or to an unknown value is not an event."""
     for rule in flag_rules:
-        found: dict[tuple[bool, Change], list[str]] = {}  # by whether it is an event: initial conditions are none
+        found: dict[tuple[bool, Change], list[str]] = {}  # key: is an event, not an initial condition; change
         for name in rule.flags:
             was, now = before.get(name), after.get(name)
             if was is None and now == rule.bad and rule.initial:
@@ -194,7 +194,7 @@ def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fi
 
 
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the events of a VehicleStatus: armed and disarmed, mode, failsafe, link to the ground station."""
+    """Yield the findings of a VehicleStatus: arming, mode, failsafe, link to the ground station."""
     was, now = before.get("arming_state"), after["arming_state"]
     if now is not None and (was is None or (was == rules.ARMED) != (now == rules.ARMED)):
         kind = "armed" if now == rules.ARMED else "disarmed"
@@ -207,7 +207,7 @@ def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the events of a VehicleLandDetected."""
+    """Yield the findings of a VehicleLandDetected."""
     was, now = before.get("landed"), after["landed"]
     if was is not None and now is not None and was != now:
         kind, text = ("landed", "landed") if now else ("takeoff", "took off")
@@ -215,7 +215,7 @@ def detect_landing(before: Fields, after: Fields) -> Iterator[Finding]:
 
 
 def detect_battery(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield the warnings of a BatteryStatus; their severity grows with them."""
+    """Yield the battery warnings of a BatteryStatus."""
     warning, was = _warning_of(after), _warning_of(before) if before else 0
     if warning is None or was is None or was == warning:
         return

@@ -1,4 +1,4 @@
-"""Events, conditions and states of a vehicle; all kinds of events, and the evidence that may explain each."""
+"""Events, conditions and states of a vehicle, and the table of event kinds with their possible causes."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from pydantic import Field
 
 Severity = Literal["bad", "watch", "info"]
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
-"""The worst first: bad keeps a vehicle from its task, watch may become bad, info occurs in any flight."""
+"""Worst first. bad: the vehicle cannot do its task; watch: may become bad; info: part of any flight."""
 
 WINDOW: Final = 10.0
-"""Seconds before an event in which others count as evidence; of conditions that go on, the begin counts at any time."""
+"""Seconds before an event in which other events count as evidence; the begin of an active condition always does."""
 
 ALL: Final = "*"
-"""The vehicle of events of the link, and of the reader itself, which concern all."""
+"""Vehicle name of events that concern all vehicles: those of the link and of the reader itself."""
 
 Seconds = Annotated[float, Field(ge=0.0, le=1e11)]
-"""A time by the account's clock; the bounds apply to reports of peers."""
+"""A time by the account's clock [s]; the bounds validate reports of peers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Event:
     """One event of a vehicle.
 
-    `kind`: a key of KINDS. `change`: a condition begins or ends, or something happens once.
-    `time`: seconds by the clock of the account: since the epoch by this host's clock where messages arrive live, since
-    the start of a file otherwise. `boot`: seconds since the vehicle's boot; None where the vehicle has said nothing.
-    `numbers`: by name, in SI units and NED; `names`: flags, sensors, or what was before and after.
-    `lasted`: of an end, seconds since the begin; None where it began before the first message.
-    `evidence`: the events that may explain it and precede it by at most WINDOW, or began earlier and go on.
+    `kind`: a key of KINDS. `change`: "begin" or "end" of a condition, or "once".
+    `time`: seconds by the account's clock: since the epoch by the clock of this host (live), or since the start of a
+    file. `boot`: seconds since the vehicle's boot, None if no message has given it.
+    `numbers`: values by name, in SI units and NED. `names`: flags, sensors, or the values before and after.
+    `lasted`: duration of a condition that ends [s], None if it began before the first message.
+    `evidence`: possible causes: events at most WINDOW seconds earlier, and conditions that are still active.
     """
 
     vehicle: str
@@ -49,21 +49,22 @@ class Event:
 
     @property
     def identity(self) -> tuple[object, ...]:
-        """The same for one event of a vehicle in the reports of two services."""
+        """A key that is equal for the same event in the reports of two services."""
         return self.kind, self.time, self.names
 
     @property
     def is_notable(self) -> bool:
-        """True for a begin that is bad or to be watched, and for a change of mode: both belong to a story."""
+        """True if a story includes it: a begin or single event of severity bad or watch, or a change of mode."""
         return self.change != "end" and (self.severity != "info" or self.kind == "mode")
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A condition of a vehicle, its begin by the account's clock, and the event that began it.
+    """A condition of a vehicle.
 
-    `initial`: it held at the first message already: it began at an unknown time before.
-    `on_ground`: its severity while the vehicle is disarmed, where that is another.
+    `since`: its begin by the account's clock [s]. `begin`: the event that began it.
+    `initial`: it already held in the first message, so its real begin is unknown.
+    `on_ground`: the severity while the vehicle is disarmed, None if it is the same.
     """
 
     kind: str
@@ -77,7 +78,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The state of a vehicle now: severity ("info" is well), text, begin, and all conditions."""
+    """The state of a vehicle: severity ("info" if all is well), text and begin of the worst condition, all of them."""
 
     severity: Severity
     text: str
@@ -86,11 +87,12 @@ class State:
 
 
 def state_of(conditions: Iterable[Condition]) -> State:
-    """Return the state in which these conditions leave a vehicle: the worst one speaks for it."""
+    """Return the state of a vehicle with these conditions; the worst one gives severity, text and begin."""
     ordered = sorted(
         (each for each in conditions if each.severity != "info"),
         key=lambda each: (
-            SEVERITIES.index(each.severity), _FIRST.index(each.kind) if each.kind in _FIRST else len(_FIRST)
+            SEVERITIES.index(each.severity),
+            _PRIORITY.index(each.kind) if each.kind in _PRIORITY else len(_PRIORITY),
         ),
     )  # fmt: skip
     if not ordered:
@@ -99,7 +101,7 @@ def state_of(conditions: Iterable[Condition]) -> State:
     return State(first.severity, first.text, first.since, tuple(ordered))
 
 
-_FIRST: Final = (
+_PRIORITY: Final = (
     "gone", "silent", "failsafe", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "battery", "dead_reckoning",
 )  # fmt: skip
 _SENSING: Final = (
@@ -143,24 +145,24 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "link_down": (),
     "overload": (),
 }  # fmt: skip
-"""All kinds, each with those that may explain it."""
+"""All kinds of events, each with the kinds that may explain it."""
 
 
 def explain(event: Event, before: Iterable[Event], conditions: Iterable[Condition] = ()) -> list[Event]:
-    """Return the events that may explain one, the last of each kind: at most WINDOW before it, or begun and going on.
+    """Return the possible causes of an event, the latest of each kind: within WINDOW seconds, or still active.
 
-    A begin is explained by what went wrong, an end by what ended; a correction of the estimate by either.
+    Begins explain a begin, ends explain an end; both explain a correction of the estimate.
     """
     kinds, latest = KINDS[event.kind], {}
-    unwanted = "begin" if event.change == "end" else "end" if event.kind not in _CORRECTIONS else ""
+    excluded = "begin" if event.change == "end" else "end" if event.kind not in _CORRECTIONS else ""
     for each in before:
         is_bad = each.severity != "info" or event.change == "end" or event.kind in _CORRECTIONS
         is_near = event.time - WINDOW <= each.time <= event.time
-        is_link = each.kind == "link_down"  # what was lost is seen when the link is back
-        if each is not event and each.kind in kinds and is_near and (is_link or (is_bad and each.change != unwanted)):
+        is_link = each.kind == "link_down"  # its losses are detected after its end
+        if each is not event and each.kind in kinds and is_near and (is_link or (is_bad and each.change != excluded)):
             latest[each.kind] = each
     for condition in conditions:
-        is_before = condition.begin.time <= event.time  # an event may be told late
+        is_before = condition.begin.time <= event.time  # an event may be reported late
         if condition.kind in kinds and condition.severity != "info" and event.change != "end" and is_before:
             latest.setdefault(condition.kind, condition.begin)
     return sorted(latest.values(), key=lambda each: each.time)

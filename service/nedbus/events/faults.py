@@ -1,4 +1,4 @@
-"""Faults of vehicles for health checks, a line each."""
+"""Health checks of vehicles."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .times import since_text, to_age, to_clock
 VALID: Final[Mapping[str, str]] = {
     "xy": "xy_valid", "z": "z_valid", "vxy": "v_xy_valid", "vz": "v_z_valid",
 }  # fmt: skip
-"""Quantities that may be required to be valid, and their flags."""
+"""Quantities whose validity a health check can require, with their flags in VehicleLocalPosition."""
 
-_MAX_LINES: Final = 20  # of what happened lately
+_MAX_LINES: Final = 20  # for recent events
 
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """The conditions of a health check.
+    """The criteria of a health check.
 
-    `expect`: vehicles that must be heard; `vehicles`: the least number of them; `valid`: keys of VALID that must be
-    valid; `within`: seconds in which nothing may have happened that is bad or to be watched; `well`: no state is bad.
+    `expect`: names of vehicles that must be heard. `vehicles`: the minimum number of vehicles. `valid`: keys of VALID.
+    `within`: seconds without an event of severity bad or watch. `well`: no vehicle may be in a bad state.
     """
 
     expect: tuple[str, ...] = ()
@@ -36,12 +36,12 @@ class Expectation:
 def faults_of(
     reports: Sequence[AccountReport], expected: Expectation, *, heard: Collection[str] = (), only: str | None = None
 ) -> list[str]:
-    """Return the faults, a line each.
+    """Return the faults that fail a health check, one line each.
 
-    `heard`: vehicles that are heard, though no service knows of them. `only`: judge the services of this host alone.
+    `heard`: vehicles that are heard although no service reports them. `only`: check the services of this host alone.
     """
-    judged = [report for report in reports if only is None or report.host == only]
-    vehicles = merge_vehicles(judged)
+    checked = [report for report in reports if only is None or report.host == only]
+    vehicles = merge_vehicles(checked)
     missing = [name for name in expected.expect if name not in vehicles and name not in heard]
     faults = [f"vehicle {name} is missing: it has no publisher" for name in missing]
     flying = sorted({name for name, (_, vehicle) in vehicles.items() if not vehicle.is_silent} | set(heard))
@@ -51,11 +51,11 @@ def faults_of(
     for name, (now, vehicle) in sorted(vehicles.items()):
         if not expected.expect or name in expected.expect:
             faults += [f"vehicle {name}: {fault}" for fault in _faults_of_vehicle(name, vehicle, now, expected)]
-    return list(dict.fromkeys([*faults, *_lately(judged, expected)]))
+    return list(dict.fromkeys([*faults, *_recent_faults(checked, expected)]))
 
 
 def merge_vehicles(reports: Iterable[AccountReport]) -> dict[str, tuple[float, VehicleReport]]:
-    """Return the report on each vehicle and its time, by a service that hears it if there is one."""
+    """Return the report of each vehicle with its time, preferably from a service that hears the vehicle."""
     return {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(reports).items()}
 
 
@@ -70,19 +70,19 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
     elif expected.well and vehicle.severity == "bad":
         yield f"{vehicle.text}{since_text(vehicle.since, now)}"
     elif expected.valid and not vehicle.has_position:
-        yield "it sends no position"
+        yield "publishes no position"
 
 
-def _lately(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
+def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:
     lines = []
     for report in reports:
         for event in report.events:
-            is_late = expected.within is not None and event.time > report.now - expected.within
-            is_asked = not expected.expect or event.vehicle in (*expected.expect, ALL)
-            if is_late and is_asked and event.severity != "info":
+            is_recent = expected.within is not None and event.time > report.now - expected.within
+            is_selected = not expected.expect or event.vehicle in (*expected.expect, ALL)
+            if is_recent and is_selected and event.severity != "info":
                 name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
                 at = f"{to_clock(event.time)} UTC, {to_age(report.now - event.time)} ago"
                 lines.append(f"{name}: {event.text}, at {at}")
     yield from lines[:_MAX_LINES]
     if len(lines) > _MAX_LINES:
-        yield f"{len(lines) - _MAX_LINES} events more in the last {expected.within:g} s"
+        yield f"{len(lines) - _MAX_LINES} more events in the last {expected.within:g} s"

@@ -1,4 +1,4 @@
-"""The detector of the position that a vehicle is judged by: flags, resets, origins, and unexplained jumps."""
+"""Event detector of the position estimate: flags, resets, origin changes, and unexplained jumps."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ _COMPARED: Final = (
     "xy_valid", *(name for rule in _RULES for name in rule.flags if name != "xy_valid"), *RESET_COUNTERS.values(),
     "ref_timestamp",
 )  # fmt: skip
-# The fields that are read when one of these changes, with the values for those that are not given.
-_TOLD: Final[Mapping[str, object]] = {
+# Fields read when a compared one changes, with their values for messages that lack them.
+_CONTEXT: Final[Mapping[str, object]] = {
     **dict.fromkeys(
         (
             "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "heading", "dist_bottom", "delta_z", "delta_vz",
@@ -28,40 +28,40 @@ _TOLD: Final[Mapping[str, object]] = {
     ),
     **dict.fromkeys(("delta_xy", "delta_vxy"), (math.nan, math.nan)),
 }  # fmt: skip
-_MIN_STEP: Final = JUMP_DISTANCE / 2  # m to one side; a smaller step is no jump, whatever the velocity
-_MAX_INTERVAL: Final = 0.5  # s between two messages that a jump is looked for in
+_MIN_STEP: Final = JUMP_DISTANCE / 2  # m along one axis; a smaller step cannot be a jump at any velocity
+_MAX_INTERVAL: Final = 0.5  # s between two messages; longer intervals are not checked for jumps
 
-Step = tuple[float, float, float]  # begin [s], north and east [m] beyond what the velocity explains
+Step = tuple[float, float, float]  # begin [s], unexplained motion north and east [m]
 
 
 class PositionDetector(ChangeDetector):
-    """Detect the events of a VehicleLocalPosition, or of an estimate with its fields."""
+    """Detector of a VehicleLocalPosition, or of another estimate with the same fields."""
 
     def __init__(self) -> None:
-        super().__init__(_COMPARED, self._detect_position, told=tuple(_TOLD))
+        super().__init__(_COMPARED, self._detect_position, context=tuple(_CONTEXT))
         self._read_motion = FieldReader(("x", "y", "vx", "vy"), math.nan)
         self._motion: tuple[float, ...] = ()
         self._motion_before: tuple[float, ...] = ()
-        self._jump: Step | None = None  # by now
+        self._jump: Step | None = None  # in progress
 
     def add(self, message: object, missing: frozenset[str]) -> Iterator[Finding] | None:
-        """Add a message; return None while nothing changes."""
+        """Return the findings of a message, None if nothing has changed."""
         before, motion = self._motion, self._read_motion(message)
         self._motion_before, self._motion = before, motion
         if (found := super().add(message, missing)) is not None:
             return found
         has_moved = abs(motion[0] - before[0]) > _MIN_STEP or abs(motion[1] - before[1]) > _MIN_STEP
         step = self._unexplained_step() if has_moved and self._state[0] else None
-        return None if step is None and self._jump is None else self._follow_jump(step)
+        return None if step is None and self._jump is None else self._track_jump(step)
 
-    def forget(self) -> None:
-        """Begin anew: the vehicle has rebooted."""
-        super().forget()
+    def reset(self) -> None:
+        """Discard the state after a reboot of the vehicle."""
+        super().reset()
         self._jump = None
 
     def _detect_position(self, before: Fields, after: Fields) -> Iterator[Finding]:
         if before:
-            earlier, values = _complete(before), _complete(after)
+            earlier, values = _fill_missing(before), _fill_missing(after)
             tracker = ResetTracker()
             tracker.add(cast("Any", SimpleNamespace(**earlier)))
             track = tracker.add(cast("Any", SimpleNamespace(**values)))
@@ -72,11 +72,11 @@ class PositionDetector(ChangeDetector):
             step = None
             if values["xy_valid"] and not track.origin_changed and "xy" not in track.reset:
                 step = self._unexplained_step()
-            yield from self._follow_jump(step)
+            yield from self._track_jump(step)
         yield from detect_flags(_RULES, before, after)
 
     def _unexplained_step(self) -> Step | None:
-        """Return the part of the last step that the velocity does not explain; None if it is small."""
+        """Return the motion since the last message that the velocity does not explain, None if it is small."""
         seconds = (self.stamp - self.earlier) / 1e6
         if not 0 < seconds <= _MAX_INTERVAL:
             return None
@@ -85,8 +85,8 @@ class PositionDetector(ChangeDetector):
         limit = JUMP_DISTANCE + JUMP_SHARE * math.hypot(vx, vy) * seconds
         return (self.earlier / 1e6, north, east) if north * north + east * east > limit * limit else None
 
-    def _follow_jump(self, step: Step | None) -> Iterator[Finding]:
-        """Add a step to a jump, or yield the jump when it has ended."""
+    def _track_jump(self, step: Step | None) -> Iterator[Finding]:
+        """Add a step to the jump in progress; yield the jump when it ends."""
         jump, self._jump = self._jump, step
         if jump is not None and step is not None:
             self._jump = (jump[0], jump[1] + step[1], jump[2] + step[2])
@@ -98,7 +98,7 @@ class PositionDetector(ChangeDetector):
 
 
 def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
-    """Return a reset, with the size of each quantity whose delta is of this reset."""
+    """Return the finding of a reset, with the size of each quantity whose delta belongs to it."""
     numbers: dict[str, float] = {}
     words = []
     explained = {name for name in quantities if name not in track.discontinued}
@@ -126,7 +126,7 @@ def _reset(quantities: Sequence[str], values: Fields, track: Any) -> Finding:
 
 
 def _detect_origin(before: Fields, after: Fields) -> Iterator[Finding]:
-    """Yield an origin that is set, or moves; one that only has a new time does not."""
+    """Yield an origin that is set or moved; a change of its timestamp alone is ignored."""
     had, has = (each["xy_global"] and math.isfinite(each["ref_lat"] + each["ref_lon"]) for each in (before, after))
     if has and not had:
         text = f"origin set at {after['ref_lat']:.6f}, {after['ref_lon']:.6f}"
@@ -147,5 +147,5 @@ def _signed(value: float, digits: int = 1) -> str:
     return f"{round(value, digits) + 0.0:.{digits}f}"
 
 
-def _complete(fields: Fields) -> Fields:
-    return {name: _TOLD.get(name, 0) if value is None else value for name, value in fields.items()}
+def _fill_missing(fields: Fields) -> Fields:
+    return {name: _CONTEXT.get(name, 0) if value is None else value for name, value in fields.items()}

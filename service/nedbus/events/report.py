@@ -1,4 +1,4 @@
-"""The account of a service, as it answers others: its events of the last minutes, and the state of each vehicle."""
+"""The account that a service sends to its peers: recent events, and the state of each vehicle."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from nedbus_msgs import check_vehicle
 from .account import Account
 from .event import Condition, Event, Seconds
 
-QUESTION: Final = "events"
-"""The parameter of a query for the status of services that asks for this in its place."""
+ACCOUNT_PARAMETER: Final = "events"
+"""Parameter of a status query that requests the account in place of the status; its value is the period [s]."""
 
 FORGOTTEN: Final = 3600.0
-"""Seconds of silence after which a vehicle that is not asked for is no fault any more: it was switched off."""
+"""Seconds of silence after which a vehicle that is not expected counts as switched off, not as a fault."""
 
-_LEAST_EVENTS: Final = 10  # of each vehicle, as long as there is room
-_MAX_EVENTS: Final = 300  # of an answer
-_MAX_TOPICS: Final = 30  # of a vehicle
-_MAX_VEHICLES: Final = 1000  # of an answer
-_MAX_BYTES: Final = 2**17  # of the events of an answer, about, and of what holds beside them
+_MIN_EVENTS: Final = 10  # per vehicle, while the report has room
+_MAX_EVENTS: Final = 300  # per report
+_MAX_TOPICS: Final = 30  # per vehicle
+_MAX_VEHICLES: Final = 1000  # per report
+_MAX_BYTES: Final = 2**17  # estimated, of the events of a report, and again of the conditions without an event
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """The state of one vehicle: severity ("info" is well), text, begin, and the kinds of its conditions.
+    """The state of one vehicle: severity ("info" if all is well), text, begin, and the kinds of its conditions.
 
-    `flags`: the flags of its position that are not valid, each with its begin. `topics`: of the messages that it sends.
-    `has_position`: True if it sends a position. `held`: conditions that hold and have no begin among the events.
+    `flags`: validity flags of its position that are false, each with the time since when. `topics`: published topics.
+    `has_position`: True if it publishes a position. `held`: active conditions whose begin is not among the events.
     """
 
     severity: Literal["bad", "watch", "info"]
@@ -46,11 +46,11 @@ class VehicleReport:
 
     @property
     def is_silent(self) -> bool:
-        """True while nothing arrives from it."""
+        """True if no messages arrive from the vehicle."""
         return "silent" in self.kinds or "gone" in self.kinds
 
     def is_forgotten(self, now: float) -> bool:
-        """Return True if it has been silent for FORGOTTEN seconds."""
+        """Return True if the vehicle has been silent for FORGOTTEN seconds."""
         return self.is_silent and self.since is not None and now - self.since >= FORGOTTEN
 
 
@@ -64,7 +64,7 @@ _Name = Annotated[str, AfterValidator(_checked)]
 
 @dataclass(frozen=True, slots=True)
 class AccountReport:
-    """The memory of one service; times are seconds since the epoch by its host's clock."""
+    """The account of one service; times are seconds since the epoch by the clock of its host."""
 
     service: str
     host: str
@@ -77,9 +77,9 @@ _REPORT: Final = TypeAdapter(AccountReport)
 
 
 def report_of(account: Account, service: str, host: str, now: float, *, within: float) -> AccountReport:
-    """Return the last `within` seconds of an account; of many events the last ones of each vehicle."""
-    recent = [event for event in account.take(0)[0] if event.time > now - within]
-    share = max(_LEAST_EVENTS, _MAX_EVENTS // max(1, len({event.vehicle for event in recent})))
+    """Return a report of the last `within` seconds; if it is full, each vehicle keeps its most recent events."""
+    recent = [event for event in account.events_since(0)[0] if event.time > now - within]
+    share = max(_MIN_EVENTS, _MAX_EVENTS // max(1, len({event.vehicle for event in recent})))
     counts: Counter[str] = Counter()
     events: deque[Event] = deque()
     size = 0
@@ -90,7 +90,7 @@ def report_of(account: Account, service: str, host: str, now: float, *, within: 
             if size > _MAX_BYTES or len(events) >= _MAX_EVENTS:
                 break
             events.appendleft(event)
-    told = {event.identity for event in events}
+    reported = {event.identity for event in events}
     vehicles, size = {}, 0
     for name, vehicle in list(account.vehicles.items()):
         state = account.state(name, now)
@@ -98,17 +98,17 @@ def report_of(account: Account, service: str, host: str, now: float, *, within: 
         flags = {flag: each.since for (kind, flag), each in held if kind.endswith("_invalid") and flag}
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
         bad = (each for _, each in held if each.severity != "info")
-        untold = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in told))
-        size += 500 * len(untold)
+        unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
+        size += 500 * len(unreported)
         vehicles[name] = VehicleReport(
             state.severity, state.text, state.since, kinds, flags, tuple(sorted(vehicle.topics))[:_MAX_TOPICS],
-            vehicle.main is not None, untold if size < _MAX_BYTES else (),
+            vehicle.main is not None, unreported if size < _MAX_BYTES else (),
         )  # fmt: skip
     return AccountReport(service, host, now, vehicles, tuple(events))
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
-    """Return the report to ask about each vehicle: that of a service that hears it, if one does."""
+    """Return a report for each vehicle, preferably from a service that hears the vehicle."""
     found: dict[str, AccountReport] = {}
     for report in reports:
         for name in report.vehicles:
@@ -118,7 +118,7 @@ def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:
 
 
 def from_json(content: object) -> AccountReport | None:
-    """Parse the answer of a peer; None if it is no report, as that of an older service."""
+    """Parse the reply of a peer; return None if it is not a report, such as the reply of an older service."""
     try:
         return _REPORT.validate_python(content)
     except ValidationError:

@@ -1,4 +1,4 @@
-"""The flags whose change is an event, by message, with their texts; all thresholds, and the names of modes."""
+"""Tables of the event detectors: flags by message with their texts, thresholds, and names of modes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from .event import Severity
 
 @dataclass(frozen=True, slots=True)
 class FlagRule:
-    """Flags that mean one condition: it holds while a flag is `bad`.
+    """A condition that holds while any of its flags has the value `bad`.
 
-    `flags`: by field, with the word for each; flags that change with one message are one event.
-    `severity`: of the begin, and `on_ground` while the vehicle is known to be disarmed; an end is always info.
-    `begin`, `end`: the texts, with `{}` for the words. `first`: that of the end of an initial condition.
-    `minor`: flags of which the begin is info too.
-    `initial`: a flag that is set in the first message is a condition too.
+    `flags`: a label for each field; flags that change in the same message become one event.
+    `severity`: of the begin; `on_ground` replaces it while the vehicle is disarmed. An end is always info.
+    `begin`, `end`: event texts, with `{}` for the labels. `first`: text for the end of an initial condition.
+    `minor`: flags whose begin is info.
+    `initial`: a flag that is bad in the first message begins a condition.
     """
 
     kind: str
@@ -32,10 +32,10 @@ class FlagRule:
     initial: bool = False
 
 
-def _valid(field: str, kind: str, word: str) -> FlagRule:
-    begin, end = f"{word} not valid", f"{word} valid again"
+def _valid(field: str, kind: str, label: str) -> FlagRule:
+    begin, end = f"{label} not valid", f"{label} valid again"
     return FlagRule(
-        kind, {field: word}, begin, end, f"{word} valid for the first time", bad=False, severity="bad", initial=True
+        kind, {field: label}, begin, end, f"{label} valid for the first time", bad=False, severity="bad", initial=True
     )
 
 
@@ -54,7 +54,7 @@ _FAULTS: Final = {
     "fs_bad_mag_x": "magnetometer x", "fs_bad_mag_y": "magnetometer y", "fs_bad_mag_z": "magnetometer z",
     "fs_bad_hdg": "heading", "fs_bad_mag_decl": "declination", "fs_bad_airspeed": "airspeed",
     "fs_bad_sideslip": "sideslip", "fs_bad_optflow_x": "optical flow x", "fs_bad_optflow_y": "optical flow y",
-    "fs_bad_acc_vertical": "accelerometer, vertical", "fs_bad_acc_clipping": "accelerometer clips",
+    "fs_bad_acc_vertical": "accelerometer, vertical", "fs_bad_acc_clipping": "accelerometer clipping",
     "fs_bad_acc_bias": "accelerometer bias", "fs_bad_vel_n": "velocity north", "fs_bad_vel_e": "velocity east",
     "fs_bad_vel_d": "velocity down", "fs_bad_pos_n": "position north", "fs_bad_pos_e": "position east",
     "fs_bad_pos_d": "position down",
@@ -66,7 +66,7 @@ _REJECTED: Final = {
     "reject_airspeed": "airspeed", "reject_sideslip": "sideslip", "reject_hagl": "height above ground",
     "reject_optflow_x": "optical flow x", "reject_optflow_y": "optical flow y",
 }  # fmt: skip
-_LACKS: Final = (
+_FAILSAFE_FLAGS: Final = (
     "angular_velocity_invalid", "attitude_invalid", "local_altitude_invalid", "local_position_invalid",
     "local_position_invalid_relaxed", "local_velocity_invalid", "global_position_invalid",
     "global_position_invalid_relaxed", "auto_mission_missing", "home_position_invalid", "manual_control_signal_lost",
@@ -108,18 +108,18 @@ RULES: Final[Mapping[str, tuple[FlagRule, ...]]] = {
             minor=frozenset(_HEIGHTS),
         ),
         FlagRule("innovation_rejected", _REJECTED, "EKF rejects {}", "EKF accepts {} again"),
-        FlagRule("estimator_fault", _FAULTS, "EKF fault: {}", "EKF fault over: {}", initial=True),
+        FlagRule("estimator_fault", _FAULTS, "EKF fault: {}", "EKF fault cleared: {}", initial=True),
     ),
     "VehicleStatus": (
         FlagRule("failsafe", {"failsafe": "failsafe"}, "failsafe", "failsafe ends", severity="bad", initial=True),
         FlagRule(
             "gcs_lost", {"gcs_connection_lost": "ground station"}, "link to the ground station lost",
-            "link to the ground station", on_ground="info",
+            "link to the ground station restored", on_ground="info",
         ),
     ),
     "FailsafeFlags": (
         FlagRule(
-            "failsafe_flag", {name: name.replace("_", " ") for name in _LACKS}, "failsafe flags: {}",
+            "failsafe_flag", {name: name.replace("_", " ") for name in _FAILSAFE_FLAGS}, "failsafe flags: {}",
             "failsafe flags cleared: {}", on_ground="info",
         ),
     ),
@@ -129,26 +129,26 @@ _FLAGGED: Final = frozenset(rule.kind for rules in RULES.values() for rule in ru
 
 
 def flags_of(kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the flags for each of which a condition holds: the names of its event, or "" where it has no flags."""
+    """Return the flags of an event, each of which is a condition of its own; "" for a kind without flags."""
     return names if kind in _FLAGGED else ("",)
 
 
 RECENT: Final = 60.0
-"""Seconds for which a single event is a reason to watch a vehicle."""
+"""Seconds during which a single event counts towards the state of a vehicle."""
 
-MAX_SILENCE: Final = 3.0  # s without a position until a vehicle is silent, where its stream has no state
-MIN_FIX_TYPE: Final = 3  # of SensorGps: a fix in three dimensions
-FEW_SATELLITES: Final = 6  # fewer are few (PX4's EKF2_REQ_NSATS), until there are enough
+MAX_SILENCE: Final = 3.0  # s without a position until a vehicle is silent, if its stream has no state
+MIN_FIX_TYPE: Final = 3  # SensorGps.fix_type of a 3D fix
+FEW_SATELLITES: Final = 6  # the condition begins below this (PX4's EKF2_REQ_NSATS) and ends at ENOUGH_SATELLITES
 ENOUGH_SATELLITES: Final = 7
-JAMMING_BEGIN: Final = 80  # jamming_indicator that PX4's guide to logs calls too high
+JAMMING_BEGIN: Final = 80  # jamming_indicator; "too high" in PX4's guide to flight log analysis
 JAMMING_END: Final = 60
-JUMP_DISTANCE: Final = 1.0  # m beyond what the velocity explains, beside a share of the distance flown
+JUMP_DISTANCE: Final = 1.0  # m of unexplained motion; JUMP_SHARE of the distance flown is added
 JUMP_SHARE: Final = 0.2
-SMALL_RESET: Final = 0.5  # m, or m/s: a smaller reset is nothing to watch
-FLAPPING_CHANGES: Final = 4  # of a condition within WINDOW; of further ones only the last is reported
-PAUSE: Final = 5.0  # s without another one until flapping, losses, rejections or an overload are over
-MAX_BURST: Final = 20.0  # s after which losses are reported, though more may follow
-OUTLIVING: Final = ("silent", "gone", "rejected")  # conditions that a reboot does not end
+SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
+FLAPPING_CHANGES: Final = 4  # of a condition within WINDOW; further changes are suppressed, except for the last
+PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended
+MAX_BURST: Final = 20.0  # s after which losses are reported even if they continue
+KEPT_ON_REBOOT: Final = ("silent", "gone", "rejected")  # conditions that a reboot does not end
 ARMED: Final = 2  # arming_state
 
 MODES: Final[Mapping[int, str]] = {
@@ -157,7 +157,7 @@ MODES: Final[Mapping[int, str]] = {
     15: "Stabilized", 17: "Takeoff", 18: "Land", 19: "Follow", 20: "Precision Land", 21: "Orbit", 22: "VTOL Takeoff",
     **{number: f"External {number - 22}" for number in range(23, 31)},
 }  # fmt: skip
-"""The names that QGroundControl shows for nav_state."""
+"""Names of nav_state in QGroundControl."""
 
 FIXES: Final[Mapping[int, str]] = {
     0: "none", 1: "none", 2: "2D", 3: "3D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed", 8: "extrapolated",

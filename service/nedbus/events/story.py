@@ -1,4 +1,4 @@
-"""Stories, the answer of `nedbus why`: a fault, its duration, its evidence, and topics that are missing."""
+"""Stories for `nedbus why`: each fault with its duration, evidence, and the topics that lack evidence."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from .event import WINDOW, Condition, Event, State, explain, state_of
-from .rules import OUTLIVING, RECENT, flags_of
+from .rules import KEPT_ON_REBOOT, RECENT, flags_of
 
-_TOGETHER: Final = 1.0  # s within which conditions that begin are one story
-_HEADS: Final = (
+_TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
+_MAIN_FAULTS: Final = (
     "gone", "silent", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "failsafe", "battery", "reboot",
 )  # fmt: skip
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
 _EVIDENCE: Final = (_GPS, "estimator_status_flags", "vehicle_status", "failsafe_flags")
-"""The topics with evidence about an estimate that is not valid."""
+"""Topics with evidence about an invalid estimate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Span(Condition):
-    """A condition until its `end`, which is None while it goes on."""
+    """A condition with its end: the time `until` and the event `end`, both None while it is active."""
 
     until: float | None = None
     end: Event | None = None
 
     def holds(self, time: float) -> bool:
-        """Return True if it holds at a time; a single event holds while it is recent."""
+        """Return True if the condition is active at a time, or a single event is recent."""
         until = math.inf if self.until is None else self.until + RECENT * (self.until == self.since)
         return self.since <= time < until
 
@@ -37,10 +37,10 @@ class Span(Condition):
 class Story:
     """One fault of a vehicle.
 
-    `what`: in words. `since`, `until`: by the account's clock; `until` is None while it goes on.
-    `begin`: the event that began it, None where it held at the first message already; `end`: the one that ended it.
-    `before`: the evidence, oldest first; `meanwhile`: other events until its end; `after`: those at its end.
-    `lacking`: topics that would have evidence, and are not in the data.
+    `what`: its text. `since`, `until`: by the account's clock [s]; `until` is None while it is active.
+    `begin`: the event that began it, None if it already held in the first message. `end`: the event that ended it.
+    `before`: the evidence, oldest first. `meanwhile`: other events until its end. `after`: events at its end.
+    `lacking`: topics that could have evidence, but are not in the data.
     """
 
     what: str
@@ -55,35 +55,35 @@ class Story:
 
     @property
     def is_bad(self) -> bool:
-        """True if it keeps the vehicle from its task."""
+        """True if its severity is bad, or it already held in the first message."""
         return self.begin is None or self.begin.severity == "bad"
 
     @property
     def topics(self) -> list[str]:
-        """The topics of its evidence."""
+        """The topics of all its events, sorted."""
         return sorted({each.topic for each in (*self.before, *self.meanwhile, *self.after) if each.topic})
 
 
-def tell(
+def stories_of(
     events: Sequence[Event],
     conditions: Iterable[Condition] = (),
     *,
     topics: Collection[str] = (),
     at: float | None = None,
 ) -> list[Story]:
-    """Return the stories of one vehicle, in order; none if all was well.
+    """Return the stories of one vehicle in order of time; empty if it has no faults.
 
-    `events`: all of one vehicle, in order. `conditions`: those that hold at their end.
-    `topics`: those of its messages. `at`: only what held then, or, if nothing did, the last thing before.
+    `events`: all events of the vehicle, in order. `conditions`: those active after the last event.
+    `topics`: the topics that the vehicle publishes. `at`: return only the stories at this time, or the last one before.
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
-    chosen = sorted((span for span in spans if span.kind in _HEADS), key=lambda each: _HEADS.index(each.kind))
+    chosen = [span for kind in _MAIN_FAULTS for span in spans if span.kind == kind]
     if not chosen or (at is not None and not any(span.holds(at) for span in chosen)):
-        chosen += [s for s in spans if s.kind not in _HEADS and s.severity != "info" and not s.initial]
+        chosen += [s for s in spans if s.kind not in _MAIN_FAULTS and s.severity != "info" and not s.initial]
     stories: list[Story] = []
     while chosen:
         group = _together(chosen[0], chosen)
-        stories.append(_tell_one(group, spans, events, topics))
+        stories.append(_make_story(group, spans, events, topics))
         chosen = [span for span in chosen if span not in group]
     stories.sort(key=lambda story: story.since)
     if at is None:
@@ -92,45 +92,45 @@ def tell(
     return held or [story for story in stories if story.since <= at][-1:] or stories[:1]
 
 
-def about(event: Event, events: Sequence[Event], *, topics: Collection[str] = ()) -> Story | None:
-    """Return the story of one event: of the condition that it began or ended, or of itself."""
+def story_of(event: Event, events: Sequence[Event], *, topics: Collection[str] = ()) -> Story | None:
+    """Return the story of the condition that an event begins or ends, or of a single event."""
     spans = spans_of(events)
     span = next((each for each in spans if event in (each.begin, each.end)), None)
-    return None if span is None else _tell_one(_together(span, spans), spans, events, topics)
+    return None if span is None else _make_story(_together(span, spans), spans, events, topics)
 
 
 def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> list[Span]:
-    """Return the conditions of one vehicle from begin to end, and its single events, in the order of their begin.
+    """Return the conditions and single events of one vehicle, ordered by begin.
 
-    `conditions`: those that hold at the end, or held at the first message, and have no begin among the events.
+    `conditions`: active or initial conditions; those whose begin is not among the events are added.
     """
-    told = {event.identity for event in events}
-    untold = [each for each in conditions if each.begin.identity not in told]
+    known = {event.identity for event in events}
+    unreported = [each for each in conditions if each.begin.identity not in known]
     spans: list[Span] = []
-    going: dict[tuple[str, str], Span] = {}  # by kind and flag
+    active: dict[tuple[str, str], Span] = {}  # by kind and flag
 
     def end(keys: Iterable[tuple[str, str]], event: Event) -> None:
-        ended = dict.fromkeys([going.pop(key) for key in keys if key in going])
+        ended = dict.fromkeys([active.pop(key) for key in keys if key in active])
         spans.extend(replace(span, until=event.time, end=event) for span in ended)
 
-    steps: list[Event | Condition] = [*events, *(each for each in untold if each.initial)]
+    steps: list[Event | Condition] = [*events, *(each for each in unreported if each.initial)]
     for step in sorted(steps, key=_order):
         event = step.begin if isinstance(step, Condition) else step
         keys = [(step.kind, flag) for flag in flags_of(step.kind, event.names)]
         if isinstance(step, Condition):
-            going |= dict.fromkeys(keys, _span(step))
+            active |= dict.fromkeys(keys, _span(step))
         elif step.change == "end":
             end(keys, step)
         elif step.change == "once":
             spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
-            if step.kind == "reboot":  # begins anew
-                end([key for key in going if key[0] not in OUTLIVING], step)
+            if step.kind == "reboot":
+                end([key for key in active if key[0] not in KEPT_ON_REBOOT], step)
         else:
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
-            going |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
-    spans += dict.fromkeys(going.values())
-    spans += [_span(each) for each in dict.fromkeys(untold) if not each.initial]
+            active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))
+    spans += dict.fromkeys(active.values())
+    spans += [_span(each) for each in dict.fromkeys(unreported) if not each.initial]
     return sorted(spans, key=lambda span: span.since)
 
 
@@ -139,8 +139,10 @@ def state_at(spans: Iterable[Span], time: float) -> State:
     return state_of(span for span in spans if span.holds(time))
 
 
-def _tell_one(group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str]) -> Story:
-    """Return the story of conditions that began together; begin and evidence are those of the first."""
+def _make_story(
+    group: Sequence[Span], spans: Iterable[Span], events: Sequence[Event], topics: Collection[str]
+) -> Story:
+    """Return the story of a group of conditions; its begin and evidence are those of the first."""
     span = group[0]
     until = None if any(each.until is None for each in group) else max(each.until or 0.0 for each in group)
     end = next((each.end for each in group if each.end is not None and each.until == until), None)
@@ -174,7 +176,7 @@ def _tell_one(group: Sequence[Span], spans: Iterable[Span], events: Sequence[Eve
 
 
 def _without_parts(stories: Sequence[Story]) -> list[Story]:
-    """Return the stories without those that are part of a bad one that began before."""
+    """Drop stories that are part of an earlier bad story, or evidence of a bad story."""
     kept: list[Story] = []
     for story in stories:
         parts = {event for each in kept if each.is_bad for event in (*each.meanwhile, *each.after)}
@@ -185,7 +187,7 @@ def _without_parts(stories: Sequence[Story]) -> list[Story]:
 
 
 def _together(span: Span, spans: Iterable[Span]) -> list[Span]:
-    """Return a span, then those that are one story with it: parts of an estimate that are not valid any more."""
+    """Return a span and all that belong to the same story: parts of the estimate that became invalid with it."""
     parts = [each for each in spans if each.kind.endswith("_invalid") and abs(each.since - span.since) <= _TOGETHER]
     return [span, *(each for each in parts if span.kind.endswith("_invalid") and each is not span)]
 
@@ -195,7 +197,7 @@ def _span(condition: Condition) -> Span:
 
 
 def _order(step: Event | Condition) -> tuple[float, bool, bool]:
-    """Return the key of an order: at one time a reboot first, then initial conditions, then all else."""
+    """Return the sort key: by time, at equal times reboots first, then initial conditions, then other events."""
     if isinstance(step, Condition):
         return step.since, True, False
     return step.time, step.kind != "reboot", True

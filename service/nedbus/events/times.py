@@ -1,4 +1,4 @@
-"""Times as a person reads them: UTC where it is known, else seconds since boot; and durations."""
+"""Formatting and parsing of times, as UTC if known or as seconds since boot, and of durations."""
 
 from __future__ import annotations
 
@@ -12,73 +12,75 @@ from typing import Final
 from .event import Event
 
 _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?")
-_LATEST: Final = 1e11  # s since the epoch, some thousand years
-_UNIX: Final = 1e9  # s since boot beyond which PX4's time is Unix time, as some simulators have it
+_MAX_UTC: Final = 1e11  # s since the epoch, about three thousand years
+_MIN_UNIX: Final = 1e9  # s; a greater time since boot is Unix time, which some simulators use
 
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """The format of times: live, or by the offsets of the vehicles of a file.
+    """Conversion of event times to UTC, for live data or for a file.
 
-    `is_live`: the account's clock is this host's, in seconds since the epoch.
-    `offsets`: Unix time minus time since boot [s], by vehicle, where a message tells it.
+    `is_live`: the account's clock is the clock of this host, in seconds since the epoch.
+    `offsets`: Unix time minus time since boot [s], for each vehicle whose messages contain it.
     """
 
     is_live: bool = False
     offsets: Mapping[str, float] = field(default_factory=dict)
 
     def utc(self, event: Event) -> float | None:
-        """Return the Unix time of an event [s], None if nothing tells it."""
+        """Return the Unix time of an event [s], None if unknown."""
         if self.is_live:
             return event.time
         if event.boot is None:
             return None
-        utc = event.boot + (0.0 if event.boot > _UNIX else self.offsets.get(event.vehicle, math.nan))
-        return utc if 0 <= utc < _LATEST else None  # a damaged time is neither
+        utc = event.boot + (0.0 if event.boot > _MIN_UNIX else self.offsets.get(event.vehicle, math.nan))
+        return utc if 0 <= utc < _MAX_UTC else None  # false for NaN and for damaged times
 
     def clock(self, event: Event) -> str:
-        """Return the clock of a time: "host", "vehicle" for UTC from its messages, or "boot"."""
+        """Return the clock of an event: "host", "vehicle" (UTC from its messages), or "boot" (since boot)."""
         return "host" if self.is_live else "boot" if self.utc(event) is None else "vehicle"
 
     def text(self, event: Event) -> str:
-        """Return the time of an event, without the date."""
+        """Format the time of an event, without a date."""
         utc = self.utc(event)
         if utc is None:
             return f"{event.time if event.boot is None else event.boot:.3f}"
         return to_clock(utc)
 
     def find(self, text: str, near: Event) -> float:
-        """Return a moment by the account's clock, given as 14:05:12 (UTC) or in seconds since boot.
+        """Parse 14:05:12 (UTC) or seconds since boot; return the time by the account's clock [s].
 
-        `near`: an event of the vehicle that is meant, for the date. Raises ValueError for anything else.
+        `near`: an event of the same vehicle; the closest such time is returned.
+
+        Raises ValueError for other text, or if no message gives UTC or the time since boot.
         """
         if found := _CLOCK.fullmatch(text.strip()):
             utc = self.utc(near)
             if utc is None:
-                raise ValueError("no message of this vehicle tells UTC")
+                raise ValueError("no message of this vehicle gives UTC")
             midnight = datetime.fromtimestamp(utc, UTC).replace(hour=0, minute=0, second=0, microsecond=0)
             since = timedelta(hours=int(found[1]), minutes=int(found[2]), seconds=float(found[3] or 0))
-            step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200  # the nearest, also past midnight
+            step = ((midnight + since).timestamp() - utc + 43_200) % 86_400 - 43_200  # closest, also across midnight
             return near.time + step
         try:
             seconds = float(text)
         except ValueError:
             seconds = math.nan
         if not math.isfinite(seconds):
-            raise ValueError("no time")
+            raise ValueError("not a time")
         if near.boot is None and self.is_live:
-            raise ValueError("no message of this vehicle tells when it booted")
+            raise ValueError("no message of this vehicle gives the time since boot")
         return near.time + seconds - (near.time if near.boot is None else near.boot)
 
 
 def to_clock(utc: float) -> str:
-    """Return a Unix time as 14:05:12.3, in UTC."""
+    """Format a Unix time as UTC, such as 14:05:12.3."""
     tenths = round(utc * 10)
     return f"{datetime.fromtimestamp(tenths // 10, UTC):%H:%M:%S}.{tenths % 10}"
 
 
 def to_age(seconds: float) -> str:
-    """Return a duration in a suitable unit, as text."""
+    """Format a duration [s] in ms, s, min or h."""
     if seconds < 1:
         return f"{max(0.0, seconds) * 1e3:.0f} ms"
     if seconds < 120:
@@ -87,5 +89,5 @@ def to_age(seconds: float) -> str:
 
 
 def since_text(since: float | None, now: float) -> str:
-    """Return the begin of a condition as a suffix for its text; "" where it is not known."""
+    """Format the begin of a condition as a suffix of its text; "" if unknown."""
     return "" if since is None else f", since {to_clock(since)} UTC ({to_age(now - since)})"

@@ -1,4 +1,4 @@
-"""One vehicle: the events of its messages, their evidence, and the conditions that hold now."""
+"""The state of one vehicle: detectors of its streams, active conditions, and recent events."""
 
 from __future__ import annotations
 
@@ -13,34 +13,36 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 from .detectors import ChangeDetector, Finding, make_detector
 from .event import WINDOW, Condition, Event, State, explain, state_of
 from .position import PositionDetector
-from .rules import FLAPPING_CHANGES, MAX_BURST, MAX_SILENCE, OUTLIVING, PAUSE, RECENT, RULES, flags_of
+from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAUSE, RECENT, RULES, flags_of
 from .times import to_age
 
-_REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
-_MAX_AHEAD: Final = 1.0  # s that something may be ahead of a look; more is a clock that was set back
+_REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
+_MAX_AHEAD: Final = 1.0  # s that an event may be ahead of an update; more means that the clock was set back
 _MAX_RECENT: Final = 100
-_MAX_STREAMS: Final = 1000  # that are followed; no peer can make it remember more
-_MAX_TOPICS: Final = 20  # that an event names
-# Of each group one topic is used, the first of the list that arrives, for these kinds of conditions.
+_MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
+_MAX_TOPICS: Final = 20  # named in one event
+# Groups of topics in order of preference: the best one that arrives gives the conditions of these kinds.
 _POSITIONS: Final = (DEFAULT_TOPIC, "external_ins_local_position", "estimator_local_position")
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
-_KINDS: Final = {
+_KINDS_BY_GROUP: Final = {
     _POSITIONS: frozenset(rule.kind for rule in RULES["VehicleLocalPosition"]),
     _RECEIVERS: frozenset({"gps_fix_lost", "few_satellites", "jamming", "spoofing"}),
 }
 
 
 class Vehicle:
-    """Follow one vehicle; `tell` gets each event as it happens, `common` has the conditions of all vehicles.
+    """The events and conditions of one vehicle.
 
-    `conditions`: those that hold now, by kind and flag. `initial`: those that held at its first messages.
-    `topics`: those of its messages.
-    `main`: the position that it is judged by: vehicle_local_position, or another estimate where there is none.
-    `time`: of its last message that is looked at, by the account's clock; `boot`: the same since boot [s].
-    `recent`: the last events, in which evidence is looked for.
+    `on_event` is called with each event. `common` has the conditions that concern all vehicles.
+
+    `conditions`: active conditions by kind and flag. `initial`: conditions that held in the first messages.
+    `topics`: the topics that it publishes.
+    `main`: the address of the position estimate in use: vehicle_local_position if published, else another estimate.
+    `time`: time of the last message with a detector, by the account's clock [s]. `boot`: its time since boot [s].
+    `recent`: the most recent events, searched for evidence.
     """
 
-    def __init__(self, name: str, tell: Callable[[Event], None], common: Vehicle | None = None) -> None:
+    def __init__(self, name: str, on_event: Callable[[Event], None], common: Vehicle | None = None) -> None:
         self.name = name
         self.conditions: dict[tuple[str, str], Condition] = {}
         self.initial: list[Condition] = []
@@ -49,19 +51,19 @@ class Vehicle:
         self.armed: bool | None = None
         self.time = 0.0
         self.boot: float | None = None
-        self._tell = tell
+        self._on_event = on_event
         self._common = common
         self.recent: deque[Event] = deque(maxlen=_MAX_RECENT)
         self._detectors: dict[Address, ChangeDetector | None] = {}
-        self._speakers: dict[tuple[str, ...], Address] = {}
-        self._main_time = math.inf  # of the last position
+        self._preferred: dict[tuple[str, ...], Address] = {}  # the stream in use of each group
+        self._main_time = math.inf  # time of the last position
         self._rebooted = -math.inf
-        self._changes: dict[tuple[str, tuple[str, ...]], deque[Event]] = {}  # of conditions, the last ones
-        self._untold: Counter[tuple[str, tuple[str, ...]]] = Counter()  # of them too fast to be reported
+        self._changes: dict[tuple[str, tuple[str, ...]], deque[Event]] = {}  # recent changes of each condition
+        self._suppressed: Counter[tuple[str, tuple[str, ...]]] = Counter()  # changes of flapping conditions
         self._lost, self._rejected = _Burst(), _Burst()
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
-        """Add a message of this vehicle, with the number of messages that were lost before it."""
+        """Add a message; `lost` is the number of messages lost before it."""
         if lost:
             self._lost.add(time, lost, address.stream)
         try:
@@ -81,7 +83,8 @@ class Vehicle:
             for kind in ("silent", "gone") if self.conditions else ():
                 if (kind, "") in self.conditions:
                     self.emit(Finding(kind, "end", "info", f"{address.stream} is back"), address.topic, time)
-        if stamp < before - _REBOOT and not 0 < earlier <= stamp + _REBOOT:  # else the one before was damaged
+        # If the message before the last one is close in time, the last one was damaged: no reboot.
+        if stamp < before - _REBOOT and not 0 < earlier <= stamp + _REBOOT:
             self._reboot(before, time)
             found = detector.add(message, missing)
         for each in found or ():
@@ -90,14 +93,14 @@ class Vehicle:
             self.emit(each, address.topic, time)
 
     def reject(self, topic: str, reason: str, time: float) -> None:
-        """Add a message that was rejected."""
+        """Record a rejected message."""
         if not self._rejected.count:
             text = f"{topic} rejected: {reason}"
             self.emit(Finding("rejected", "begin", "watch", text, names=(topic, reason)), topic, time)
         self._rejected.add(time, 1, topic)
 
     def settle(self, time: float) -> None:
-        """Report losses, rejections and flapping that are over."""
+        """Report bursts of losses and rejections, and flapping, that have ended."""
         lost, rejected = self._lost, self._rejected
         if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
             names = tuple(sorted(lost.topics))
@@ -105,19 +108,19 @@ class Vehicle:
             self.emit(Finding("lost", "once", "watch", text, names, {"messages": lost.count}), "", lost.begin)
             self._lost = _Burst()
         if rejected.is_over(time):
-            text = f"nothing rejected any more: {rejected.count} were"
+            text = f"rejections stopped ({rejected.count} message{'s' * (rejected.count > 1)})"
             self.emit(Finding("rejected", "end", "info", text, numbers={"messages": rejected.count}), "", rejected.end)
             self._rejected = _Burst()
         for key, events in list(self._changes.items()):
             last = events[-1]
-            if key in self._untold and not 0 <= time - last.time <= PAUSE:
-                count = self._untold.pop(key)
-                self._keep(replace(last, text=f"{last.text}, the last of {count} changes that are not told"))
+            if key in self._suppressed and not 0 <= time - last.time <= PAUSE:
+                count = self._suppressed.pop(key)
+                self._report(replace(last, text=f"{last.text}, the last of {count} suppressed changes"))
             if time - last.time > WINDOW:
                 del self._changes[key]
 
-    def look(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Update from the state of its position's stream: "stale", "gone" or another, None where it is not known."""
+    def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
+        """Update from the state of the position's stream: "stale", "gone" or another, None if unknown."""
         self.settle(time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
@@ -131,22 +134,22 @@ class Vehicle:
         self.emit(Finding(silent, "begin", "bad", text, numbers={"age": age}), stream, time, changed=since)
 
     def state(self, time: float) -> State:
-        """Return its state now: conditions that hold or flap, and single events of the last minute."""
+        """Return the current state: active and flapping conditions, and single events of the last minute."""
         found = [each for each in self.conditions.values() if each.on_ground != "info" or self.armed is not False]
         kinds = {each.kind for each in found}
         for event in reversed(self.recent):
             if event.change == "once" and time - RECENT < event.time <= time + _MAX_AHEAD:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
-            elif event.change == "begin" and (event.kind, event.names) in self._untold and event.kind not in kinds:
+            elif event.change == "begin" and (event.kind, event.names) in self._suppressed and event.kind not in kinds:
                 kinds.add(event.kind)
-                text = f"{event.text} again and again"
+                text = f"{event.text} (flapping)"
                 found.append(Condition(event.kind, event.severity, text, event.time, event))
-        return state_of(dict.fromkeys(found))  # a condition of several flags counts once
+        return state_of(dict.fromkeys(found))  # a condition with several flags counts once
 
     def emit(self, found: Finding, topic: str, time: float, *, changed: float | None = None) -> None:
-        """Make an event of a finding, and begin or end its conditions; report it, unless it is initial or flaps.
+        """Begin or end the conditions of a finding, and report its event unless it is initial or flapping.
 
-        `changed`: when its condition began or ended, where that is earlier than `time`.
+        `changed`: the time at which the condition began or ended, if it is earlier than `time`.
         """
         changed = time if changed is None else changed
         severity, text, lasted = found.severity, found.text, None
@@ -169,56 +172,56 @@ class Vehicle:
             self.conditions |= dict.fromkeys(keys, condition)
             if found.initial and len(self.initial) < _MAX_RECENT:
                 self.initial.append(condition)
-        if not found.initial and not self._flaps(event):
-            self._keep(event)
+        if not found.initial and not self._is_flapping(event):
+            self._report(event)
 
     def _open(self, address: Address) -> ChangeDetector | None:
-        """Return the detector of a stream, None for one without events."""
+        """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)
-        if address.instance and address.topic not in _POSITIONS:  # other sensors, batteries and EKFs are not used
+        if address.instance and address.topic not in _POSITIONS:  # only the first sensor, battery and EKF are used
             return None
-        topics = next((each for each in _KINDS if address.topic in each), ())
-        if topics:
-            speaker = self._speakers.get(topics)
-            if speaker is not None and _rank(topics, speaker) <= _rank(topics, address):
+        group = next((each for each in _KINDS_BY_GROUP if address.topic in each), ())
+        if group:
+            current = self._preferred.get(group)
+            if current is not None and _rank(group, current) <= _rank(group, address):
                 return None
-            if speaker is not None:
-                self._replace(speaker, address, _KINDS[topics])
-            self._speakers[topics] = address
-        if topics is _POSITIONS:
+            if current is not None:
+                self._supersede(current, address, _KINDS_BY_GROUP[group])
+            self._preferred[group] = address
+        if group is _POSITIONS:
             self.main = address
             return PositionDetector()
         return make_detector(BY_TOPIC[address.topic].name) if address.topic in BY_TOPIC else None
 
-    def _replace(self, old: Address, new: Address, kinds: frozenset[str]) -> None:
-        """End the conditions of a stream when a better one takes its place."""
+    def _supersede(self, old: Address, new: Address, kinds: frozenset[str]) -> None:
+        """Stop using a stream, and end its conditions, when a better one arrives."""
         self._detectors[old] = None
         for each in [each for (kind, _), each in self.conditions.items() if kind in kinds]:
-            text = f"{each.text}: over, {new.stream} tells from now on"
+            text = f"{each.text}: superseded by {new.stream}"
             ended = Finding(each.kind, "end", "info", text, each.begin.names, initial=each.initial)
             self.emit(ended, new.topic, self.time)
 
     def _reboot(self, before: int, time: float) -> None:
         """Reset the state, and report the reboot once, even if late messages from before it follow."""
         for detector in filter(None, self._detectors.values()):
-            detector.forget()
-        self.conditions = {key: each for key, each in self.conditions.items() if key[0] in OUTLIVING}
+            detector.reset()
+        self.conditions = {key: each for key, each in self.conditions.items() if key[0] in KEPT_ON_REBOOT}
         self.armed = None
         last, self._rebooted = self._rebooted, time
         if time - last >= PAUSE:
-            text = f"rebooted: {self.boot or 0.0:.1f} s since boot, {before / 1e6:.1f} s before"
+            text = f"rebooted: time since boot {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
             self.emit(Finding("reboot", "once", "bad", text, numbers={"before": before / 1e6}), "", time)
 
-    def _keep(self, event: Event) -> None:
+    def _report(self, event: Event) -> None:
         recent, conditions = list(self.recent), list(self.conditions.values())
         if self._common is not None:
             recent, conditions = [*self._common.recent, *recent], [*conditions, *self._common.conditions.values()]
         self.recent.append(event)
         held = [each for each in conditions if each.begin is not event]
-        self._tell(replace(event, evidence=tuple(explain(event, recent, held))))
+        self._on_event(replace(event, evidence=tuple(explain(event, recent, held))))
 
-    def _flaps(self, event: Event) -> bool:
-        """Return True if a condition changes too fast to be reported; the last change is reported later."""
+    def _is_flapping(self, event: Event) -> bool:
+        """Return True if a condition changes too often to report each change; `settle` reports the last one."""
         if event.change == "once":
             return False
         key = event.kind, event.names
@@ -226,13 +229,13 @@ class Vehicle:
         is_fast = len(events) == FLAPPING_CHANGES and event.time - events[0].time < WINDOW
         events.append(event)
         if is_fast:
-            self._untold[key] += 1
+            self._suppressed[key] += 1
         return is_fast
 
 
 @dataclass(slots=True)
 class _Burst:
-    """Losses or rejections in a row, which are reported once."""
+    """A burst of losses or rejections, reported once."""
 
     begin: float = 0.0
     end: float = 0.0

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from nedbus.extras import lazy_exports
 
 from .http_server import HttpServer, Page, leads_here
-from .observer import Observer, Sight
+from .observer import Observer, Snapshot
 from .pages import service_pages, why_not_ready
 
 if TYPE_CHECKING:
@@ -13,4 +13,4 @@ if TYPE_CHECKING:
 else:
     __getattr__ = lazy_exports(__name__, {"Exporter": ("metrics", "exporter")})
 
-__all__ = ["Exporter", "HttpServer", "Observer", "Page", "Sight", "leads_here", "service_pages", "why_not_ready"]
+__all__ = ["Exporter", "HttpServer", "Observer", "Page", "Snapshot", "leads_here", "service_pages", "why_not_ready"]

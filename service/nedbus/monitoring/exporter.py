@@ -1,4 +1,4 @@
-"""An exporter: metrics of all that a reader receives, for networks where no service of ours serves metrics.
+"""Exporter of metrics that subscribes like any reader, for networks without a nedbus service to scrape.
 
 Needs the extra `metrics`.
 """
@@ -25,7 +25,7 @@ from nedbus_msgs import Address, Selection
 from .http_server import Page
 from .metrics import (
     MAX_STREAMS,
-    Stream,
+    MeasuredStream,
     build_info,
     is_switched_off,
     make_metrics,
@@ -33,21 +33,22 @@ from .metrics import (
     stream_metrics,
     vehicle_metrics,
 )
-from .observer import Observer, Sight
+from .observer import Observer, Snapshot
 from .pages import vehicles_page
 
-_LOOK_PERIOD: Final = 0.5  # s between two looks at all vehicles
-_MAX_SOURCES: Final = 4 * MAX_STREAMS  # addresses whose source is remembered
-_MAX_ROUTERS: Final = 16  # that are shown: any peer may claim to be one
-_ROUTERS_PERIOD: Final = 30.0  # s between two queries of all routers: 183 bytes for each of their sessions
-_ROUTERS_TIMEOUT: Final = 5.0  # s for all answers, over a slow link perhaps
-_SESSION_TIMEOUT: Final = 1.0  # s
+_POLL_INTERVAL: Final = 0.5  # s between polls of all vehicles
+_MAX_SOURCES: Final = 4 * MAX_STREAMS  # addresses whose source is kept
+_MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
+_ROUTERS_INTERVAL: Final = 30.0  # s between router queries; a reply has 183 bytes per session
+_ROUTERS_TIMEOUT: Final = 5.0  # s for all replies; the link may be slow
+_SESSION_TIMEOUT: Final = 1.0  # s to open the session for router queries
 
 
 class Exporter:
-    """Read all that a selection matches: an `account` of it, and `pages` by path.
+    """Subscribe to a selection and serve metrics about it.
 
-    `watch` gets each sample as well, and `on_look` the sight of all vehicles twice a second.
+    `account`: the events and states of its vehicles; `pages`: the HTTP pages by path.
+    `on_sample` is called with each sample, `on_poll` with a `Snapshot` of all vehicles twice a second.
     """
 
     def __init__(
@@ -56,11 +57,11 @@ class Exporter:
         selection: Selection,
         *,
         version: str,
-        watch: Callable[[Sample[Any]], object] = lambda _: None,
-        on_look: Callable[[Sight], object] = lambda _: None,
+        on_sample: Callable[[Sample[Any]], object] = lambda _: None,
+        on_poll: Callable[[Snapshot], object] = lambda _: None,
     ) -> None:
         self._bus, self._version = bus, version
-        self._watch, self._on_look = watch, on_look
+        self._on_sample, self._on_poll = on_sample, on_poll
         self._observer = Observer(bus, selection)
         self._subscription, self.account = self._observer.subscription, self._observer.account
         self.pages: Mapping[str, Callable[[], Page]] = {
@@ -76,20 +77,20 @@ class Exporter:
         self._sources: dict[Address, str] = {}
 
     def run(self, stop: threading.Event) -> None:
-        """Read until `stop` is set; raise the error that ends the reader before."""
+        """Run until `stop` is set; raise the error that stopped the reader early."""
         with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
             tasks = pool.submit(self._read), pool.submit(self._ask_routers, stop)
             for task in tasks:
                 task.add_done_callback(lambda _: stop.set())
             try:
-                while not stop.wait(_LOOK_PERIOD):
-                    sight = self._observer.look()
-                    self._alive = sight.alive
-                    self._on_look(sight)
+                while not stop.wait(_POLL_INTERVAL):
+                    snapshot = self._observer.poll()
+                    self._alive = snapshot.alive
+                    self._on_poll(snapshot)
             finally:
                 stop.set()
                 if self._session is not None:
-                    self._session.close()  # which ends a query that a router does not answer
+                    self._session.close()  # aborts a query that a router does not answer
                 self._subscription.close()
             for task in tasks:
                 task.result()
@@ -110,9 +111,9 @@ class Exporter:
         yield from stream_metrics(streams, messages="nedbus_messages_received")
         yield from vehicle_metrics(self.account, streams)
 
-    def _streams(self) -> list[Stream]:
+    def _streams(self) -> list[MeasuredStream]:
         return [
-            Stream(
+            MeasuredStream(
                 (address.vehicle, address.stream, self._sources.get(address, "")), health,
                 address in self._alive or not is_switched_off(health), latencies,
             )
@@ -124,21 +125,21 @@ class Exporter:
             self._observer.add(sample)
             if sample.address in self._sources or len(self._sources) < _MAX_SOURCES:
                 self._sources[sample.address] = sample.source or ""
-            self._watch(sample)
+            self._on_sample(sample)
 
     def _ask_routers(self, stop: threading.Event) -> None:
-        """Ask all routers for their sessions now and then, until `stop` is set.
+        """Query the session counts of all routers periodically, until `stop` is set.
 
-        In a session of its own: the answer of a router with 1,000 sessions, 183 kB, does not hold up messages.
+        A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
         """
         while not stop.is_set():
             states: list[RouterState] = []
-            with suppress(NedbusError):  # no room for this session, a broken link: then nothing is known
+            with suppress(NedbusError):  # the router is full or the link is down: export no counts
                 self._session = self._session or self._bus.open_session(timeout=_SESSION_TIMEOUT)
                 if not stop.is_set():
                     states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
             self._routers = states[:_MAX_ROUTERS]
-            stop.wait(_ROUTERS_PERIOD)
+            stop.wait(_ROUTERS_INTERVAL)
         if self._session is not None:
             self._session.close()
 

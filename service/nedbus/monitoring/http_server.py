@@ -1,4 +1,4 @@
-"""A read-only HTTP server: one page per path."""
+"""Read-only HTTP server with one page per path."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from nedbus.settings import is_loopback, split_http
 
 _log = logging.getLogger(__name__)
 
-_MAX_REQUESTS: Final = 16  # at the same time
-_CLIENT_TIMEOUT: Final = 5.0  # s to send a request, to read the answer, and to wait for a free thread
-_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # a Prometheus or a probe calls a host as it likes
+_MAX_REQUESTS: Final = 16  # concurrent requests
+_CLIENT_TIMEOUT: Final = 5.0  # s to send a request, to read the response, and to wait for a free thread
+_ANY_NAME: Final = {"/metrics", "/healthz", "/readyz", "/vehicles"}  # Prometheus and probes may use any host name
 
 
 class Page(NamedTuple):
-    """An answer: HTTP's status, the type of its content, and the content."""
+    """An HTTP response: status, content type and body."""
 
     status: int
     content_type: str
@@ -33,33 +33,33 @@ class Page(NamedTuple):
 
     @classmethod
     def text(cls, text: str, *, status: int = 200) -> Page:
-        """Return a page of plain text."""
+        """Return a plain-text page."""
         return cls(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
     @classmethod
     def json(cls, content: Mapping[str, Any]) -> Page:
-        """Return a page of JSON."""
+        """Return a JSON page."""
         return cls(200, "application/json", json.dumps(content, indent=2).encode())
 
     @classmethod
     def verdict(cls, faults: list[str], good: str) -> Page:
-        """Return the faults, a line each, with status 503; `good` if there are none."""
+        """Return status 503 with one fault per line, or `good` if there are no faults."""
         return cls.text("\n".join(faults), status=503) if faults else cls.text(good)
 
 
 class HttpServer(ThreadingHTTPServer):
-    """Serve pages by path on HOST:PORT, 16 clients at a time, in threads of its own, until it is closed.
+    """Serve pages by path on HOST:PORT, in up to 16 background threads, until closed.
 
-    DNS rebinding: a foreign page in a browser on this network may point its own name at this host and read what is
-    answered under that name. So a page is answered under names that only lead here: addresses, localhost, the names of
-    this host and, for others than this host, names without a dot, as in Docker. Others may ask by any name for metrics,
-    health, readiness and the states of vehicles.
+    Protects against DNS rebinding, where a web page in a browser on this network points its own host name at this
+    server to read the responses. Pages are served only under host names that such a page cannot control: IP addresses,
+    localhost, this host's own names and, unless bound to loopback, names without a dot, as in Docker. Unless bound to
+    loopback, metrics, health, readiness and vehicle states are served under any name.
 
     Raises ConfigError for anything but HOST:PORT, ListenError when it cannot listen there.
     """
 
     daemon_threads = True
-    request_queue_size = 2 * _MAX_REQUESTS  # with Python's five the sixth that connects at once waits for a second
+    request_queue_size = 2 * _MAX_REQUESTS  # Python's default of 5 makes the sixth concurrent client wait 1 s
 
     def __init__(self, where: str, pages: Mapping[str, Callable[[], Page]]) -> None:
         try:
@@ -78,38 +78,38 @@ class HttpServer(ThreadingHTTPServer):
         threading.Thread(target=self.serve_forever, args=(0.2,), name="nedbus-http", daemon=True).start()
 
     def close(self) -> None:
-        """Stop listening, at once also while a client waits for a free thread."""
+        """Stop listening, without waiting for queued clients."""
         self._free.release(_MAX_REQUESTS)
         self.shutdown()
         self.server_close()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a client in a thread of its own; while all are busy, let it wait a few seconds for one."""
+        """Handle a client in its own thread; wait up to 5 s for a free one, then disconnect the client."""
         if self._free.acquire(timeout=_CLIENT_TIMEOUT):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer a client, and give the thread back."""
+        """Handle a client, then release its thread."""
         try:
             super().process_request_thread(request, client_address)
         finally:
             self._free.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Log a client that went away."""
-        _log.debug("an HTTP client went away", exc_info=True)
+        """Log a client that disconnected."""
+        _log.debug("an HTTP client disconnected", exc_info=True)
 
 
 class _Handler(BaseHTTPRequestHandler):
     server: HttpServer
-    timeout = _CLIENT_TIMEOUT  # of each receive, and of the whole answer
+    timeout = _CLIENT_TIMEOUT  # for each receive, and for the whole response
     server_version = "nedbus"
     sys_version = ""
 
     def handle(self) -> None:
-        """Answer one request; stop receiving from a client that sends it byte by byte."""
+        """Handle one request; stop receiving after the timeout, in case the client sends it byte by byte."""
         deadline = threading.Timer(self.timeout, self._stop_receiving)
         deadline.start()
         try:
@@ -128,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(page.content)
 
-    do_HEAD = do_GET  # noqa: N815 - the name that http.server calls
+    do_HEAD = do_GET  # noqa: N815 - the name http.server calls
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
         _log.debug(format, *args)
@@ -136,15 +136,15 @@ class _Handler(BaseHTTPRequestHandler):
     def _make_page(self, path: str) -> Page:
         pages, is_local = self.server.pages, self.server.is_local
         if path not in pages:
-            return Page.text(f"there is {', '.join(pages)}", status=200 if path == "/" else 404)
-        host = self.headers.get("Host") or "localhost"  # every browser names it
+            return Page.text(f"available pages: {', '.join(pages)}", status=200 if path == "/" else 404)
+        host = self.headers.get("Host") or "localhost"  # every browser sends Host
         if (is_local or path not in _ANY_NAME) and not leads_here(host, local=is_local):
-            return Page.text(f"{path} is answered under an address or a name of this host only", status=403)
+            return Page.text(f"{path} is only served under an IP address or a name of this host", status=403)
         try:
             return pages[path]()
-        except Exception:  # noqa: BLE001 - of one page, not of the server
+        except Exception:  # noqa: BLE001 - one page must not break the server
             _log.exception("%s failed", path, extra=about("bug"))
-            return Page.text("an unexpected error: the log has it", status=500)
+            return Page.text("unexpected error, see the log", status=500)
 
     def _stop_receiving(self) -> None:
         with suppress(OSError):  # the client has disconnected
@@ -152,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def leads_here(host: str, *, local: bool) -> bool:
-    """Return whether a Host header is a name that no foreign page can point at this host."""
+    """Return whether a Host header is a name that a foreign web page cannot point at this host."""
     name = host.rpartition("]")[0][1:] if host.startswith("[") else host.partition(":")[0]
     name = name.lower().removesuffix(".")
     with suppress(ValueError):

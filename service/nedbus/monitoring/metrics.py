@@ -1,7 +1,7 @@
-"""Metrics for Prometheus: of a service, of streams and of vehicles, collected at each scrape.
+"""Prometheus metrics of services, streams and vehicles, collected at each scrape.
 
 Needs the extra `metrics`. Names and units follow https://prometheus.io/docs/practices/naming/.
-Labels: `vehicle`, `topic` as `nedbus list` shows it (estimator_local_position/0), `source` as it was configured.
+Labels: `vehicle`, `topic` as shown by `nedbus list` (estimator_local_position/0), `source` as configured.
 """
 
 from __future__ import annotations
@@ -26,76 +26,81 @@ from nedbus.events import SEVERITIES, Account
 from .http_server import Page
 
 MAX_STREAMS: Final = 1000
-"""Streams with labels of their own, positions first; counts of the rest are added up as vehicle and topic "other"."""
+"""Streams exported individually, positions first; the rest are summed under vehicle and topic "other"."""
 
 SWITCHED_OFF: Final = 3600.0
-"""Seconds of silence after which a stream without a publisher is not active."""
+"""Seconds without a message after which a stream without a publisher counts as inactive."""
 
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
 
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
-    # of a service
-    "nedbus_start_time_seconds": (_GAUGE, (), "When the service started"),
-    "nedbus_sessions": (_GAUGE, ("role",), "Zenoh sessions at the embedded router, or routers of a client"),
-    "nedbus_sessions_max": (_GAUGE, ("role",), "Sessions that the embedded router accepts"),
+    # Services
+    "nedbus_start_time_seconds": (_GAUGE, (), "Start time of the service, seconds since the Unix epoch"),
+    "nedbus_sessions": (
+        _GAUGE, ("role",), "Zenoh sessions open at the embedded router, or routers a client is connected to",
+    ),
+    "nedbus_sessions_max": (_GAUGE, ("role",), "Session limit of the embedded router"),
     "nedbus_vehicle_refused": (
-        _GAUGE, ("vehicle",),
-        "1 for a vehicle that the access rules of the router keep from everybody, 0 for one that they let through",
+        _GAUGE, ("vehicle",), "1 if the router's access rules block a vehicle's messages, 0 if they pass",
     ),
-    "nedbus_messages_published": (_COUNTER, _STREAM, "Messages that were validated and published"),
-    # of an exporter
-    "nedbus_connected": (_GAUGE, (), "1 while there is a link to a router"),
-    "nedbus_messages_dropped": (_COUNTER, (), "Messages for which the exporter was too slow"),
-    "nedbus_messages_invalid": (_COUNTER, (), "Payloads that were no valid message"),
-    "nedbus_queue_messages": (_GAUGE, (), "Messages that wait to be read"),
-    "nedbus_router_sessions": (_GAUGE, ("router",), "Zenoh sessions at a router of the network, by its id"),
-    "nedbus_router_sessions_max": (_GAUGE, ("router",), "Sessions that a router accepts"),
-    "nedbus_messages_received": (_COUNTER, _STREAM, "Messages that arrived here, were valid and were read"),
-    # of streams
-    "nedbus_messages_lost": (_COUNTER, _STREAM, "Messages that were lost in transit before they came here, for good"),
-    "nedbus_time_gaps": (_COUNTER, _STREAM, "Steps of PX4's own time of more than three usual ones"),
-    "nedbus_messages_out_of_order": (_COUNTER, _STREAM, "Messages whose time is before that of the one before"),
-    "nedbus_reboots": (_COUNTER, _STREAM, "Times that PX4's own time began anew"),
-    "nedbus_resets": (_COUNTER, (*_STREAM, "quantity"), "Resets of the estimator, by quantity"),
+    "nedbus_messages_published": (_COUNTER, _STREAM, "Messages validated and published"),
+    # Exporters
+    "nedbus_connected": (_GAUGE, (), "1 while connected to a router"),
+    "nedbus_messages_dropped": (_COUNTER, (), "Messages dropped because the exporter fell behind"),
+    "nedbus_messages_invalid": (_COUNTER, (), "Payloads discarded because they are not valid messages"),
+    "nedbus_queue_messages": (_GAUGE, (), "Messages queued in the exporter"),
+    "nedbus_router_sessions": (_GAUGE, ("router",), "Zenoh sessions open at a router, by router id"),
+    "nedbus_router_sessions_max": (_GAUGE, ("router",), "Session limit of a router, by router id"),
+    "nedbus_messages_received": (_COUNTER, _STREAM, "Valid messages received and read"),
+    # Streams
+    "nedbus_messages_lost": (_COUNTER, _STREAM, "Messages lost in transit and not recovered"),
+    "nedbus_time_gaps": (_COUNTER, _STREAM, "Gaps in PX4 timestamps, longer than three usual intervals"),
+    "nedbus_messages_out_of_order": (_COUNTER, _STREAM, "Messages with a timestamp before the previous message's"),
+    "nedbus_reboots": (_COUNTER, _STREAM, "Reboots detected from PX4 timestamps"),
+    "nedbus_resets": (_COUNTER, (*_STREAM, "quantity"), "Estimator resets, by quantity"),
     "nedbus_stream_age_seconds": (_GAUGE, _STREAM, "Seconds since the last message"),
-    "nedbus_stream_rate_hertz": (_GAUGE, _STREAM, "Messages a second, over the last full second"),
-    "nedbus_stream_usual_rate_hertz": (_GAUGE, _STREAM, "Messages a second that this stream has had so far"),
-    "nedbus_stream_jitter_seconds": (_GAUGE, _STREAM, "Standard deviation of the intervals of the last second"),
-    "nedbus_stream_flag_ratio": (
-        _GAUGE, (*_STREAM, "flag"), "Share of the messages of the last second with this flag set",
+    "nedbus_stream_rate_hertz": (_GAUGE, _STREAM, "Messages per second over the last full second"),
+    "nedbus_stream_usual_rate_hertz": (_GAUGE, _STREAM, "Usual message rate of the stream so far"),
+    "nedbus_stream_jitter_seconds": (
+        _GAUGE, _STREAM, "Standard deviation of the intervals between messages over the last second",
     ),
-    "nedbus_latency_seconds": (_HISTOGRAM, _STREAM, "Time from the publisher to here, by the clocks of both hosts"),
-    "nedbus_streams": (_GAUGE, (), "Streams that are known"),
-    # of vehicles
-    "nedbus_vehicle_state": (_GAUGE, ("vehicle", "state"), "1 for the state that a vehicle is in"),
+    "nedbus_stream_flag_ratio": (
+        _GAUGE, (*_STREAM, "flag"), "Fraction of the last second's messages that have the flag set",
+    ),
+    "nedbus_latency_seconds": (
+        _HISTOGRAM, _STREAM, "Latency from the publisher to this host; assumes synchronized clocks",
+    ),
+    "nedbus_streams": (_GAUGE, (), "Known streams"),
+    # Vehicles
+    "nedbus_vehicle_state": (_GAUGE, ("vehicle", "state"), "1 for the current state of a vehicle, 0 for the others"),
     "nedbus_vehicle_condition": (
         _GAUGE, ("vehicle", "condition"),
-        "1 for what holds, or happened in the last minute, and is bad or to be watched",
+        "1 for each condition of severity bad or watch that holds or occurred in the last minute",
     ),
-    "nedbus_vehicle_events": (_COUNTER, ("vehicle", "severity"), "Events of a vehicle"),
-    # of sources
-    "nedbus_source_rejected": (_COUNTER, _SOURCE, "Messages that were not published, whatever rule they violate"),
+    "nedbus_vehicle_events": (_COUNTER, ("vehicle", "severity"), "Events of a vehicle, by severity"),
+    # Sources
+    "nedbus_source_rejected": (_COUNTER, _SOURCE, "Messages rejected by validation and not published"),
     "nedbus_messages_rejected": (
-        _COUNTER, ("source", "rule"), "Messages that were not published, by the rule they violate",
+        _COUNTER, ("source", "rule"), "Messages rejected by validation and not published, by violated rule",
     ),
-    "nedbus_source_lost": (_COUNTER, _SOURCE, "Messages that were lost before they reached the source"),
+    "nedbus_source_lost": (_COUNTER, _SOURCE, "Messages lost before they reached the source"),
     "nedbus_source_addresses": (
-        _GAUGE, _SOURCE, "Addresses of a replay, or those that a live source publishes now: 0 while nothing arrives",
+        _GAUGE, _SOURCE, "Addresses of a replay, or those a live source currently publishes; 0 while nothing arrives",
     ),
-    "nedbus_source_state": (_GAUGE, ("source", "state"), "1 for the state that a source is in"),
-    "nedbus_source_restarts": (_COUNTER, _SOURCE, "Times that a source failed, and began again"),
+    "nedbus_source_state": (_GAUGE, ("source", "state"), "1 for the current state of a source, 0 for the others"),
+    "nedbus_source_restarts": (_COUNTER, _SOURCE, "Restarts of a source after a failure"),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
 }  # fmt: skip
-"""Each metric by its name: its type, its labels, and its help text."""
+"""The type, labels and help text of each metric, by name."""
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
-    """The measurements of one stream; `labels`: vehicle, topic and source.
+class MeasuredStream:
+    """Measurements of one stream, labelled with vehicle, topic and source.
 
-    `active` unless its source has ended, or its vehicle was switched off: then it has counts, and no age or rate.
+    `active` is False once the source has ended or the vehicle is off; then only counts are exported, no age or rate.
     """
 
     labels: tuple[str, str, str]
@@ -105,7 +110,7 @@ class Stream:
 
 
 def metrics_page(metrics: Iterable[core.Metric]) -> Page:
-    """Return metrics, and those of this process, in Prometheus's text format."""
+    """Return these metrics and those of this process in Prometheus's text format."""
 
     class Metrics(Collector):
         def collect(self) -> Iterator[core.Metric]:
@@ -116,13 +121,13 @@ def metrics_page(metrics: Iterable[core.Metric]) -> Page:
 
 
 def build_info(version: str) -> core.Metric:
-    """Return the versions of nedbus, Python and Zenoh."""
+    """Return the info metric with the versions of nedbus, Python and Zenoh."""
     versions = {"version": version, "python": platform.python_version(), "zenoh": version_of("eclipse-zenoh")}
     return core.InfoMetricFamily("nedbus_build", "Versions", value=versions)
 
 
 def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[core.Metric]:
-    """Yield metrics by name with their series: the values of the labels, and a value, or buckets and sum."""
+    """Yield the named metrics; each row has the label values, then a value or a histogram's buckets and sum."""
     for name, rows in series.items():
         kind, labels, text = METRICS[name]
         metric = kind(name, text, labels=labels)
@@ -132,13 +137,13 @@ def make_metrics(series: Mapping[str, Iterable[tuple[Any, ...]]]) -> Iterator[co
 
 
 def is_switched_off(health: Health) -> bool:
-    """Return whether a stream without a publisher has been silent long enough to be taken for switched off."""
+    """Return whether a stream without a publisher has been silent long enough to count as switched off."""
     return health.age is not None and health.age >= SWITCHED_OFF
 
 
-def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core.Metric]:
-    """Yield the metrics of streams; `messages` is the name of the counter of messages."""
-    streams = sorted(streams, key=lambda stream: not stream.health.resets)  # which only positions have
+def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Iterator[core.Metric]:
+    """Yield the stream metrics; `messages` is the name of the message counter."""
+    streams = sorted(streams, key=lambda stream: not stream.health.resets)  # only positions have resets
     named = streams[:MAX_STREAMS]
     rest = [replace(stream, labels=("other", "other", stream.labels[2])) for stream in streams[MAX_STREAMS:]]
     active = [stream for stream in named if stream.active]
@@ -149,7 +154,7 @@ def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core
             totals[stream.labels] += getattr(stream.health, attribute)
         return totals.items()
 
-    def measure(attribute: str, of: Iterable[Stream] = active) -> Iterator[tuple[tuple[str, ...], float]]:
+    def measure(attribute: str, of: Iterable[MeasuredStream] = active) -> Iterator[tuple[tuple[str, ...], float]]:
         values = ((stream.labels, getattr(stream.health, attribute)) for stream in of)
         return ((labels, value) for labels, value in values if value is not None)
 
@@ -159,7 +164,7 @@ def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core
         "nedbus_time_gaps": count("gaps"),
         "nedbus_messages_out_of_order": count("out_of_order"),
         "nedbus_reboots": count("reboots"),
-        # Without a rate, alerts would take an age for silence.
+        # Streams without a nominal rate are silent by nature: an age would trigger alerts.
         "nedbus_stream_age_seconds": measure("age", [stream for stream in active if stream.health.nominal]),
         "nedbus_stream_rate_hertz": measure("rate"),
         "nedbus_stream_usual_rate_hertz": measure("usual_rate"),
@@ -177,8 +182,8 @@ def stream_metrics(streams: Sequence[Stream], *, messages: str) -> Iterator[core
     })  # fmt: skip
 
 
-def vehicle_metrics(account: Account, streams: Iterable[Stream]) -> Iterator[core.Metric]:
-    """Yield the metrics of vehicles; one without an active stream has counts, and no state."""
+def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
+    """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
     now, vehicles = time.time(), list(account.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
     states = {name: account.state(name, now) for name in vehicles if name in active}
@@ -196,7 +201,7 @@ def vehicle_metrics(account: Account, streams: Iterable[Stream]) -> Iterator[cor
 
 
 def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
-    """Yield all metrics of a daemon."""
+    """Yield all metrics of a service."""
     sources = _by_label(daemon.measures)
     yield build_info(daemon.version)
     yield from make_metrics({
@@ -227,7 +232,7 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
 
 
 def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
-    """Return each source by its label: two that are configured alike must not be one time series."""
+    """Return the sources by label, numbered where two have the same text: time series must be unique."""
     seen: Counter[str] = Counter()
     labelled = {}
     for measures in sources:
@@ -237,11 +242,11 @@ def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:
     return labelled
 
 
-def _streams(source: str, measures: SourceMeasures) -> Iterator[Stream]:
+def _streams(source: str, measures: SourceMeasures) -> Iterator[MeasuredStream]:
     for stream in measures.streams:
         vehicle, _, topic = stream.address.partition("/")
         is_off = stream.address in measures.status.stale and is_switched_off(stream.health)
-        yield Stream((vehicle, topic, source), stream.health, active=not (measures.status.ended or is_off))
+        yield MeasuredStream((vehicle, topic, source), stream.health, active=not (measures.status.ended or is_off))
 
 
 def _histogram_row(labels: Sequence[str], measured: Histogram) -> tuple[Any, ...]:

@@ -1,4 +1,4 @@
-"""An observer: a reader of a selection, the health of its streams, and the account of its vehicles."""
+"""Reader that tracks the health of the selected streams and the events of their vehicles."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Samp
 from nedbus.events import Account
 from nedbus_msgs import Address, Selection
 
-_MAX_WAITING: Final = 200  # messages that may wait to be read, at any rate
-_MAX_LAG: Final = 1.0  # s of messages that may wait to be read
-_MAX_PAUSE: Final = 2.5  # s between two looks; after a longer one this process was held up itself
-_SETTLING_TIME: Final = 3.0  # s after a link is back, in which what was held up arrives
-_MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one is of a stream that has ended
+_MAX_WAITING: Final = 200  # queued messages that do not yet count as falling behind, at any rate
+_MAX_LAG: Final = 1.0  # s worth of queued messages that do not yet count as falling behind
+_MAX_PAUSE: Final = 2.5  # s between two polls; after a longer pause this process itself was stalled
+_SETTLING_TIME: Final = 3.0  # s after a reconnect until delayed messages have arrived
+_MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one belongs to a stream that has ended
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """Streams, new rejections and the link at one moment [s since the epoch].
+class Snapshot:
+    """Snapshot of the streams, new rejections and the link.
 
-    `alive`: published addresses; `link`, `behind`: the fault of the link, and of this reader itself, "" without one.
+    `time`: seconds since the Unix epoch; `alive`: the published addresses.
+    `link`, `behind`: the fault of the link and of this reader, "" if there is none.
     """
 
     time: float
@@ -35,9 +36,10 @@ class Sight:
 
 
 class Observer:
-    """Read a selection, and look at it twice a second; `account` is what happened, by this host's clock.
+    """Subscribe to a selection and keep an `account` of the events and states of its vehicles, by this host's clock.
 
-    The samples of `subscription` are given to `add` by the thread that reads them; any thread may look.
+    The thread that reads `subscription` passes each sample to `add`. `poll` and `measure` may be called in any thread;
+    call `poll` about twice a second.
     """
 
     def __init__(self, bus: Bus, selection: Selection) -> None:
@@ -47,11 +49,11 @@ class Observer:
         self._monitor = Monitor()
         self._rejections = bus.rejections()
         self._looked: float | None = None
-        self._disconnected = 0.0  # when there was no link, last
-        self._lock = threading.Lock()  # a stream is not in the monitor for a moment while a sample is added
+        self._disconnected = 0.0  # time of the last poll without a link
+        self._lock = threading.Lock()  # while a sample is added, its stream is briefly missing from the monitor
 
     def add(self, sample: Sample[Any]) -> None:
-        """Add a sample that was read just now; the last one of a stream that ended long ago says nothing of now."""
+        """Add a sample just read; the account ignores the cached last sample of a stream that ended long ago."""
         with self._lock:
             is_known = self._monitor.add(sample)
         if is_known or sample.latency is None or sample.latency <= _MAX_AGE:
@@ -59,13 +61,13 @@ class Observer:
             self.account.add(sample.address, sample.message, received, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
-        """Return the health of each stream now, and its latencies."""
+        """Return the current health and latencies of each stream."""
         with self._lock:
             healths = self._monitor.snapshot()
             return {address: (health, self._monitor.latencies(address)) for address, health in healths.items()}
 
-    def look(self) -> Sight:
-        """Look at streams, rejections and the link, and note in the account what changed."""
+    def poll(self) -> Snapshot:
+        """Poll streams, rejections and the link, and record changes in the account."""
         now, connected = time.time(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         with self._lock:
@@ -85,8 +87,8 @@ class Observer:
         paused, self._looked = self._looked is not None and now - self._looked > _MAX_PAUSE, now
         rate = sum(health.usual_rate or 0.0 for health in healths.values())
         is_behind = paused or waiting > max(_MAX_WAITING, _MAX_LAG * rate)
-        self.account.look(now, states, link=link, dropped=dropped, is_behind=is_behind)
+        self.account.update(now, states, link=link, dropped=dropped, is_behind=is_behind)
         behind = ""
         if self.account.overload is not None:
-            behind = f"this reader does not read in time: {waiting} messages wait, {dropped} were never read"
-        return Sight(now, alive, rejected, link, healths, behind)
+            behind = f"this reader falls behind: {waiting} messages queued, {dropped} dropped"
+        return Snapshot(now, alive, rejected, link, healths, behind)

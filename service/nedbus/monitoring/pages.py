@@ -1,4 +1,4 @@
-"""The pages of a service: /metrics, /healthz, /readyz, /vehicles and /status."""
+"""HTTP pages of a service: /metrics, /healthz, /readyz, /vehicles and /status."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from nedbus.extras import needs
 
 from .http_server import Page
 
-_MAX_BUSY: Final = 20.0  # s that a source may take for one message
+_MAX_BUSY: Final = 20.0  # s that a source may spend on one message
 
 
 def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
-    """Return the pages of a daemon by path."""
+    """Return the pages of a service by path."""
     return {
         "/metrics": lambda: _metrics(daemon),
         "/healthz": lambda: _health(daemon),
@@ -28,7 +28,7 @@ def service_pages(daemon: Daemon) -> Mapping[str, Callable[[], Page]]:
 
 
 def vehicles_page(report: AccountReport) -> Page:
-    """Return the states of all vehicles; only the faults, with 503, if there are any."""
+    """Return the state of each vehicle, or status 503 with the faults if there are any."""
     faults = faults_of([report], Expectation(well=True))
     lines = [
         f"{name} {vehicle.text}{since_text(vehicle.since, report.now)}"
@@ -39,15 +39,15 @@ def vehicles_page(report: AccountReport) -> Page:
 
 
 def why_not_ready(daemon: Daemon) -> list[str]:
-    """Return the reasons why a service is not ready: no router, one that refuses it, or a source that is silent."""
+    """Return the reasons why a service is not ready: no router, a refused vehicle, or a silent source."""
     if not daemon.ready.is_set():
-        return [f"the service starts: {' or '.join(daemon.endpoints)}"]
+        return [f"the service is starting: {' or '.join(daemon.endpoints)}"]
     reasons = []
     if daemon.role == "client" and not daemon.sessions:
         reasons.append(f"no router answers at {' or '.join(daemon.endpoints)}")
     reasons += _refusals(daemon)
     for source in daemon.sources:
-        silent = source.state == "waiting" and not source.addresses  # a replay that waits for a reader has some
+        silent = source.state == "waiting" and not source.addresses  # a replay waiting for a reader has addresses
         if silent or source.state in {"starting", "retrying", "failed"}:
             what = "nothing arrives" if silent else source.state
             reasons.append(f"{source.source}: {what}{f': {source.error}' if source.error else ''}")
@@ -55,13 +55,13 @@ def why_not_ready(daemon: Daemon) -> list[str]:
 
 
 def _one_line(text: str) -> str:
-    return "".join(each if each.isprintable() else " " for each in text)  # a reason quotes what a peer sent
+    return "".join(each if each.isprintable() else " " for each in text)  # a reason may quote a peer's text
 
 
 def _health(daemon: Daemon) -> Page:
     reasons, busy = _refusals(daemon), daemon.busy
     if busy >= _MAX_BUSY:
-        reasons.append(f"a source has been at one message for {busy:.0f} s")
+        reasons.append(f"a source has been blocked on one message for {busy:.0f} s")
     return Page.verdict(reasons, "ok")
 
 

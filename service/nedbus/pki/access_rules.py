@@ -1,7 +1,7 @@
-"""Access rules of a fleet: the part of a router's configuration file that names the vehicles, made from a list.
+"""Access rules of a fleet: generate the part of a router's configuration file that names the vehicles.
 
-Zenoh's access control has no patterns for names, and none for key expressions that contain them: each vehicle needs a
-rule, a subject and a policy of its own. These stand between marks in the file; everything else in it stays as it is.
+Zenoh's access control has no patterns for common names or for key expressions derived from them, so each vehicle needs
+its own rule, subject and policy. These go between marks in the file; the rest of the file is left as it is.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _BLOCK: Final = re.compile(
 _SUBJECT: Final = re.compile(
     rf'^[ \t]*\{{ id: "{CERTIFICATE_PREFIX}([A-Za-z0-9_-]+)", cert_common_names: ', re.MULTILINE
 )
-# A vehicle sends: data, last values, retransmissions (@adv), downsampled copies (@rate), liveliness, probes of
-# `nedbus doctor`, rejection reports, and a status.
+# A vehicle sends data, last values, retransmissions (@adv), downsampled copies (@rate), liveliness tokens, probes of
+# `nedbus doctor`, rejection reports and a status.
 _MESSAGES: Final = '["put", "delete", "reply", "declare_queryable", "liveliness_token"]'
 _KEYS: Final = (
     "{p}/{v}/**",
@@ -42,19 +42,19 @@ _KEYS: Final = (
 
 
 def read_access_rules(file: Path) -> list[str]:
-    """Return the vehicles that a router's file names between its marks; raise ConfigError as `write_access_rules`."""
+    """Return the vehicles between the marks of a router's file; raises ConfigError like `write_access_rules`."""
     return _SUBJECT.findall(_find_blocks(file)[1]["content"])
 
 
 def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEFAULT_PREFIX) -> None:
-    """Write rules for exactly these vehicles into a router's file, whole or not at all; nothing else in it changes.
+    """Write rules for exactly these vehicles into a router's file, atomically; the rest of the file is left as it is.
 
-    Raises AddressError for an invalid vehicle; ConfigError for no vehicle at all, and for a file that cannot be read or
-    written or has no marks, which are those of `config/router-secure.json5`.
+    Raises AddressError for an invalid vehicle; ConfigError without any vehicle, and for a file that cannot be read or
+    written, or lacks the marks of `config/router-secure.json5`.
     """
     check_prefix(prefix)
     names = sorted(set(vehicles))
-    if not names:  # Zenoh takes no subject without names: the router would not start
+    if not names:  # a router does not start with a subject without names
         raise ConfigError.in_file(file, "name at least one vehicle")
     text, sections = _find_blocks(file)[0].string, iter(_sections(names, prefix))
 
@@ -70,26 +70,26 @@ def write_access_rules(file: Path, vehicles: Iterable[str], *, prefix: str = DEF
 
 
 def _find_blocks(file: Path) -> list[re.Match[str]]:
-    """Return the blocks between marks: in the rules, the subjects and the policies."""
+    """Return the blocks between the marks: rules, subjects and policies."""
     try:
         blocks = list(_BLOCK.finditer(file.read_text(encoding="utf-8")))
     except OSError as exc:
         raise ConfigError.in_file(file, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
     except UnicodeDecodeError as exc:
-        raise ConfigError.in_file(file, "this is not text in UTF-8") from exc
+        raise ConfigError.in_file(file, "not UTF-8 text") from exc
     if len(blocks) != 3:
         reason = (
             f"it has {len(blocks)} of 3 pairs of lines '{_BEGIN}' and '{_END}', in rules, subjects and policies of"
-            " access_control: take config/router-secure.json5 as a start"
+            " access_control: start from config/router-secure.json5"
         )
         raise ConfigError.in_file(file, reason)
     return blocks
 
 
 def _sections(vehicles: Sequence[str], prefix: str) -> tuple[list[str], list[str], list[str]]:
-    """Return the lines of the rules, the subjects and the policies, in the order of the file.
+    """Return the lines of rules, subjects and policies, in the order of the file.
 
-    One subject is of all vehicles, for what each of them may, and one of each; a certificate may match both.
+    There is one subject for all vehicles, for their common permissions, and one for each; a certificate matches both.
     """
     names = [certificate_name(vehicle) for vehicle in vehicles]
     rules, subjects, policies = [], [f'{{ id: "vehicles", cert_common_names: {json.dumps(names)} }},'], []

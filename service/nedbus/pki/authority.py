@@ -1,6 +1,6 @@
-"""The authority of a fleet, and the keys and certificates that it signs, lists and renews.
+"""The certificate authority (CA) of a fleet: create, sign, list and renew its keys and certificates.
 
-The access control of `config/router-secure.json5` matches the common name of a certificate.
+The access control in `config/router-secure.json5` matches the common names of certificates.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .certificate import DAYS, MAX_NAME, Certificate
 
 _CA_DAYS: Final = 3650
 _FOREIGN: Final = "signed by another authority"
-_UNFIT: Final = "not of the key beside it"
+_UNFIT: Final = "does not match the key beside it"
 _USAGES: Final = (
     "digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_agreement",
     "key_cert_sign", "crl_sign", "encipher_only", "decipher_only",
@@ -36,26 +36,25 @@ _USAGES: Final = (
 
 
 def make_authority(folder: Path, *, days: int | None = None) -> list[Path]:
-    """Make the CA of a fleet, `ca.key` and `ca.crt`, and return both paths.
+    """Create the CA of a fleet, `ca.key` and `ca.crt`, and return both paths.
 
-    The key signs everything else and belongs to no vehicle and no router.
+    The key signs all other certificates; keep it off vehicles and routers.
 
-    Raises PkiError when there is one already, or the folder cannot be written.
+    Raises PkiError if there is a CA already, or the folder cannot be written.
     """
     key = new_key()
     return write_files(folder / "ca", sign_authority(key, days=days), key)
 
 
 def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days: int | None = None) -> list[Path]:
-    """Make `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
+    """Create `NAME.key` and `NAME.crt`, signed by the CA in the folder, and return both paths.
 
-    `hosts` are the names and addresses under which a router is reached: clients check them.
-    A certificate without hosts is for a client only.
+    `hosts`: names and addresses of a router, which clients check. A certificate without hosts is for clients only.
 
-    Raises PkiError when there is a key of that name already, no CA, or the folder cannot be written.
+    Raises PkiError if there is a key of that name already, no CA, or the folder cannot be written.
     """
     if not name or len(name) > MAX_NAME or "/" in name or name.startswith("."):
-        raise PkiError(f"{name!r} is not a name for a certificate: take 1 to {MAX_NAME} characters without /")
+        raise PkiError(f"{name!r} is not a name for a certificate: use 1 to {MAX_NAME} characters without /")
     authority = Authority.read(folder)
     key = new_key()
     return write_files(folder / name, authority.sign(name, key.public_key(), hosts=hosts, days=days), key)
@@ -65,9 +64,9 @@ def make_certificate(folder: Path, name: str, *, hosts: Sequence[str] = (), days
 class CertificateEntry:
     """A certificate of a folder.
 
-    `name`: its common name, for an authority that of its file.
+    `name`: its common name; for the CA, the name of its file.
     `use`: "authority", "router" or "client".
-    `problem`: the reason that it is of no use before its end, "" if there is none.
+    `problem`: the reason that it is useless even before it expires; "" if there is none.
     """
 
     path: Path
@@ -78,9 +77,9 @@ class CertificateEntry:
 
 
 def list_certificates(folder: Path) -> list[CertificateEntry]:
-    """Return the certificates of an authority's folder, the authority first, then those that end first.
+    """Return the certificates in a CA's folder: the CA's own first, then the others by expiry.
 
-    Raises PkiError when the folder has no authority, or a certificate cannot be read.
+    Raises PkiError if the folder has no CA, or a certificate cannot be read.
     """
     authority = load_certificate(folder / "ca.crt")
     found = [_describe(path, authority) for path in folder.glob("*.crt")]
@@ -88,20 +87,20 @@ def list_certificates(folder: Path) -> list[CertificateEntry]:
 
 
 def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, days: int | None = None) -> list[Path]:
-    """Replace a certificate by one of the same name and hosts that ends later, and return the files that are new.
+    """Replace a certificate with one of the same name and hosts that expires later, and return the new files.
 
-    The old one stays valid until it ends, wherever it is in use; so it does with `replace_key`, with its old key.
-    An authority keeps its key, or all that it signed would be void.
+    The old one remains valid until it expires, even with `replace_key`, together with its old key.
+    A CA keeps its key, as all certificates that it signed would be void otherwise.
 
-    Raises PkiError for one that this folder's authority did not sign, and when a file cannot be read or written.
+    Raises PkiError for a certificate of another CA, and if a file cannot be read or written.
     """
     folder = entry.path.parent
     authority = Authority.read(folder)
     if entry.use == "authority":
         return write_files(folder / "ca", sign_authority(authority.key, days=days), replace=True)
     if entry.problem == _FOREIGN:
-        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it where that authority is")
-    # The private key may be on its vehicle only: the old certificate has all that is needed of it.
+        raise PkiError(f"{entry.path} is {_FOREIGN}: renew it in the folder of that authority")
+    # The private key may be on its vehicle only; the public key is in the old certificate.
     key = new_key() if replace_key else None
     public_key = key.public_key() if key else load_certificate(entry.path).public_key()
     signed = authority.sign(entry.name, public_key, hosts=entry.certificate.hosts, days=days)
@@ -110,28 +109,28 @@ def renew_certificate(entry: CertificateEntry, *, replace_key: bool = False, day
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """The CA of a folder: its certificate, and the key that signs."""
+    """The CA of a folder: its certificate and its private key."""
 
     certificate: x509.Certificate
     key: ec.EllipticCurvePrivateKey
 
     @classmethod
     def read(cls, folder: Path) -> Authority:
-        """Read `ca.crt` and `ca.key`; raise PkiError when they are missing or damaged."""
+        """Read `ca.crt` and `ca.key`; raise PkiError if they are missing or damaged."""
         certificate, path = load_certificate(folder / "ca.crt"), folder / "ca.key"
         try:
             key = serialization.load_pem_private_key(_read(path), password=None)
         except (ValueError, TypeError):
             key = None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise PkiError(f"{path} is not a key that 'nedbus pki ca' made")
+            raise PkiError(f"{path} is not a key of 'nedbus pki ca': restore it, or make a new CA in another folder")
         return cls(certificate, key)
 
     def sign(
         self, name: str, key: CertificatePublicKeyTypes, *, hosts: Sequence[str] = (), days: int | None = None
     ) -> x509.Certificate:
-        """Return the certificate of a key; with hosts it is one of a router, and it ends with the CA at the latest."""
-        # A router is a client of other routers too.
+        """Sign a key, for a router if hosts are given; the certificate never outlives the CA's."""
+        # A router is also a client of other routers.
         purposes = [ExtendedKeyUsageOID.CLIENT_AUTH] + ([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])
         extensions: list[x509.ExtensionType] = [x509.ExtendedKeyUsage(purposes)]
         if hosts:
@@ -140,23 +139,23 @@ class Authority:
 
 
 def sign_authority(key: ec.EllipticCurvePrivateKey, *, days: int | None = None) -> x509.Certificate:
-    """Return the certificate of a CA for its key; certificates that the key signed before stay valid."""
+    """Return a self-signed CA certificate for a key; certificates that the key signed before stay valid."""
     return _sign("nedbus CA", key.public_key(), key, _CA_DAYS if days is None else days, [])
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
-    """Return a new key, on the curve P-256."""
+    """Generate a key on the curve P-256."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
 def write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Write a key into a new file that only its owner can read."""
+    """Write a key to a new file that only its owner can read."""
     pkcs8, plain = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     _write_new(path, key.private_bytes(serialization.Encoding.PEM, pkcs8, plain), 0o600)
 
 
 def write_certificate(path: Path, certificate: x509.Certificate) -> None:
-    """Write a certificate into a new file that all users can read."""
+    """Write a certificate to a new file that all users can read."""
     _write_new(path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
@@ -165,7 +164,7 @@ def write_files(
 ) -> list[Path]:
     """Write `STEM.crt`, and `STEM.key` if a key is given, both or neither, and return their paths.
 
-    Raises PkiError when one of them exists and is not to be replaced, or the folder cannot be written.
+    Raises PkiError if one of them exists and `replace` is false, or if the folder cannot be written.
     """
     paths = [Path(f"{stem}.crt")] if key is None else [Path(f"{stem}.key"), Path(f"{stem}.crt")]
     try:
@@ -176,7 +175,7 @@ def write_files(
                 write_key(parts[0], key)
             write_certificate(parts[-1], certificate)
     except FileExistsError as exc:
-        reason = "it is not overwritten; move it away, or take another folder or name"
+        reason = "it is not overwritten; move it away, or choose another folder or name"
         raise PkiError(f"{exc.filename} exists: {reason}") from exc
     except OSError as exc:
         raise PkiError(f"{stem} cannot be written: {(exc.strerror or str(exc)).lower()}") from exc
@@ -184,18 +183,18 @@ def write_files(
 
 
 def load_certificate(path: Path) -> x509.Certificate:
-    """Read the certificate in a PEM file; raise PkiError when it is missing or damaged."""
+    """Read the certificate in a PEM file; raise PkiError if it is missing or damaged."""
     try:
         return x509.load_pem_x509_certificate(_read(path))
     except ValueError as exc:
-        raise PkiError(f"{path} is not a certificate in PEM: move it away, or make it anew") from exc
+        raise PkiError(f"{path} is not a PEM certificate: move it away, or make a new one") from exc
 
 
 def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as exc:
-        hint = "make the CA first, 'nedbus pki ca'" if path.name == "ca.crt" else "may this user read it?"
+        hint = "run 'nedbus pki ca' first" if path.name == "ca.crt" else "check that this user may read it"
         raise PkiError(f"{path}: {(exc.strerror or str(exc)).lower()}: {hint}") from exc
 
 
@@ -213,7 +212,7 @@ def _sign(
     *,
     issuer: x509.Certificate | None = None,
 ) -> x509.Certificate:
-    """Return the certificate of a key; without an issuer it is that of an authority, signed by itself."""
+    """Return the certificate of a key; without an issuer, that of a CA, signed by itself."""
     is_authority = issuer is None
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     now = dt.datetime.now(dt.UTC)
@@ -229,7 +228,7 @@ def _sign(
         # A vehicle's clock may be behind when it boots.
         .not_valid_before(min(now, until) - dt.timedelta(days=1))
         .not_valid_after(until if issuer is None else min(until, issuer.not_valid_after_utc))
-        # Python asks for both key identifiers from 3.13 on, Zenoh does not.
+        # Python 3.13 and later require both key identifiers, Zenoh does not.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key()), critical=False)
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), critical=True)
@@ -264,5 +263,5 @@ def _find_problem(path: Path, authority: x509.Certificate) -> str:
     try:
         key = serialization.load_pem_private_key(path.with_suffix(".key").read_bytes(), password=None)
     except (OSError, ValueError, TypeError):
-        return ""  # the key is where it is used, or is not ours to read
+        return ""  # the key is elsewhere, or this user may not read it
     return "" if key.public_key() == certificate.public_key() else _UNFIT

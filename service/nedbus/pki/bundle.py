@@ -1,4 +1,4 @@
-"""A bundle for a vehicle: its certificate, its key, and the configuration that uses them, ready to be copied there."""
+"""Bundle for a vehicle: its certificate, its key, and the configuration that uses them, ready to copy to it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from nedbus.whole_file import whole_file
 from .authority import Authority, new_key, write_certificate, write_key
 from .certificate import certificate_name
 
-_TARGET: Final = Path("/etc/nedbus")  # where the unit and the image look for nedbus.toml
+_TARGET: Final = Path("/etc/nedbus")  # where the systemd unit and the container image look for nedbus.toml
 _IN_WHEEL: Final = Path(__file__).with_name("fleet")
 _TEMPLATES: Final = _IN_WHEEL if _IN_WHEEL.is_dir() else Path(__file__).parents[3] / "packaging" / "fleet"
 
@@ -36,29 +36,29 @@ def make_bundle(
     target: Path | None = None,
     days: int | None = None,
 ) -> list[Path]:
-    """Make a folder of all that a vehicle needs to join these routers, whole or not at all, and return its files.
+    """Create a folder with everything that a vehicle needs to join these routers, atomically, and return its files.
 
-    The authority's folder keeps the certificate, to be listed and renewed; the key is in the bundle only.
-    `target` is where the files will be on the vehicle, by default /etc/nedbus.
+    The CA's folder keeps the certificate, to list and renew it; the key is only in the bundle.
+    `target`: folder of the files on the vehicle, by default /etc/nedbus.
 
-    Raises PkiError when the folder, or a key or certificate of this vehicle, exists already; ConfigError for an
+    Raises PkiError if the output folder, or a key or certificate of this vehicle, exists already; ConfigError for an
     endpoint that is not tls/, AddressError for an invalid vehicle.
     """
     name = certificate_name(vehicle)
     check_endpoints(routers, where="--router")
     for router in routers:
         if not router.startswith("tls/"):
-            raise ConfigError("--router", f"{router!r} shows no certificate: name a tls/ endpoint")
+            raise ConfigError("--router", f"{router!r} does not use TLS: give a tls/ endpoint")
     if not routers:
-        raise ConfigError("--router", "name at least one router, such as tls/192.168.1.5:7447")
+        raise ConfigError("--router", "give at least one router, such as tls/192.168.1.5:7447")
     authority = Authority.read(folder)
     for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
         if path.exists():
-            raise PkiError(f"{path} exists: it is not overwritten; 'nedbus pki list' says until when it is valid")
+            raise PkiError(f"{path} exists: it is not overwritten; 'nedbus pki list' shows when it expires")
     key = new_key()
     certificate = authority.sign(name, key.public_key(), days=days)
     target = target or _TARGET
-    strings = {  # of TOML and YAML; those of JSON are
+    strings = {  # written as JSON, which TOML and YAML read as well
         "routers": list(routers),
         "ca": f"{target}/pki/ca.crt",
         "certificate": f"{target}/pki/{name}.crt",
@@ -87,7 +87,7 @@ def make_bundle(
                 (part / file).write_text(_Template((_TEMPLATES / file).read_text()).substitute(facts))
             part.rename(output)
     except OSError as exc:
-        raise PkiError(f"{output} cannot be made: {(exc.strerror or str(exc)).lower()}") from exc
+        raise PkiError(f"cannot create {output}: {(exc.strerror or str(exc)).lower()}") from exc
     finally:
         shutil.rmtree(part, ignore_errors=True)
     return sorted(path for path in output.rglob("*") if path.is_file())

@@ -1,4 +1,4 @@
-"""The readable part of X.509 certificates: subject, issuer, hosts, validity; and the names of vehicles in them."""
+"""X.509 certificates as text: subject, issuer, hosts and validity; and the common names of vehicles."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from nedbus.extras import needs
 from nedbus_msgs import AddressError, check_vehicle
 
 DAYS: Final = 825
-"""Days for which a certificate is valid."""
+"""Days of validity of a certificate."""
 
 RENEW_WITHIN: Final = 30
-"""Days before its end from which a certificate is due for renewal."""
+"""Days before expiry from which a certificate is due for renewal."""
 
 CERTIFICATE_PREFIX: Final = "vehicle-"
-"""The common name of a vehicle's certificate is this and its id, so that no vehicle can be named like a reader."""
+"""Prefix of the vehicle's id in the common name of its certificate, so no vehicle has the name of a reader."""
 
 MAX_NAME: Final = 64
-"""Characters of a common name, a limit of X.509."""
+"""Characters of the longest common name that X.509 allows."""
 
 
 def certificate_name(vehicle: str) -> str:
@@ -34,7 +34,7 @@ def certificate_name(vehicle: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """One certificate: common names of its subject and its issuer, its hosts, and its validity, UTC."""
+    """One certificate: common names of subject and issuer, hosts, and validity (UTC)."""
 
     subject: str
     issuer: str
@@ -44,11 +44,11 @@ class Certificate:
 
     @classmethod
     def decode(cls, data: bytes, *, pem: bool = False) -> Certificate:
-        """Decode a certificate in DER, or the first one of a text with `pem`; it may come from any peer.
+        """Decode a DER certificate, or with `pem` the first one of a PEM text; it may come from any peer.
 
-        Python's `ssl` decodes verified certificates only, the package `cryptography` any: a vehicle runs without it.
+        Uses the optional package `cryptography`, as Python's `ssl` decodes only verified certificates.
 
-        Raises ValueError for anything else, ConfigError (a ValueError too) without the extra `pki`.
+        Raises ValueError for anything else, ConfigError (also a ValueError) without the extra `pki`.
         """
         x509 = needs("pki", "cryptography.x509")
         try:
@@ -62,7 +62,7 @@ class Certificate:
 
     @classmethod
     def read(cls, path: str | Path) -> Certificate:
-        """Read the first certificate of a PEM file; raise ValueError and ConfigError as `decode` does, OSError."""
+        """Read the first certificate of a PEM file; raise OSError, and ValueError or ConfigError as `decode` does."""
         return cls.decode(Path(path).read_bytes(), pem=True)
 
     def days_left(self, now: dt.datetime) -> float:
@@ -70,7 +70,7 @@ class Certificate:
         return (self.ends - now) / dt.timedelta(days=1)
 
     def is_due(self, now: dt.datetime, within: float = RENEW_WITHIN) -> bool:
-        """Return whether it is due for renewal: it ends within these days, or has ended."""
+        """Return whether it is due for renewal: it expires within these days, or has expired."""
         return self.days_left(now) <= within
 
     def __str__(self) -> str:

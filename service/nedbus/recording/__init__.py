@@ -1,6 +1,6 @@
-"""Recordings and logs as files: write and read MCAP, read .ulg, load either as arrays, and plot them.
+"""MCAP recordings and .ulg logs: write and read MCAP, read .ulg, load either as arrays, and plot them.
 
-Each name loads its module when it is first used: MCAP files and plots need extras, and NumPy is slow to import.
+Each name imports its module on first use: MCAP and plots need extras, and NumPy is slow to import.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .utc import UtcOffset, utc_of
     from .writer import RecordingWriter
 else:
-    # No submodule has the name of an export: importing it would replace the export.
+    # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "alignment"): "align",
         ("", "arrays"): "Flight addresses_of missing_of read",

@@ -1,4 +1,4 @@
-"""Align streams: one table of the values of several streams at the times of one of them."""
+"""Time alignment of several streams into one table."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     import polars as pl
 
 _METHODS: Final = ("last", "nearest", "linear")
-_PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # by the unit of an angle
-_MAX_ROWS: Final = 10_000_000  # of a table at a rate: a damaged timestamp must not fill the memory
-_STRAY: Final = 0.01  # of the messages may be out of order; more are several boots
-_PARALLEL: Final = 1 - 1e-9  # cosine from which two quaternions are as good as equal
+_PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
+_MAX_ROWS: Final = 10_000_000  # rows of a table resampled at a rate; a damaged timestamp must not exhaust memory
+_STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
+_PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
 
 _Floats = npt.NDArray[np.float64]
@@ -61,24 +61,24 @@ def align(
     utc: bool = False,
     dataframe: Library = None,
 ) -> Any:
-    """Return one table by time of several streams of a .ulg log, an .mcap recording, or arrays of `read`.
+    """Return several streams of a .ulg log, an .mcap recording, or arrays from `read` as one table, aligned in time.
 
-    `topics` are those of `read`; by default all, but of a log only those that have a file here.
-    `on` gives the rows: a stream, whose messages they are, a rate [Hz], or times as PX4's `timestamp` has them [us].
-    Columns are `timestamp` [us], and of each stream `<stream>.<field>` and `<stream>.age` [s]: the time since the
-    message that the values are from, NaN where there is none yet; then floats are NaN, others 0 or false.
-    With `dataframe` it is a data frame as `read` returns it; a missing value is null.
+    `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
+    `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
+    Columns are `timestamp` [us], and for each stream `<stream>.<field>` and `<stream>.age` [s], the time since the
+    message with these values. Before the first message the age is NaN, floats are NaN, and other values 0 or false.
+    `dataframe`: return a data frame as `read` does, with nulls for missing values.
 
-    `method`: "last" takes the last message that is not later: no value is from the future.
-    "nearest" takes that nearest in time, so that an age can be negative. "linear" interpolates floats between the
-    messages before and after: unit quaternions by slerp, angles the shorter way around. Everything else is the last
-    value, as floats are where a reset counter changes, and after the last message.
-    With `utc`, a column `utc` is the UTC of `utc_of`, NaT without one.
+    `method`: "last" uses the last message at or before each row, so no value is from the future.
+    "nearest" uses the message nearest in time; its age can be negative. "linear" interpolates floats between the
+    messages before and after, unit quaternions by slerp and angles the shorter way around. Other types, floats across
+    a change of a reset counter, and rows after the last message keep the last value.
+    `utc`: add a column `utc` with the UTC from `utc_of`, NaT if it has none.
 
-    Raises ConfigError for several boots of a vehicle in one stream: they have no common time; errors of `read`.
+    Raises ConfigError if a stream spans several boots of a vehicle, which share no time base, and the errors of `read`.
     """
     if method not in _METHODS:
-        raise ConfigError("method", f"{method!r} is none of {', '.join(_METHODS)}")
+        raise ConfigError("method", f"{method!r} is not one of {', '.join(_METHODS)}")
     reference = [on] if isinstance(on, str) else []
     topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
@@ -127,8 +127,8 @@ def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
 
 
 def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _Floats]:
-    """Return the message for each time, -1 for none, the next one, and the fraction of the way between these two."""
-    if method == "own" or not len(stamps):  # by its place: two messages may have one time
+    """Return for each time the row of its message (-1 for none), the next row, and the fraction of the way to it."""
+    if method == "own" or not len(stamps):  # by index: two messages may share a timestamp
         rows = np.arange(len(times)) if len(stamps) else np.full(len(times), -1)
         return rows, rows, np.zeros(len(times))
     order = np.argsort(stamps, kind="stable")
@@ -143,7 +143,7 @@ def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _F
 
 
 def _interpolate(stream: str, values: MessageArray, following: MessageArray, weight: _Floats) -> None:
-    """Move the floats of messages towards those of the following ones."""
+    """Interpolate the floats of `values` towards `following`, in place."""
     definition = BY_TOPIC.get(stream.partition("/")[0])
     rules = definition.rules if definition else ()
     quaternions = {name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields}
@@ -163,8 +163,11 @@ def _interpolate(stream: str, values: MessageArray, following: MessageArray, wei
 
 
 def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> _Floats:
-    """Return values between two; of angles the shorter way around, from 0 or minus half a period on, as they are."""
-    with np.errstate(invalid="ignore"):  # infinity minus itself, and no period
+    """Interpolate linearly, angles the shorter way around.
+
+    Angles stay in the range of the inputs: from minus half a period if one is negative, else from 0.
+    """
+    with np.errstate(invalid="ignore"):  # infinity minus infinity, and an infinite period
         step = second - first
         turned = first + weight * (step - np.sign(step) * period)
         start = np.where(np.minimum(first, second) < 0, -period / 2, 0.0)
@@ -172,7 +175,7 @@ def _linear(first: _Floats, second: _Floats, weight: _Floats, period: float) -> 
 
 
 def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Floats:
-    """Return unit quaternions between two, of shape (n, 4), on the shorter way."""
+    """Interpolate unit quaternions of shape (n, 4) along the shorter arc."""
     cosine = np.sum(first * second, axis=1, keepdims=True)
     angle = np.arccos(np.minimum(np.abs(cosine), _PARALLEL))
     near = np.where(cosine < 0, -1, 1) * second
@@ -182,26 +185,26 @@ def _slerp(first: _Floats, second: _Floats, weight: _Floats, _: float) -> _Float
 
 
 def _stamps(stream: str, messages: MessageArray) -> _Ints:
-    """Return the timestamps [us]; raise ConfigError where the vehicle's clock starts again."""
+    """Return the timestamps [us]; raise ConfigError if they restart, as after a reboot of the vehicle."""
     stamps: _Ints = np.minimum(messages["timestamp"], 2**62).astype(np.int64)
     late = np.count_nonzero(stamps < np.maximum.accumulate(stamps))
     early = np.count_nonzero(stamps > np.minimum.accumulate(stamps[::-1])[::-1])
     if min(late, early) > max(1, _STRAY * len(stamps)):
-        raise ConfigError(stream, "its timestamps start again: align the messages of one boot, as slices of `read`")
+        raise ConfigError(stream, "timestamps restart: align the messages of each boot separately, as slices of `read`")
     return stamps
 
 
 def _times(on: float | Sequence[int] | _Ints, stamps: Iterable[_Ints]) -> _Ints:
-    """Return times that are given, or those at a rate from the first message to the last one [us]."""
+    """Return the given times, or times at the given rate from the first to the last message [us]."""
     given = np.asarray(on)
     if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
-        raise ConfigError("on", f"{on!r:.60} is none of a stream, a rate above 0 [Hz], and times [us]")
+        raise ConfigError("on", f"{on!r:.60} is neither a stream, nor a rate above 0 [Hz], nor times [us]")
     if given.ndim:
         return given.astype(np.int64)
     every = np.concatenate([*stamps, np.empty(0, np.int64)])
-    every, rate = every[every > 0], float(given)  # 0 is no time
+    every, rate = every[every > 0], float(given)  # a timestamp of 0 is unset
     count = np.ptp(every) / 1e6 * rate + 1 if len(every) else 0
     if count > _MAX_ROWS:
-        raise ConfigError("on", f"{count:.0f} rows at {rate:g} Hz: expected up to {_MAX_ROWS}, or times")
+        raise ConfigError("on", f"{rate:g} Hz gives {count:.0f} rows, above {_MAX_ROWS}: use a lower rate, or times")
     first: int = every.min(initial=2**62)
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

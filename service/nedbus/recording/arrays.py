@@ -1,4 +1,4 @@
-"""Load topics of a log or a recording as NumPy arrays or data frames, with PX4's own types."""
+"""Loading of topics of a log or recording as NumPy arrays or data frames, with PX4's own types."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from nedbus_msgs import (
 )
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
-from .flight_files import SUFFIXES, matching, require_one_vehicle, the_one
+from .flight_files import SUFFIXES, matching, require_one_vehicle, single_match
 from .ulog import UlogTopic, UlogTopics, read_ulog
 
 if TYPE_CHECKING:
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_CHUNK: Final = 65536  # messages of a recording that are decoded together
+_CHUNK: Final = 65536  # messages of a recording decoded at a time
 
 _Mask = npt.NDArray[np.bool_]
 Absent = Mapping[str, _Mask]
-"""For each missing field, a mask of the messages that lack it."""
+"""Masks of the messages that lack a field, by field."""
 Streams = dict[str, tuple[MessageArray, Absent]]
 """The messages of streams, by topic or topic/instance."""
 
@@ -87,18 +87,18 @@ def read(
     instance: int | None = None,
     dataframe: Library = None,
 ) -> Any:
-    """Return one topic of a .ulg log or an .mcap recording as a structured array, one element a message.
+    """Return one topic of a .ulg log or an .mcap recording as a structured array with one element per message.
 
-    Its columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
-    Fields that a layout or a source lacks are NaN, false or 0, and `nedbus.missing_of` names them.
-    Invalid messages and damaged parts of the file are left out, and logged.
-    With `dataframe` it is a data frame of pandas or polars instead, with `delta_xy[0]`, `delta_xy[1]` as columns, where
-    missing fields are null; that of pandas names them in `attrs["missing"]`.
-    For a list of topics, or of streams such as "sensor_gps/1", it is a dict by stream, of one vehicle; "*" stands for
-    all streams of the file, including messages that only the file describes.
+    The columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
+    Fields that a layout or source lacks are NaN, false or 0; `nedbus.missing_of` names them.
+    Invalid messages and damaged parts of the file are skipped and logged.
+    `dataframe`: return a pandas or polars data frame, with array fields as columns `delta_xy[0]`, `delta_xy[1]` and
+    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`.
+    A list of topics, or of streams such as "sensor_gps/1", returns a dict by stream, for one vehicle. "*" selects all
+    streams of the file, including messages that are defined only by the file.
 
-    Raises SourceError for a file that cannot be read, AddressError when no stream, or more than one, matches topic,
-    vehicle and instance, ConfigError when the package that reads the file is not installed.
+    Raises SourceError if the file cannot be read, AddressError if no stream or several streams match topic, vehicle
+    and instance, ConfigError if the package that reads the file is not installed.
     """
     streams = read_streams(path, topic, vehicle=vehicle, instance=instance)
     tables = {name: to_dataframe(messages, absent, dataframe) for name, (messages, absent) in streams.items()}
@@ -108,9 +108,9 @@ def read(
 def read_streams(
     path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
 ) -> Streams:
-    """Return the messages of one stream, or of several of one vehicle.
+    """Return the messages of one stream, or of several streams of one vehicle.
 
-    None is all streams, but of a log only those of known topics.
+    `topics`: None selects all streams, for a log all of known topics.
     """
     path, vehicle = Path(path).expanduser(), vehicle_name(vehicle)
     names = [ANY] if topics is None else [topics] if isinstance(topics, str) else topics
@@ -120,7 +120,7 @@ def read_streams(
         for name in names:
             topic, _, number = name.rpartition("/")
             parts = (topic, vehicle, int(number)) if number.isdecimal() else (name, vehicle, instance)
-            select = the_one if isinstance(topics, str) else matching
+            select = single_match if isinstance(topics, str) else matching
             chosen |= dict.fromkeys(select(path, flight.addresses, Selection(*parts)))
         require_one_vehicle(path, chosen, vehicle)
         streams = {address.stream: found for address, found in flight.read(chosen).items()}
@@ -130,26 +130,26 @@ def read_streams(
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
-    """Return the fields that `read` did not find in some or all of these messages: they hold NaN, false or 0.
+    """Return the fields that some or all of these messages lack; their values are NaN, false or 0.
 
-    It stands in the metadata of the array's dtype, and is kept by slices, masks and copies, but not by `numpy.save`.
+    `read` stores the names in the metadata of the dtype: slices, masks and copies keep them, `numpy.save` does not.
     """
     metadata: Mapping[str, Any] = messages.dtype.metadata or {}
     return frozenset(metadata.get("missing", ()))
 
 
 def addresses_of(path: str | Path) -> list[Address]:
-    """Return the addresses that occur in a .ulg log or an .mcap recording; errors are those of `read`."""
+    """Return the addresses in a .ulg log or an .mcap recording; raises the errors of `read`."""
     with Flight(Path(path).expanduser()) as flight:
         return flight.addresses
 
 
 class Flight:
-    """A .ulg log or an .mcap recording that is open for reading: its addresses, and the messages of each.
+    """A .ulg log or an .mcap recording open for reading: its addresses, and the messages of each.
 
-    `topics`: the topics to read of a log, None for all; `definitions`: the definition of each address.
+    `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
 
-    Raises SourceError for a file that cannot be read.
+    Raises SourceError if the file cannot be read.
     """
 
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
@@ -161,7 +161,7 @@ class Flight:
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
             if not self.definitions:
                 reader.close()
-                raise SourceError(str(path), "no message of PX4's topics is in this recording")
+                raise SourceError(str(path), "this recording has no messages of PX4 topics")
         else:
             log = read_ulog(path, topics=topics)
             self._file, self.definitions = log, {each: topic.definition for each, topic in log.topics.items()}
@@ -176,16 +176,16 @@ class Flight:
 
     @property
     def warnings(self) -> list[str]:
-        """Damage, and messages left out, of what was read so far."""
+        """Damage found and messages left out so far."""
         return [*self._file.warnings, *self._invalid]
 
     @property
     def damaged(self) -> bool:
-        """True if damage cost messages of what was read so far."""
+        """True if damage has cost messages so far."""
         return self._file.damaged
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
-        """Return the messages of each address, and for each field that some of them lack a mask of those."""
+        """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
         if isinstance(self._file, UlogTopics):
             topics = self._file.topics
             return {address: self._valid(address, _decode_ulog(topics[address])) for address in addresses}
@@ -203,11 +203,10 @@ class Flight:
         }
 
     def _valid(self, address: Address, decoded: _Decoded) -> tuple[MessageArray, Absent]:
-        """Leave out invalid messages, and name the fields that are missing."""
+        """Drop the invalid messages, and store the names of missing fields in the dtype."""
         messages, valid, absent = decoded
         if not valid.all():
-            count = f"{np.sum(~valid)} of {len(valid)} messages"
-            self._invalid.append(f"{address.stream}: {count} violate the rules and are left out")
+            self._invalid.append(f"{address.stream}: skipped {np.sum(~valid)} of {len(valid)} messages as invalid")
             messages, absent = messages[valid], absent[valid]
         masks = {name: absent[name] for name in absent.dtype.names or () if absent[name].any()}
         if masks:
@@ -217,7 +216,7 @@ class Flight:
 
 
 class _Decoded(NamedTuple):
-    """Messages of one definition, a mask of the valid ones, and for each field a mask of the messages that lack it."""
+    """Messages of one definition, with a mask of the valid ones and, by field, of those that lack the field."""
 
     messages: MessageArray
     valid: _Mask
@@ -225,7 +224,7 @@ class _Decoded(NamedTuple):
 
     @classmethod
     def empty(cls, definition: Definition[Any], count: int) -> Self:
-        """Return messages of which nothing is provided, and none is valid yet."""
+        """Return `count` messages with no field set and none marked valid."""
         absent = np.zeros(count, [(name, bool) for name in definition.types])
         return cls(arrays_of(definition).absent(count), np.zeros(count, bool), absent)
 
@@ -252,7 +251,7 @@ def _decode_ulog(topic: UlogTopic) -> _Decoded:
 
 
 def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -> _Decoded:
-    """Decode messages all at once, and those that this cannot decide one by one."""
+    """Decode messages vectorized; decode those that this rejects or cannot handle one by one."""
     arrays = arrays_of(definition)
     decoded = _Decoded.empty(definition, len(chunk))
     by_stream: dict[RecordedStream, list[int]] = {}
@@ -276,7 +275,7 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
 
 
 def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> Any:
-    """Return a structured array as a data frame, with nulls where a field is absent; for None as it is."""
+    """Convert a structured array to a data frame with nulls for absent fields; for None return it unchanged."""
     if library is None:
         return messages
     if library not in ("pandas", "polars"):
@@ -294,7 +293,7 @@ def to_dataframe(messages: MessageArray, absent: Absent, library: Library) -> An
             elif name in absent and library == "polars":
                 column = column.scatter(np.flatnonzero(absent[name]), None)
             elif name in absent:
-                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()  # a float has NaN
+                nullable = column if each.dtype.kind == "f" else column.convert_dtypes()  # floats use NaN
                 column = nullable.mask(absent[name])
             columns[part] = column
     data = package.DataFrame(columns)

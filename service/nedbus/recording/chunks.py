@@ -1,7 +1,7 @@
-"""Read the records of an MCAP file chunk by chunk; leave out and report damaged parts.
+"""MCAP file reader that goes chunk by chunk, and skips and reports damaged parts.
 
-The summary, which has a CRC of its own, lists the chunks; without one the records are followed one by one.
-Chunks are unpacked into bounded memory: the readers of the `mcap` package have no limit, and stop at the first damage.
+The summary, which has its own CRC, lists the chunks; without a summary the records are scanned one by one.
+Decompression is bounded in memory; the readers of the `mcap` package have no limit and stop at the first damage.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from nedbus.errors import SourceError
 from .flight_files import open_flight
 
 READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryError, OverflowError, RuntimeError)
-"""The errors of the mcap package and the decompressors for a damaged file."""
+"""Errors that the mcap package and the decompressors raise for a damaged file."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of its records, length of its compression's name
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
 _MESSAGE_HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, times
-_FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, begin of the summary and of its offsets, CRC, magic
+_FOOTER: Final = struct.Struct("<BQQQI8s")  # opcode, length, start of summary and summary offsets, CRC, magic
 _LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _DESCRIPTIONS: Final[dict[int, Any]] = {
     Opcode.SCHEMA: Schema,
@@ -42,22 +42,22 @@ _DESCRIPTIONS: Final[dict[int, Any]] = {
     Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.STATISTICS: Statistics,
 }
-_MAX_SMALL_CHUNK: Final = 2**26  # bytes that any chunk may unpack to: ROS 2 writes 768 kB, nedbus 8 MiB and a message
-_MAX_CHUNK: Final = 2**30  # bytes that a chunk may unpack to
-_MAX_RATIO: Final = 100  # to which a chunk that is not small may be compressed
+_MAX_SMALL_CHUNK: Final = 2**26  # bytes uncompressed, at any ratio; ROS 2 writes 768 kB, nedbus 8 MiB plus a message
+_MAX_CHUNK: Final = 2**30  # bytes uncompressed
+_MAX_RATIO: Final = 100  # compression ratio of chunks above _MAX_SMALL_CHUNK
 _MAX_WARNINGS: Final = 100
-_EPOCH: Final = 10**17  # ns: a later time is a date, an earlier one counts from a vehicle's start
+_EPOCH: Final = 10**17  # ns; above this a time is a Unix time, below it counts from the vehicle's boot
 
-_Place = tuple[int, int, int]  # a record: its opcode, its offset, and the offset of the next one
+_Place = tuple[int, int, int]  # a record: opcode, offset, and offset of the next record
 
 
 class ChunkFile:
-    """An MCAP file that is open for reading.
+    """An MCAP file open for reading.
 
-    `summary`: the schemas, channels, chunk indexes and statistics of the summary; empty without one, or if damaged.
+    `summary`: the schemas, channels, chunk indexes and statistics of the summary; empty if it is absent or damaged.
     `warnings`: the damage found so far; `damaged`: True if it cost messages.
 
-    Raises SourceError for a file that is not MCAP or cannot be opened.
+    Raises SourceError if the file is not MCAP or cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,25 +74,25 @@ class ChunkFile:
         try:
             self._read_summary()
         except READ_ERRORS:
-            self.warn("its index is damaged: it is read without")
+            self.warn("the index is damaged: reading without it")
 
     def parts(self, only: Collection[int] | None = None) -> Iterator[bytes]:
-        """Yield the records of each chunk that is whole, in the order of the file.
+        """Yield the records of each intact chunk, in file order.
 
-        With `only`, chunks in which none of these channels occurs may be left out.
+        `only`: channels of interest; chunks without any of them may be skipped.
         """
         for opcode, offset, end in self._indexed(only) if self._chunks else self._follow():
             record = self._read(offset, end - offset)
             try:
                 yield _unpack_chunk(record) if opcode == Opcode.CHUNK else record
             except READ_ERRORS:
-                self.warn(f"the chunk {_describe(record, offset)} is damaged: its messages are left out", lost=True)
+                self.warn(f"the chunk {_describe(record, offset)} is damaged: its messages are skipped", lost=True)
 
     def warn(self, warning: str, *, lost: bool = False) -> None:
-        """Report something once; `lost` if it cost messages."""
+        """Add a warning unless it was given before; `lost`: the damage cost messages."""
         self.damaged |= lost
         if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
-            self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "there is more damage")
+            self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed")
 
     def _read(self, start: int, size: int) -> bytes:
         self._file.seek(start)
@@ -121,14 +121,14 @@ class ChunkFile:
         self._chunks, self.summary = chunks, records
 
     def _indexed(self, only: Collection[int] | None) -> Iterator[_Place]:
-        """Yield the chunks that the summary lists."""
+        """Yield the chunks listed in the summary."""
         for chunk in self._chunks:
-            channels = chunk.message_index_offsets.keys()  # a chunk that lists none may have any
+            channels = chunk.message_index_offsets.keys()  # a chunk that lists no channels may contain any
             if only is None or not channels or not channels.isdisjoint(only):
                 yield Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
 
     def _follow(self) -> Iterator[_Place]:
-        """Yield each chunk, and each schema, channel and message outside of chunks, from one record to the next."""
+        """Scan the file record by record; yield each chunk, and each schema, channel and message outside of chunks."""
         offset, after_chunk = len(MCAP0_MAGIC), False
         while True:
             begin = self._read(offset, _RECORD_HEAD.size + 64)
@@ -136,12 +136,12 @@ class ChunkFile:
             end = offset + _RECORD_HEAD.size + length
             own_length = _own_length(opcode, begin[_RECORD_HEAD.size :])
             if opcode == 0 or end > self._size or own_length not in (None, length):
-                self.warn(f"cut or damaged: all from byte {offset} of {self._size} on is left out", lost=True)
+                self.warn(f"truncated or damaged: skipped from byte {offset} of {self._size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
-                self.warn(f"damaged: the chunk before byte {offset} is left out", lost=True)
+                self.warn(f"damaged: skipped the chunk before byte {offset}", lost=True)
             after_chunk = opcode == Opcode.CHUNK or (after_chunk and opcode == Opcode.MESSAGE_INDEX)
             if opcode in {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}:
                 yield opcode, offset, end
@@ -149,7 +149,7 @@ class ChunkFile:
 
 
 def _own_length(opcode: int, body: bytes) -> int | None:
-    """Return the length of a record by its own first fields, None for a kind without such fields."""
+    """Return the record length implied by its first fields, None for record types without length fields."""
     if opcode == Opcode.MESSAGE_INDEX:
         return 6 + int.from_bytes(body[2:6], "little")
     if opcode == Opcode.CHUNK:
@@ -159,7 +159,10 @@ def _own_length(opcode: int, body: bytes) -> int | None:
 
 
 def records_of(part: bytes) -> Iterator[McapRecord]:
-    """Yield the records of a part of a file that describe or hold messages; raise one of READ_ERRORS at damage."""
+    """Yield the schemas, channels, messages, chunk indexes and statistics in a part of a file.
+
+    Raises one of READ_ERRORS if the part is damaged.
+    """
     offset = 0
     while offset < len(part):
         opcode, length = _RECORD_HEAD.unpack_from(part, offset)
@@ -175,10 +178,10 @@ def records_of(part: bytes) -> Iterator[McapRecord]:
 
 
 def _unpack_chunk(record: bytes) -> bytes:
-    """Return the records of a chunk; raise one of READ_ERRORS if it is damaged, or would fill the memory."""
+    """Decompress the records of a chunk; raise one of READ_ERRORS if it is damaged or too large."""
     body = ReadDataStream(BytesIO(record[_RECORD_HEAD.size :]))
     chunk = Chunk.read(body)
-    if _RECORD_HEAD.unpack_from(record) != (Opcode.CHUNK, body.count):  # zeros would be an empty chunk
+    if _RECORD_HEAD.unpack_from(record) != (Opcode.CHUNK, body.count):  # all zeros would parse as an empty chunk
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
     if size > max(_MAX_SMALL_CHUNK, min(_MAX_CHUNK, _MAX_RATIO * len(packed))):
@@ -196,7 +199,7 @@ def _unpack_chunk(record: bytes) -> bytes:
 
 
 def _describe(chunk: bytes, offset: int) -> str:
-    """Return the place of a chunk in its file, and the times of its messages."""
+    """Return the byte offset of a chunk and the time range of its messages, as text."""
     if len(chunk) < _RECORD_HEAD.size + _CHUNK_HEAD.size:
         return f"at byte {offset}"
     start, end, *_ = _CHUNK_HEAD.unpack_from(chunk, _RECORD_HEAD.size)

@@ -1,4 +1,4 @@
-"""Plot a log or a recording: the track, altitude and speed, the flags over time, resets, and events."""
+"""Plot of a log or recording: track, altitude, speed, flags over time, resets, and events."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _DPI: Final = 120
 _WIDTH: Final = 12.0  # inches
-_HEIGHT: Final = 6.0  # inches of track, altitude and speed
-_ROW: Final = 0.2  # inches of a row below these
-_FRAME: Final = 0.6  # inches of the title and the axis of the rows
+_HEIGHT: Final = 6.0  # inches for track, altitude and speed
+_ROW: Final = 0.2  # inches per row of flags or events below these
+_FRAME: Final = 0.6  # inches for the title and axis of the rows
 _COLORS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2")
 _WARNING_COLOR: Final = "#d62728"
 _MARKERS: Final[Mapping[Severity, tuple[str, str, float]]] = {
     "bad": ("x", _WARNING_COLOR, 7.0), "watch": ("D", "#e69f00", 5.0), "info": ("|", "#707070", 6.0),
 }  # fmt: skip
-_LEGEND: Final[Mapping[Severity, str]] = {"watch": "an event to watch", "bad": "a bad event"}
+_LEGEND: Final[Mapping[Severity, str]] = {"watch": "watch event", "bad": "bad event"}
 _QUIET: Final = {
     "mode": "mode", "armed": "armed, landed", "disarmed": "armed, landed", "takeoff": "armed, landed",
     "landed": "armed, landed",
 }  # fmt: skip
-"""The events of severity info that are shown, each with its row."""
+"""The plotted events of severity info, each with its row."""
 
 _NEAR: Final = 1.0  # s between an event and the message with its position
 _GAP: Final = 6.0  # points between a mark and its text
 MAX_STREAMS: Final = len(_COLORS)
-"""The number of streams that one plot can show."""
+"""Maximum number of streams in one plot."""
 
-_FLAGS: Final = (  # of the estimate
+_FLAGS: Final = (  # estimator flags
     "xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control", "dead_reckoning",
 )  # fmt: skip
 _HEIGHT_COUNTERS: Final = ("z_reset_counter", "vz_reset_counter")
@@ -55,7 +55,7 @@ _COUNTERS: Final = {f"{name}_reset_counter": name for name in ("xy", "z", "vxy",
 
 
 class _Stream(NamedTuple):
-    """A stream that is drawn, with the times of its messages [s] since the first one of all, and its colour."""
+    """A plotted stream, with the times of its messages since the first message of all streams [s], and its colour."""
 
     address: Address
     messages: MessageArray
@@ -69,7 +69,7 @@ class _Stream(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """An event of a vehicle, from begin to end [s]; one that happens once ends as it begins."""
+    """An event of a vehicle, from begin to end [s]; both are equal for an instantaneous event."""
 
     vehicle: str
     row: str
@@ -82,26 +82,28 @@ class _Mark:
 def draw(
     streams: Sequence[tuple[Address, MessageArray]], path: str | Path, *, title: str, events: Iterable[Event] = ()
 ) -> None:
-    """Write a plot of up to MAX_STREAMS streams; the file's suffix, .png, .svg or .pdf, is its format.
+    """Plot up to MAX_STREAMS streams to a file, in the format of its suffix: .png, .svg or .pdf.
 
-    Each stream has at least one message.
-    Times are seconds since the first message of all, positions local NED in metres; altitude is -z.
-    Fields that `missing_of` names are not drawn, and the plot says so.
-    `events`: of those of the streams' vehicles, bad ones, those to watch, and modes, arming and landing are marked.
+    Each stream must have at least one message.
+    Times are seconds since the first message of all streams, positions local NED in metres; altitude is -z.
+    Fields named by `missing_of` are not plotted; a note lists them.
+    `events`: for the streams' vehicles, events of severity bad or watch, mode changes, arming and landing are marked.
 
-    Raises ConfigError for another suffix, OutputError when the file cannot be written; then there is none.
+    Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
     if Path(path).suffix not in _SUFFIXES:
-        raise ConfigError(str(path), f"expected a picture: a file that ends with {' or '.join(_SUFFIXES)}")
+        raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):
-            draw_figure(streams, title=title, events=events).savefig(part)  # a character that the font lacks is a box
+            draw_figure(streams, title=title, events=events).savefig(
+                part
+            )  # a glyph missing in the font is only a warning
     except OSError as exc:
         raise OutputError(Path(path), exc) from exc
 
 
 def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, events: Iterable[Event] = ()) -> Figure:
-    """Return the plot that `draw` writes."""
+    """Return the figure that `draw` saves."""
     start = min(int(messages["timestamp"][0]) for _, messages in streams)
     drawn = [
         _Stream(address, messages, (messages["timestamp"].astype(np.int64) - start) / 1e6, color)
@@ -129,8 +131,8 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
     times = np.concatenate([*(stream.seconds for stream in drawn), *([mark.begin, mark.end] for mark in marks)])
     margin = 0.02 * (np.ptp(times) or 1.0)
     for name in axes.keys() - {"track"}:
-        axes[name].set_xlim(times.min() - margin, times.max() + 3 * margin)  # with room for the last text
-    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a name of a file may have any bytes
+        axes[name].set_xlim(times.min() - margin, times.max() + 3 * margin)  # room for the last label
+    figure.suptitle(title.encode(errors="replace").decode(), parse_math=False)  # a file name may have any bytes
     figure.supxlabel(_explain_missing(drawn), fontsize="small")
     axes["events" if by_row else "flags"].set_xlabel("time [s]")
     if by_row:
@@ -139,7 +141,7 @@ def draw_figure(streams: Sequence[tuple[Address, MessageArray]], *, title: str, 
 
 
 def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
-    """Draw the tracks, each with a circle at its start and a square at its end."""
+    """Plot the tracks, with a circle at the start and a square at the end of each."""
     _draw_lines(axes, streams, "xy_valid", lambda each: (each.messages["y"], each.messages["x"]), width=1.2)
     for stream, line in zip(streams, axes.lines[-len(streams) :], strict=True):
         line.set_label(str(stream.address))
@@ -148,7 +150,7 @@ def _draw_track(axes: Any, streams: Sequence[_Stream]) -> None:
             axes.plot(track["y"][0], track["x"][0], "o", color=stream.color, markersize=7, fillstyle="none")
             axes.plot(track["y"][-1], track["x"][-1], "s", color=stream.color, markersize=4)
     axes.set(xlabel="east [m]", ylabel="north [m]", aspect="equal", adjustable="datalim")
-    axes.locator_params(axis="x", nbins=6)  # more labels than these may touch each other
+    axes.locator_params(axis="x", nbins=6)  # more labels may overlap
     axes.set_title("track; circle: start, square: end, thin: xy invalid")
 
 
@@ -157,7 +159,7 @@ def _draw_altitude(axes: Any, streams: Sequence[_Stream]) -> None:
     for stream in streams:
         for time in np.unique(np.concatenate([stream.resets(each) for each in _HEIGHT_COUNTERS])):
             axes.axvline(time, color=stream.color, linewidth=0.5, alpha=0.4, linestyle="--")
-    title = "altitude; thin: z invalid, dashed: a reset of z or vz"
+    title = "altitude; thin: z invalid, dashed: z or vz reset"
     axes.set(ylabel="altitude above origin, -z [m]", title=title)
 
 
@@ -172,19 +174,19 @@ def _draw_speed(axes: Any, streams: Sequence[_Stream]) -> None:
 def _draw_lines(
     axes: Any, streams: Sequence[_Stream], flag: str, line_of: Callable[[_Stream], tuple[Any, Any]], *, width: float
 ) -> None:
-    """Draw a line of each stream: thin where its flag is not set, and out of the scale there if any is valid."""
+    """Plot a line per stream, thin where its flag is not set; thin parts scale the axes only if no part is valid."""
     lines = [(stream, *line_of(stream)) for stream in streams]
     in_scale = not any(np.any(stream.messages[flag] & np.isfinite(y)) for stream, _, y in lines)
     for stream, x, y in lines:
         thin = Line2D(x, y, color=stream.color, linewidth=0.5, alpha=0.6)
-        (axes.add_line if in_scale else axes.add_artist)(thin)  # an artist does not take part in the limits
+        (axes.add_line if in_scale else axes.add_artist)(thin)  # artists do not affect the axis limits
     for stream, x, y in lines:
         valid = stream.messages[flag]
         axes.plot(np.where(valid, x, np.nan), np.where(valid, y, np.nan), color=stream.color, linewidth=width)
 
 
 def _rows(streams: Sequence[_Stream]) -> list[tuple[str, _Stream, str]]:
-    """Return label, stream and field of each row: flags, kinds of reset that occurred, and resets of heading."""
+    """Return label, stream and field of each row: flags, resets of each quantity that was reset, and heading resets."""
     rows: list[tuple[str, _Stream, str]] = []
     for stream in streams:
         suffix, missing = f" {stream.address}" if len(streams) > 1 else "", missing_of(stream.messages)
@@ -202,23 +204,23 @@ def _draw_rows(axes: Any, rows: Sequence[tuple[str, _Stream, str]]) -> None:
             axes.plot(times, np.full(len(times), number), "|", color=stream.color, markersize=7)
         else:
             flag, color = stream.messages[field], _WARNING_COLOR if field == "dead_reckoning" else stream.color
-            is_shown = flag | np.append(False, flag[:-1])  # until the first message where it is not set
+            is_shown = flag | np.append(False, flag[:-1])  # fill up to the first message without the flag
             axes.fill_between(stream.seconds, number - 0.35, number + 0.35, where=is_shown, color=color)
     axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize="x-small" if len(rows) > 12 else "small")
-    axes.set(title="set flags, and resets", ylim=(len(rows) - 0.4, -0.6))
+    axes.set(title="flags and resets", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
 
 
 def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) -> list[_Mark]:
-    """Return the marks of the streams' vehicles, by time; a damaged time, far from all messages, is left out."""
-    told = [event for event in events if event.boot is not None]
+    """Return the marks of the streams' vehicles by time; skip events far from all messages: their time is damaged."""
+    timed = [event for event in events if event.boot is not None]
     marks: list[_Mark] = []
     vehicles = sorted({stream.address.vehicle for stream in streams})
     for vehicle in vehicles:
         seconds = np.concatenate([stream.seconds for stream in streams if stream.address.vehicle == vehicle])
         first, last = float(seconds.min()), float(seconds.max())
-        found: dict[Event, _Mark] = {}  # flags that began together have one mark, until the last one ends
-        for span in spans_of([event for event in told if event.vehicle == vehicle]):
+        found: dict[Event, _Mark] = {}  # conditions that began together share a mark until the last of them ends
+        for span in spans_of([event for event in timed if event.vehicle == vehicle]):
             event = span.begin
             if span.initial or event.boot is None or (event.severity == "info" and event.kind not in _QUIET):
                 continue
@@ -237,7 +239,7 @@ def _marks(streams: Sequence[_Stream], start: float, events: Iterable[Event]) ->
 
 
 def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
-    """Return the marks of each row by its label, rows with the worst first."""
+    """Return the marks by row label, rows with the most severe marks first."""
     rows: dict[str, list[_Mark]] = {}
     for mark in sorted(marks, key=lambda mark: SEVERITIES.index(mark.severity)):
         rows.setdefault(mark.row, []).append(mark)
@@ -245,7 +247,7 @@ def _by_row(marks: Iterable[_Mark]) -> dict[str, list[_Mark]]:
 
 
 def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Iterable[_Mark]) -> None:
-    """Mark the begin of bad events and of those to watch, on the track and on the time axes of altitude and speed."""
+    """Mark the begin of bad and watch events on the track and on the time axes of altitude and speed."""
     by_preference = sorted(streams, key=lambda stream: stream.address.topic == DEFAULT_TOPIC)
     main = {stream.address.vehicle: stream for stream in by_preference}
     for severity, label in _LEGEND.items():
@@ -271,7 +273,7 @@ def _mark_events(axes: Mapping[str, Any], streams: Sequence[_Stream], marks: Ite
 
 
 def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]]) -> None:
-    """Draw a row for each kind, and texts where they have room."""
+    """Plot the marks row by row, with labels where there is room."""
     for number, marks in enumerate(rows.values()):
         for mark in marks:
             marker, color, size = _MARKERS[mark.severity]
@@ -280,15 +282,15 @@ def _draw_events(figure: Figure, axes: Any, rows: Mapping[str, Sequence[_Mark]])
             )
             axes.plot(mark.begin, number, marker, color=color, markersize=size)
     axes.set_yticks(range(len(rows)), rows.keys(), fontsize="small", parse_math=False)
-    axes.set(title="events; x: bad, diamond: watch, bar: until its end", ylim=(len(rows) - 0.4, -0.6))
+    axes.set(title="events; x: bad, diamond: watch, bar: duration", ylim=(len(rows) - 0.4, -0.6))
     axes.grid(axis="x", alpha=0.3)
-    figure.draw_without_rendering()  # places the axes: the room for texts is known from here on
+    figure.draw_without_rendering()  # lays out the axes, which determines the room for labels
     for number, marks in enumerate(rows.values()):
         _label(axes, number, marks)
 
 
 def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
-    """Write the text of each mark beside it if there is room before the next one."""
+    """Label each mark if the text fits before the next mark."""
     gap = _GAP * _DPI / 72
     places = [float(axes.transData.transform((mark.begin, number))[0]) for mark in marks[1:]]
     for mark, after in zip(marks, [*places, float(axes.get_window_extent().x1) + gap], strict=True):
@@ -298,12 +300,12 @@ def _label(axes: Any, number: int, marks: Sequence[_Mark]) -> None:
         )  # fmt: skip
         text.set_in_layout(False)
         box = text.get_window_extent()
-        if box.x0 + 1.05 * box.width > after - gap:  # the formats differ a little
+        if box.x0 + 1.05 * box.width > after - gap:  # text width differs slightly between file formats
             text.remove()
 
 
 def _explain_missing(streams: Sequence[_Stream]) -> str:
-    """Return the rows that are not drawn, as the flight does not have them."""
+    """Return a note on the rows that are not plotted because the flight lacks their fields."""
     drawn = [*_FLAGS, *_COUNTERS]
     missing = {each.address: [name for name in drawn if name in missing_of(each.messages)] for each in streams}
-    return "\n".join(f"{address} does not have {', '.join(names)}" for address, names in missing.items() if names)
+    return "\n".join(f"not in {address}: {', '.join(names)}" for address, names in missing.items() if names)

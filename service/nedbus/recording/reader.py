@@ -1,4 +1,4 @@
-"""Read MCAP files: those of nedbus, and px4_msgs that ROS 2's own `ros2 bag record` wrote."""
+"""Reader of MCAP recordings by nedbus, and of px4_msgs recorded by `ros2 bag record`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .chunks import READ_ERRORS, ChunkFile, records_of
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """One channel: its address, the layout of its messages, and the fields that its source did not provide."""
+    """One channel: its address, the layout of its messages, and the fields its source did not provide."""
 
     address: Address
     definition: Definition[Any]
@@ -27,7 +27,7 @@ class RecordedStream:
 
 
 class RecordedMessage(NamedTuple):
-    """One message of a file: its CDR payload, and the time of its recording [ns]."""
+    """One recorded message: its CDR payload and log time [ns]."""
 
     stream: RecordedStream
     payload: bytes
@@ -35,12 +35,12 @@ class RecordedMessage(NamedTuple):
 
 
 class RecordingReader:
-    """An MCAP file that is open for reading; a context manager. Messages are read one chunk at a time.
+    """An MCAP file open for reading, one chunk at a time; a context manager.
 
-    `vehicle` is that of channels that name none; `counts` has the number of messages of each stream.
-    `warnings` name the damage that is left out, and are complete when `messages` or `check` has ended.
+    `vehicle`: the vehicle of channels that name none; `counts`: the number of messages per stream.
+    `warnings`: the damage found, complete after `messages` or `check` has finished.
 
-    Raises SourceError for a file that is not MCAP or cannot be opened.
+    Raises SourceError if the file is not MCAP, cannot be opened, or has no readable message because of damage.
     """
 
     def __init__(self, path: str | Path, *, vehicle: str) -> None:
@@ -53,7 +53,7 @@ class RecordingReader:
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
-        for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # after their schemas
+        for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
             self._learn(record)
             if isinstance(record, Statistics):
                 totals = record.channel_message_counts
@@ -69,14 +69,14 @@ class RecordingReader:
         return self._file.damaged
 
     def check(self) -> None:
-        """Read the file once, so that `warnings`, `damaged` and `counts` are those of the messages that can be read."""
+        """Read the whole file to complete `warnings` and `damaged`, and to correct `counts` for damage."""
         for _ in self._file.parts(self._channels()):
             pass
         if self.damaged:
             self.counts = self._count()
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
-        """Yield all messages, or those of some addresses, in the order of the file."""
+        """Yield the messages in file order; `only`: those of these addresses."""
         for part in self._file.parts(self._channels(only)):
             try:
                 for record in records_of(part):
@@ -85,7 +85,7 @@ class RecordingReader:
                     elif (stream := self._stream(record)) and (only is None or stream.address in only):
                         yield RecordedMessage(stream, record.data, record.log_time)
             except READ_ERRORS:
-                self._file.warn("damaged: a chunk has an invalid record; the rest of that chunk is left out", lost=True)
+                self._file.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
 
     def __enter__(self) -> Self:
         return self
@@ -94,14 +94,14 @@ class RecordingReader:
         self.close()
 
     def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
-        """Return the channels of some addresses, or all that can be read; None before all are known."""
+        """Return the readable channels, of these addresses or all; None while not all channels are known."""
         if not self._all_known:
             return None
         streams = self._streams.items()
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
     def _count(self) -> dict[RecordedStream, int]:
-        """Count the messages that can be read; raise SourceError if damage leaves none."""
+        """Count the readable messages; raise SourceError if damage leaves none."""
         counts = Counter(recorded.stream for recorded in self.messages())
         if not counts and self.damaged:
             self.close()
@@ -109,7 +109,7 @@ class RecordingReader:
         return counts
 
     def _learn(self, record: McapRecord) -> None:
-        """Keep a schema or a channel, unless there is one of this number already."""
+        """Register a schema or channel; the first with its id wins."""
         if isinstance(record, Schema):
             self._schemas.setdefault(record.id, record)
         elif isinstance(record, Channel) and record.id not in self._streams:
@@ -118,7 +118,9 @@ class RecordingReader:
     def _stream(self, message: Message) -> RecordedStream | None:
         if message.channel_id not in self._streams:
             self._streams[message.channel_id] = None
-            self._file.warn(f"the messages of channel {message.channel_id} are left out: its name is lost", lost=True)
+            self._file.warn(
+                f"skipped the messages of channel {message.channel_id}: its channel record is lost", lost=True
+            )
         return self._streams[message.channel_id]
 
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
@@ -126,7 +128,8 @@ class RecordingReader:
             return None
         if channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
             self._file.warn(
-                f"{channel.topic} is left out: {channel.message_encoding} with {schema.encoding}, not cdr, ros2msg"
+                f"skipped {channel.topic}: its encoding is {channel.message_encoding} with {schema.encoding}, not cdr"
+                " with ros2msg"
             )
             return None
         try:
@@ -134,14 +137,14 @@ class RecordingReader:
             address = self._address(channel)
             expected = BY_TOPIC.get(address.topic, definition)
             if expected is not definition:
-                raise ValueError(f"messages of type {definition.name}, where {address.topic} has {expected.name}")
+                raise ValueError(f"its messages are {definition.name}, but {address.topic} has {expected.name}")
         except (AddressError, ValueError) as exc:
-            self._file.warn(f"{channel.topic} is left out: {exc}")
+            self._file.warn(f"skipped {channel.topic}: {exc}")
             return None
         return RecordedStream(address, definition, layout, frozenset(channel.metadata.get("missing", "").split()))
 
     def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
-        """Return the message and the layout that a schema describes; raise ValueError if there is none."""
+        """Return the definition and layout of a schema; raise ValueError if no layout matches."""
         if schema.id not in self._layouts:
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
             definition = known or define_msg(schema.name.rpartition("/")[2], text)

@@ -1,4 +1,4 @@
-"""Record a subscription to an MCAP file."""
+"""Recorder of a subscription to an MCAP file."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from nedbus.errors import ClosedError, NoDataError
 from .flight_files import check_recording
 from .writer import RecordingWriter
 
-_FLUSH_INTERVAL: Final = 1.0  # s: the most that a power cut costs
-_POLL_INTERVAL: Final = 0.2  # s between two looks at `stop`
+_FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs at most the messages of this interval
+_POLL_INTERVAL: Final = 0.2  # s between checks of `stop`
 
 
 class Recorder:
     """Write every message of a subscription of mode "every" to a new MCAP file.
 
-    Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
+    Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """
 
     def __init__(self, subscription: Subscription, path: Path) -> None:
@@ -31,12 +31,12 @@ class Recorder:
 
     @property
     def messages(self) -> int:
-        """The number of messages that were recorded so far."""
+        """The number of messages recorded so far."""
         return self._writer.messages
 
     @property
     def status(self) -> str:
-        """The counts so far, in one line."""
+        """The counts so far, as one line of text."""
         counts = self._subscription.counts
         names = ("lost", "dropped", "invalid", "discarded")
         trouble = ", ".join(f"{count} {name}" for name in names if (count := getattr(counts, name)))
@@ -45,7 +45,7 @@ class Recorder:
     def run(self, stop: threading.Event, *, duration: float | None = None) -> None:
         """Record until `stop` is set, for `duration` seconds, or until the subscription is closed.
 
-        Raises NoDataError when there was no message: then there is no file.
+        Raises NoDataError, and removes the file, if no message arrived.
         """
         start = now = time.monotonic()
         end = float("inf") if duration is None else now + duration

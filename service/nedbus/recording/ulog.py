@@ -1,4 +1,4 @@
-"""Read the topics of a PX4 .ulg log as columns."""
+"""Reader of PX4 .ulg logs; topics are returned as columns."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from .flight_files import open_flight
 _MESSAGE_HEADER: Final = 3  # bytes
 _FILE_HEADER: Final = 16  # bytes
 _MESSAGE_TYPES: Final = frozenset(b"BFIMPQARDLCSO")
-_MIN_READ_COST: Final = 4096  # bytes of the budget that any read costs
-_BUDGET: Final = 2**31  # bytes that may be read of a damaged log, beside 1000 times its size
-_MAX_FIELDS: Final = 1000  # that are read of a format; a message has fewer
-_MAX_NESTING: Final = 3  # levels of messages within messages; PX4 has one
+_MIN_READ_COST: Final = 4096  # bytes charged to the budget per read, in addition to its size
+_BUDGET: Final = 2**31  # bytes that may be read from a log, plus 1000 times its size
+_MAX_FIELDS: Final = 1000  # fields read from a format; real messages have fewer
+_MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
 _INDEX = re.compile(r"\[(\d+)\]")
-_OLDEST: Final = 0x010D  # PX4 1.13, whose layouts are the oldest known
-_FLOATS: Final = {"float": "float32", "double": "float64"}  # of C, as a log has them; its integers end with _t
+_OLDEST: Final = 0x010D  # PX4 1.13, the oldest release with known layouts
+_FLOATS: Final = {"float": "float32", "double": "float64"}  # C's names, as in the log; its integers end with _t
 _READ_ERRORS: Final = (ULogException, ValueError, TypeError, KeyError, IndexError, AttributeError, MemoryError)
 
 UlogColumns = Mapping[str, npt.NDArray[np.generic]]
-"""One topic of a log: PX4's field names, and the values of all messages, of arrays as one row each."""
+"""The values of all messages of one topic, by PX4's field name; array fields have one row per message."""
 
 
 @dataclass(frozen=True, slots=True)
 class UlogTopic:
-    """One topic of a log; its message is a known one, or described by the log."""
+    """One topic of a log; its message definition is known to nedbus, or comes from the log."""
 
     address: Address
     definition: Definition[Any]
@@ -50,8 +50,8 @@ class UlogTopic:
 class UlogTopics:
     """Topics of a log.
 
-    `warnings`: the damage, and the parts that are left out; `damaged`: True if damage may have cost messages.
-    A log has no checksums: damage inside the values of a message cannot be noticed.
+    `warnings`: damage and skipped parts; `damaged`: True if damage may have cost messages.
+    Logs have no checksums: damage to the values of a message goes undetected.
     """
 
     topics: dict[Address, UlogTopic]
@@ -62,11 +62,11 @@ class UlogTopics:
 def read_ulog(
     path: Path, *, topics: Collection[str] | None = TOPICS, vehicle: str | None = None, default_vehicle: str = "1"
 ) -> UlogTopics:
-    """Return these topics of a log, or all for None; unknown messages are described by the log's formats.
+    """Read topics of a log, all for None; messages unknown to nedbus are defined by the log's formats.
 
-    `vehicle` is the log's MAV_SYS_ID unless it is given, and `default_vehicle` if the log has none.
+    `vehicle`: by default the log's MAV_SYS_ID; `default_vehicle` is used if the log has none.
 
-    Raises SourceError when it is not a ULog file, or has none of the topics.
+    Raises SourceError if the file is not a ULog file, or has none of the topics.
     """
     log, damage = _load(path, topics)
     found = UlogTopics({}, damage, bool(damage))
@@ -79,17 +79,17 @@ def read_ulog(
             instances = TOPICS[data.name].instances if data.name in TOPICS else data.name in several
             address = Address(vehicle, data.name, data.multi_id if instances else None)
         except (AddressError, ValueError) as exc:
-            found.warnings.append(f"{data.name} is left out: {exc}")
+            found.warnings.append(f"skipped {data.name}: {exc}")
             found.damaged |= data.name in TOPICS or isinstance(exc, AddressError)
             continue
         columns = _by_field(data.data)
-        if data.name not in BY_TOPIC:  # their types are the log's own, but pyulog reads char as int8
+        if data.name not in BY_TOPIC:  # types are the log's own, except that pyulog reads char as int8
             chars = [field for field, kind in definition.types.items() if kind.base == "uint8" and field in columns]
             columns |= {field: columns[field].view(np.uint8) for field in chars}
         known = definition.known_types
         wrong = {field for field, column in columns.items() if field in known and not _has_type(known[field], column)}
         if wrong and _is_older(log):
-            found.warnings.append(f"{name}: {', '.join(sorted(wrong))} left out: of another type before PX4 1.13")
+            found.warnings.append(f"{name}: skipped {', '.join(sorted(wrong))}, which had another type before PX4 1.13")
             columns = {field: column for field, column in columns.items() if field not in wrong}
             wrong = set()
         lacking = definition.always - columns.keys()
@@ -99,32 +99,32 @@ def read_ulog(
             found.damaged = True
         if address in found.topics:
             if not _equal(found.topics[address].columns, columns):
-                found.warnings.append(f"{name} is left out: a second one")
+                found.warnings.append(f"skipped a second {name} with other messages")
                 found.damaged |= instances or data.multi_id == 0
         elif not wrong and "timestamp" in columns:
             found.topics[address] = UlogTopic(address, definition, columns)
     if not found.topics:
         wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
-        raise SourceError(str(path), "; ".join([f"no message of {wanted} is in this log", *found.warnings[:3]]))
+        raise SourceError(str(path), "; ".join([f"this log has no message of {wanted}", *found.warnings[:3]]))
     return found
 
 
 def _equal(one: UlogColumns, other: UlogColumns) -> bool:
-    """Return whether these are the same messages: PX4 can log a topic twice."""
+    """Return whether two topics have the same messages; PX4 can log a topic twice."""
     return one.keys() == other.keys() and all(one[name].tobytes() == other[name].tobytes() for name in one)
 
 
 def _describe(formats: Mapping[str, Any], topic: str) -> Definition[Any]:
-    """Return the definition of a message that the log describes; raise ValueError if it is invalid."""
+    """Return the definition of a message from the log's formats; raise ValueError if it is invalid."""
     name = "".join(part.capitalize() for part in topic.split("_"))
     return _define(name, tuple(islice(_fields(formats, topic), _MAX_FIELDS)))
 
 
-_define = lru_cache(1024)(define)  # one for all instances, and all logs of this vehicle: its codecs are kept with it
+_define = lru_cache(1024)(define)  # shared by all instances and logs, since codecs are cached per definition
 
 
 def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType]]:
-    """Yield names and types of a format; those of a nested message have its name as a prefix."""
+    """Yield field names and types of a format; fields of a nested message are prefixed with its field name."""
     for kind, length, field in formats[name].fields:
         if field.startswith("_padding"):
             continue
@@ -138,7 +138,7 @@ def _fields(formats: Mapping[str, Any], name: str, prefix: str = "", level: int 
 
 
 class _BoundedFile:
-    """A file with a budget of bytes to read: pyulog can loop in a damaged file."""
+    """A file with a read budget in bytes: pyulog can loop on a damaged file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file = file
@@ -151,12 +151,12 @@ class _BoundedFile:
         data = self._file.read(size)
         self._budget -= _MIN_READ_COST + len(data)
         if self._budget < 0:
-            raise ULogException("invalid structure: its parts refer back to each other")
+            raise ULogException("invalid structure: its records form a loop")
         return data
 
 
 def _load_pyulog(printed: list[str]) -> ModuleType:
-    """Return a copy of pyulog that adds its warnings to `printed`: a library must leave stdout alone."""
+    """Return a copy of pyulog that appends its warnings to `printed`, because a library must not write to stdout."""
     spec = find_spec("pyulog.core")
     if spec is None or spec.loader is None:
         raise ModuleNotFoundError(name="pyulog")
@@ -167,7 +167,7 @@ def _load_pyulog(printed: list[str]) -> ModuleType:
 
 
 def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
-    """Return pyulog's ULog, and a list of damages."""
+    """Return pyulog's ULog and a list of the damage found."""
     damage: list[str] = []
     try:
         with open_flight(path) as file:
@@ -181,12 +181,12 @@ def _load(path: Path, topics: Collection[str] | None) -> tuple[Any, list[str]]:
     if damage:
         return log, [f"damaged: {line}" for line in damage[:5]]
     if log.file_corruption:
-        return log, ["damaged: parts of it were skipped"]
+        return log, ["damaged: parts were skipped"]
     return log, [end] if end else []
 
 
 def _find_damage(path: Path) -> str:
-    """Return the first damage of a log's structure, empty without one: pyulog skips unknown messages silently."""
+    """Return the first structural damage of a log, "" if there is none; pyulog skips unknown messages silently."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(_FILE_HEADER)
@@ -195,13 +195,13 @@ def _find_damage(path: Path) -> str:
                 return f"damaged: no message begins at byte {file.tell() - len(head)}"
             end = file.tell() + int.from_bytes(head[:2], "little")
             if len(head) < _MESSAGE_HEADER or end > size:
-                return "cut: it ends inside a message"
+                return "truncated: the file ends inside a message"
             file.seek(end)
     return ""
 
 
 def _has_type(kinds: Iterable[FieldType], column: npt.NDArray[np.generic]) -> bool:
-    """Return whether a column has one of PX4's types of its field; pyulog reads a bool as int8."""
+    """Return whether a column has one of the PX4 types of its field; pyulog reads bool as int8."""
     return any(
         column.dtype == np.dtype("i1" if kind.base == "bool" else BASES[kind.base].code)
         and column.shape[1:] == ((kind.length,) if kind.length else ())
@@ -210,7 +210,7 @@ def _has_type(kinds: Iterable[FieldType], column: npt.NDArray[np.generic]) -> bo
 
 
 def _is_older(log: Any) -> bool:
-    """Return whether a log is from before the oldest known layouts."""
+    """Return whether a log was written by a release before the oldest known layouts."""
     release = log.msg_info_dict.get("ver_sw_release")
     return isinstance(release, int) and 0 < release >> 16 < _OLDEST
 
@@ -222,7 +222,7 @@ def _system_id(log: Any) -> str | None:
 
 
 def _by_field(data: Mapping[str, npt.NDArray[np.generic]]) -> dict[str, npt.NDArray[np.generic]]:
-    """Return the columns by PX4's field names: `q[0]` to `q[3]` become one of four, `esc[0].rpm` is `esc_0_rpm`."""
+    """Return the columns by PX4's field names: `q[0]` to `q[3]` become one array, `esc[0].rpm` becomes `esc_0_rpm`."""
     parts: dict[str, list[npt.NDArray[np.generic]]] = {}
     arrays: set[str] = set()
     for name, column in data.items():

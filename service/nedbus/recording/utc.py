@@ -1,4 +1,4 @@
-"""The UTC of a flight, from its own messages."""
+"""UTC of a flight, derived from its messages."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from .arrays import Flight, missing_of
 from .flight_files import matching, require_one_vehicle
 
 _FIELDS: Final = ("time_utc_usec", "estimated_offset")  # a GNSS receiver's UTC, or the offset to a companion's clock
-_RELATIVE: Final = "timestamp_time_relative"  # us, of a receiver's UTC after its timestamp
-_PLAUSIBLE: Final = (946_684_800_000_000, 4_102_444_800_000_000)  # us: 2000 to 2100; other clocks have no date
-_TOLERANCE: Final = 1_000_000  # us from the median; messages within agree
-_AGREEING: Final = 0.9  # of the messages; fewer are several boots, or a clock that was set
+_RELATIVE: Final = "timestamp_time_relative"  # us from the message's timestamp to the receiver's UTC
+_PLAUSIBLE: Final = (946_684_800_000_000, 4_102_444_800_000_000)  # us; 2000 to 2100, other clocks have no date
+_TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
+_AGREEING: Final = 0.9  # fraction that must agree; fewer indicate several boots or a clock step
 
 
 @dataclass(frozen=True, slots=True)
 class UtcOffset:
-    """Unix time minus the vehicle's `timestamp` [us], and its source.
+    """Offset from a vehicle's `timestamp` to Unix time [us], and its source.
 
-    `source`: its stream. With timesync_status it is the clock of a companion, and as good as that clock.
-    `offset_us`: the median of its messages. A GNSS fix is some tenths of a second older than its message.
-    `count`: the messages that agree to a second; `spread_us`: from the least to the greatest of these.
+    `source`: the stream; timesync_status is the clock of a companion computer, and only as accurate as that clock.
+    `offset_us`: the median over its messages. A GNSS fix is some tenths of a second older than its message.
+    `count`: the number of messages within one second of the median; `spread_us`: their maximum minus minimum.
     """
 
     source: str
@@ -39,22 +39,23 @@ class UtcOffset:
     spread_us: int
 
     def at(self, timestamp: int) -> datetime:
-        """Return the UTC of a `timestamp` of this vehicle, since the same boot."""
+        """Return the UTC of a `timestamp` of this vehicle from the same boot."""
         return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(timestamp) + self.offset_us)
 
 
 def utc_of(
     flight: str | Path | Mapping[str, MessageArray] | Iterable[Sample[Any]], *, vehicle: str | int = ANY
 ) -> UtcOffset | None:
-    """Return the UTC of a .ulg log, an .mcap recording or arrays of `read`, and its source; None without one.
+    """Return the UTC offset of a .ulg log, an .mcap recording, arrays from `read`, or samples; None if it is unknown.
 
-    Of samples it is that of their vehicle: `nedbus.utc_of(bus.latest("*", vehicle="7"))`, and then
-    `utc.at(sample.message.timestamp)` of any sample until the vehicle boots again.
+    For live samples: `utc = nedbus.utc_of(bus.latest("*", vehicle="7"))`, then `utc.at(sample.message.timestamp)` for
+    any sample until the vehicle reboots.
 
-    The source is a GNSS receiver whose `time_utc_usec` is not 0, or the clock of a companion in `timesync_status`,
-    which counts as UTC only with a date after 2000. Where messages disagree by more than a second there is none.
+    The source is a GNSS receiver with a `time_utc_usec` other than 0, or a companion's clock in `timesync_status`,
+    accepted only with a date after 2000. The offset is unknown if over 10 % of the messages are more than a second off
+    their median.
 
-    Raises AddressError for several vehicles, without the name of one; other errors are those of `read`.
+    Raises AddressError for several vehicles unless `vehicle` names one, and the errors of `read`.
     """
     vehicle = vehicle_name(vehicle)
     if isinstance(flight, Mapping):
@@ -72,16 +73,17 @@ def utc_of(
 
 
 def _find_utc(streams: Mapping[str, MessageArray]) -> UtcOffset | None:
-    """Return the offset of the best of these streams, None if no stream has one."""
+    """Return the offset from the best of these streams, None if no stream provides one."""
     for field in _FIELDS:
         for name, messages in sorted(streams.items()):
             names = set(messages.dtype.names or ()) - missing_of(messages)
             if field not in names:
                 continue
             times, value = messages["timestamp"].astype(np.int64), messages[field].astype(np.int64)
-            utc = value if field == "time_utc_usec" else times - value
-            if field == "time_utc_usec" and _RELATIVE in names:
-                utc = value - messages[_RELATIVE]
+            if field == "estimated_offset":
+                utc = times - value
+            else:
+                utc = value - messages[_RELATIVE] if _RELATIVE in names else value
             offsets = (utc - times)[(utc >= _PLAUSIBLE[0]) & (utc < _PLAUSIBLE[1])]
             middle = int(np.median(offsets)) if len(offsets) else 0
             near = offsets[np.abs(offsets - middle) <= _TOLERANCE]

@@ -1,7 +1,7 @@
-"""Write MCAP files that Foxglove, PlotJuggler and any MCAP reader open: CDR messages with their definition.
+"""Writer of MCAP files for Foxglove, PlotJuggler and any MCAP reader: CDR messages with their definitions.
 
-A file is complete from the beginning and after every flush: its end is written behind the last chunk, and overwritten
-by the next one. So a power cut costs the messages since the last flush, and never the file.
+A file is valid from the start and after every flush: a footer follows the last chunk, and the next chunk overwrites
+it. A power cut costs only the messages since the last flush, never the file.
 """
 
 from __future__ import annotations
@@ -23,25 +23,24 @@ from nedbus.errors import OutputError
 from nedbus_msgs import Address, Definition, Layout, Message, Provenance, definition_text, ros2_type
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
-_CHUNK: Final = 2**23  # bytes; a flush every second makes smaller ones
-_MAX_PENDING_BYTES: Final = 2**24  # that wait for a flush
-_MAX_TIME: Final = 2**64 - 1  # ns: a damaged log may have any timestamp
+_CHUNK: Final = 2**23  # bytes; a flush every second makes smaller chunks
+_MAX_PENDING_BYTES: Final = 2**24  # bytes buffered until a flush
+_MAX_TIME: Final = 2**64 - 1  # ns; a damaged log may have any timestamp
 _END: Final = (
     struct.pack("<BQI", Opcode.DATA_END, 4, 0) + struct.pack("<BQQQI", Opcode.FOOTER, 20, 0, 0, 0) + MCAP0_MAGIC
 )
 
-_Encoded = tuple[int, int, bytes, int, int]  # time of recording [ns], channel, payload, time of publication, number
+_Encoded = tuple[int, int, bytes, int, int]  # log time [ns], channel, payload, publish time [ns], sequence number
 
 
 class RecordingWriter:
-    """Write messages to a new MCAP file; a context manager that finishes it.
+    """Write messages to a new MCAP file; a context manager that finishes the file on exit.
 
-    There is one channel for each address and provenance, in the current layout of its message, or in that of PX4 which
-    has just the fields that its source provides, where no layout of PX4 has all.
-    Damage of one bit costs a chunk, of up to `chunk_size` bytes before compression.
+    Each address and provenance has its own channel, in the message's current layout. If no PX4 layout has all fields
+    of the message, a PX4 layout with exactly the fields provided by the source is preferred.
+    A flipped bit costs one chunk, of up to `chunk_size` bytes before compression.
 
-    Raises OutputError when the file exists already, was deleted meanwhile, or cannot be written; messages that were
-    flushed can still be read.
+    Raises OutputError if the file exists, is deleted while open, or cannot be written; flushed messages stay readable.
     """
 
     def __init__(self, path: str | Path, *, chunk_size: int = _CHUNK) -> None:
@@ -49,7 +48,7 @@ class RecordingWriter:
         self.messages = 0
         with _writing(self.path):
             self._file = _AppendFile(self.path)
-        # Chunks as large as a flush allows: the writer keeps an index of each, with a line for every channel.
+        # Large chunks: the writer keeps an index of each chunk in memory, with an entry per channel.
         self._writer = Writer(cast("IO[bytes]", self._file), chunk_size=chunk_size)
         self._writer.start(profile="ros2", library="nedbus")
         try:
@@ -71,13 +70,13 @@ class RecordingWriter:
         published: Iterable[int],
         sequence: Iterable[int] = repeat(0),
     ) -> None:
-        """Write messages of one kind, each with its address and provenance, when it was recorded and published [ns]."""
+        """Write messages of one type, each with its stream, log and publish time [ns], and sequence number."""
         self._add(self._encode(messages, definition, streams, zip(logged, published, sequence, strict=False)))
 
     def write_messages(self, messages: Iterable[tuple[Message, Address, Provenance, int]]) -> None:
-        """Write messages of any kinds, each with address, provenance and when it was recorded [ns], in that order.
+        """Write messages of any types, each with address, provenance and log time [ns], in the order of log times.
 
-        A message was published at its own timestamp.
+        The publish time of a message is its own timestamp.
         """
         by_kind: dict[Definition[Any], list[tuple[Message, Address, Provenance, int]]] = {}
         for each in messages:
@@ -88,7 +87,7 @@ class RecordingWriter:
             streams = ((address, provenance) for _, address, provenance, _ in own)
             times = ((logged, min(message.timestamp * 1000, _MAX_TIME), 0) for message, *_, logged in own)
             encoded += self._encode(array, definition, streams, times)
-        self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file from begin to end
+        self._add(sorted(encoded, key=itemgetter(0)))  # a replay reads the file sequentially
 
     def _encode(
         self,
@@ -97,7 +96,7 @@ class RecordingWriter:
         streams: Iterable[tuple[Address, Provenance]],
         times: Iterable[tuple[int, int, int]],
     ) -> Iterator[_Encoded]:
-        encoded: dict[Layout, tuple[int, bytes]] = {}  # size of a payload, and all payloads
+        encoded: dict[Layout, tuple[int, bytes]] = {}  # payload size, and all payloads
         for index, stream, (logged, published, number) in zip(range(len(messages)), streams, times, strict=False):
             channel, layout = self._channels.get(stream) or self._open_channel(definition, *stream)
             if layout not in encoded:
@@ -113,7 +112,7 @@ class RecordingWriter:
                 self.messages += 1
 
     def flush(self) -> None:
-        """Sync everything to the disk, so that a power cut loses none of it."""
+        """Sync all messages written so far to disk."""
         with _writing(self.path):
             self._writer.flush()
             self._file.sync()
@@ -131,7 +130,7 @@ class RecordingWriter:
 
     def __exit__(self, *exc: object) -> None:
         if isinstance(exc[1], OutputError):
-            self._file.close()  # finishing it would fail again
+            self._file.close()  # finishing the file would fail again
         else:
             self.close()
 
@@ -144,7 +143,7 @@ class RecordingWriter:
             text = definition_text(definition, layout).encode()
             schema = self._writer.register_schema(ros2_type(definition), "ros2msg", text)
             self._schemas[definition.name, layout.name] = schema
-        # ROS 2 tools recognise their bags by the first key.
+        # ROS 2 tools recognize their bags by the first key.
         metadata = {"offered_qos_profiles": "", "vehicle": address.vehicle, "topic": address.topic}
         if address.instance is not None:
             metadata["instance"] = str(address.instance)
@@ -159,7 +158,7 @@ class RecordingWriter:
 
 @contextmanager
 def _writing(path: Path) -> Iterator[None]:
-    """Raise OutputError for an OSError in the block."""
+    """Translate an OSError in the block to OutputError."""
     try:
         yield
     except OSError as exc:
@@ -167,7 +166,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 class _AppendFile:
-    """A file for the MCAP writer that has a valid end after each `sync`."""
+    """An append-only file for the MCAP writer that ends with a valid footer after each `sync`."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
@@ -188,7 +187,7 @@ class _AppendFile:
         """Do nothing: `sync` writes to the disk."""
 
     def sync(self, end: bytes = _END) -> None:
-        """Write the pending data and an end behind it to the disk; restore the previous end if that fails."""
+        """Write the pending data and a footer to disk; restore the previous footer if that fails."""
         pending = bytes(self._pending)
         self._pending.clear()
         try:
@@ -201,7 +200,7 @@ class _AppendFile:
         os.fsync(self._file.fileno())
         self._offset += len(pending)
         if not os.fstat(self._file.fileno()).st_nlink:
-            raise OSError(errno.ESTALE, "it was deleted while it was written")
+            raise OSError(errno.ESTALE, "the file was deleted while it was being written")
 
     def _write_at_offset(self, data: bytes) -> None:
         rest = memoryview(data)

@@ -1,4 +1,4 @@
-"""Settings from `nedbus.toml`, the environment and flags; nothing else reads them."""
+"""Settings from `nedbus.toml`, the environment and flags; no other package reads them."""
 
 from .load import find_mistakes, load_settings, locate_setting, locate_source
 from .model import Settings, is_loopback, split_http

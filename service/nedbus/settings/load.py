@@ -1,4 +1,4 @@
-"""Settings from a file, the environment and flags, each overriding the one before; nothing else reads them."""
+"""Load settings from a file, the environment and flags, each overriding the previous one."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from .toml_file import find_key, find_source, read_text, read_toml
 _log = logging.getLogger(__name__)
 
 DEFAULT_FILE: Final = Path("nedbus.toml")
-_MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters of a variable that is taken for the beginning of a setting
+_MIN_PREFIX: Final = len("NEDBUS_TLS")  # characters from which a variable counts as the beginning of a setting's name
 
 
 def load_settings(file: str | Path | None = None, **given: object) -> Settings:
-    """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if there is one) and the environment.
+    """Return the settings of a file (default: NEDBUS_CONFIG, else ./nedbus.toml if it exists) and the environment.
 
-    Values given here that are not None override both.
+    Keyword arguments that are not None override both.
 
-    Raises ConfigError, with file, line and column or the name of the flag or variable.
+    Raises ConfigError, with file, line and column, or with the name of the flag or variable.
     """
     settings, mistakes = find_mistakes(file, **given)
     if mistakes:
@@ -39,7 +39,7 @@ def load_settings(file: str | Path | None = None, **given: object) -> Settings:
 
 
 def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Settings, list[ConfigError]]:
-    """Return the settings as `load_settings` does, and all mistakes; wrong values are left out of the settings."""
+    """Return the settings as `load_settings` does, without invalid values, and the errors for those."""
     flags = {name: value for name, value in given.items() if value is not None}
     mistakes: list[ConfigError] = []
     path, content = None, dict[str, object]()
@@ -65,12 +65,12 @@ def find_mistakes(file: str | Path | None = None, **given: object) -> tuple[Sett
 
 
 def locate_setting(settings: Settings, name: str, reason: str) -> ConfigError:
-    """Return the error of a setting with its place: file, line and column, or the name of the flag or variable."""
+    """Return an error for a setting with its location: file, line and column, or the name of the flag or variable."""
     return _locate(settings._file, settings.set_by(name) or name, name, reason)
 
 
 def locate_source(settings: Settings, index: int, error: ConfigError) -> ConfigError:
-    """Return the error of a source with its place: file, line and column, or the name of the variable."""
+    """Return the error of a source with its location: file, line and column, or the name of the variable."""
     setter = settings.set_by("source")
     if settings._file is None or setter != str(settings._file):
         return error if setter in {"", "source"} else ConfigError(setter, str(error), key=error.key)
@@ -86,7 +86,7 @@ def _locate(path: Path | None, setter: str, name: str, reason: str) -> ConfigErr
 
 
 def _settings_file(given: str | Path | None) -> Path | None:
-    """Return the file to read, None if there is none; raise ConfigError when one is named that does not exist."""
+    """Return the file to read, None if there is none; raise ConfigError if a named one does not exist."""
     named = given or os.environ.get("NEDBUS_CONFIG")
     if not named:
         return DEFAULT_FILE if DEFAULT_FILE.is_file() else None
@@ -104,7 +104,7 @@ def _from_environment(name: str) -> str | None:
 
 
 def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]) -> dict[str, Any]:
-    """Return the values, with the default in place of each wrong setting, or a list without its wrong items."""
+    """Return the values with each invalid setting replaced by its default, or without the invalid items of a list."""
     wrong: dict[str, set[int | str]] = defaultdict(set)
     for detail in details:
         wrong[str(detail["loc"][0])].update(detail["loc"][1:2])
@@ -120,14 +120,14 @@ def _without_mistakes(values: Mapping[str, Any], details: Sequence[ErrorDetails]
 
 
 def _set_by(name: str, path: Path | None, flags: Collection[str]) -> str:
-    """Return the name of the flag or argument, of the environment variable, or of the file that sets a setting."""
+    """Return the origin of a setting: the name of the flag, the environment variable or the file."""
     if name in flags:
         return name
     return _variable(name) if _from_environment(name) else str(path or name)
 
 
 def _warn_of_misspelt_variables() -> None:
-    """Warn of environment variables that look like a setting, and are none."""
+    """Warn about environment variables that look like misspelt settings."""
     known = set(map(_variable, (*Settings.model_fields, "config", "log_level", "log_format")))
     for variable in sorted(name for name in os.environ if name.startswith("NEDBUS_") and name not in known):
         longer = sorted(name for name in known if name.startswith(variable) and len(variable) >= _MIN_PREFIX)

@@ -1,4 +1,4 @@
-"""All settings: their names, types, defaults and checks."""
+"""The settings: names, types, defaults and checks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from nedbus_msgs import DEFAULT_PREFIX, check_prefix, check_vehicle, vehicle_nam
 
 
 def split_sources(value: object) -> object:
-    """Split at semicolons and line breaks; without any, at commas before KIND: that are no part of an option."""
+    """Split at semicolons and line breaks; if there are none, at commas followed by `KIND:`."""
     if not isinstance(value, str):
         return value
     parts = re.split(r"[;\n]", value) if re.search(r"[;\n]", value) else re.split(r",(?=\s*[a-z][a-z0-9-]*:)", value)
@@ -24,12 +24,12 @@ def split_sources(value: object) -> object:
 
 
 def split_values(value: object) -> object:
-    """Split one text at commas."""
+    """Split a text at commas."""
     return tuple(part.strip() for part in value.split(",") if part.strip()) if isinstance(value, str) else value
 
 
 def split_http(where: str) -> tuple[str, int]:
-    """Return host and port of HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
+    """Parse HOST:PORT or [HOST]:PORT; raise ValueError for anything else."""
     host, _, port = where.rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not bare or (":" in bare) != (host != bare) or not port.isdecimal() or int(port) > 65_535:
@@ -38,12 +38,12 @@ def split_http(where: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this host reaches a server on this address."""
+    """Return whether a server on this address can be reached from this host only."""
     return host in {"127.0.0.1", "::1", "localhost"}
 
 
 def _checked(check: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that runs a check, which raises, and keeps the value."""
+    """Return a validator that runs a check, which raises for an invalid value, and keeps the value."""
 
     def validate(value: str) -> str:
         check(value)
@@ -57,17 +57,17 @@ Endpoints = Annotated[tuple[_Endpoint, ...], NoDecode, BeforeValidator(split_val
 
 
 class Settings(BaseSettings):
-    """All settings; every field is also NEDBUS_<FIELD> in the environment, with commas between several values.
+    """All settings. Each is also NEDBUS_<FIELD> in the environment, with several values separated by commas.
 
-    Sources whose options contain commas are separated by semicolons.
-    `load_settings` makes one; it raises ConfigError with the flag, the variable, or file, line and column.
+    Separate sources by semicolons if their options contain commas.
+    Create it with `load_settings`, whose errors name the flag, the variable, or file, line and column.
     """
 
     model_config = SettingsConfigDict(env_prefix="NEDBUS_", env_ignore_empty=True, extra="forbid", frozen=True)
 
-    connect: Endpoints = Field((), description="Zenoh routers to join, the first that answers")
+    connect: Endpoints = Field((), description="Endpoints of Zenoh routers; the first one that answers is joined")
     tls_ca: Path | None = Field(None, description="Authority that signed the routers of tls/ endpoints, PEM")
-    tls_certificate: Path | None = Field(None, description="Certificate that this client shows to a router, PEM")
+    tls_certificate: Path | None = Field(None, description="Certificate that this client presents to routers, PEM")
     tls_key: Path | None = Field(None, description="Key of that certificate, PEM")
     listen: Endpoints = Field((), description="Endpoints of the embedded router")
     router_config: Path | None = Field(None, description="JSON5 configuration of the embedded router")
@@ -89,33 +89,33 @@ class Settings(BaseSettings):
 
     @property
     def routers(self) -> tuple[str, ...]:
-        """The endpoints that a client joins: `connect`, else the router that these settings start on this host."""
+        """The endpoints for a client to join: `connect`, else those of the router that these settings start."""
         return self.connect or tuple(map(dial_endpoint, self.router_endpoints))
 
     @property
     def router_endpoints(self) -> tuple[str, ...]:
-        """The endpoints on which the embedded router of a service with these settings listens."""
+        """The endpoints that the embedded router of a service listens on."""
         return router_endpoints(self.listen, self.router_config)
 
     @property
     def is_client(self) -> bool:
-        """True if a service with these settings joins other routers without being one itself."""
+        """True if a service joins other routers without being one itself."""
         return bool(self.connect) and not (self.listen or self.router_config)
 
     def set_by(self, name: str) -> str:
-        """Return the name of the flag, the environment variable or the file that sets this; "" for a default."""
+        """Return the origin of a setting: the name of the flag, variable or file; "" for a default."""
         return self._set_by.get(name, "")
 
     @property
     def left_out(self) -> frozenset[str]:
-        """The settings of which `find_mistakes` left something out, because it is wrong or cannot be read."""
+        """The settings that `find_mistakes` left out, in whole or in part, as they are invalid or cannot be read."""
         return self._left_out
 
     @property
     def tls(self) -> Tls | None:
-        """The files of a client of tls/ endpoints; raise ConfigError if some are missing."""
+        """The files for tls/ endpoints; raises ConfigError if some are missing."""
         if self.tls_ca is None:
             if self.tls_certificate or self.tls_key:
-                raise ConfigError("tls_ca", "a certificate is given, but not the authority to trust: give both")
+                raise ConfigError("tls_ca", "a certificate is set, but not the authority to trust: set both")
             return None
         return Tls(self.tls_ca, self.tls_certificate, self.tls_key)

@@ -1,4 +1,4 @@
-"""A settings file in TOML: reading it, and finding the place of a setting in it, for error messages."""
+"""Read a settings file in TOML, and locate settings in it for error messages."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from pathlib import Path
 from nedbus.errors import ConfigError
 
 Place = tuple[int | None, int | None]
-"""Line and column, from 1; None where they are not known."""
+"""Line and column, counted from 1; None if unknown."""
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file, without the mark that editors on Windows put first; raise ConfigError."""
+    """Return the text of a file without a byte order mark; raise ConfigError if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as exc:
-        raise ConfigError.in_file(path, "this is not text in UTF-8") from exc
+        raise ConfigError.in_file(path, "not UTF-8 text") from exc
     except OSError as exc:
         raise ConfigError.in_file(path, f"cannot be read: {(exc.strerror or str(exc)).lower()}") from exc
 
 
 def read_toml(path: Path) -> dict[str, object]:
-    """Return the content of a file; raise ConfigError with line and column."""
+    """Parse a file; raise ConfigError with line and column."""
     text = read_text(path)
     try:
         return tomllib.loads(text)
@@ -38,7 +38,7 @@ def read_toml(path: Path) -> dict[str, object]:
 
 
 def find_key(text: str, name: str) -> Place:
-    """Return line and column of a key or a table; TOML parsers do not keep them."""
+    """Return line and column of a key or a table, which TOML parsers do not keep."""
     found = re.search(rf"^[ \t]*\[*[ \t]*(\"?{re.escape(name)}\"?)[ \t]*[=.\]]", text, re.MULTILINE)
     if found is None:
         return None, None
@@ -46,7 +46,7 @@ def find_key(text: str, name: str) -> Place:
 
 
 def find_source(text: str, sources: Sequence[object], index: int, key: str = "") -> Place:
-    """Return line and column of the source with this index, or of an option of it: a table, or a text in a list."""
+    """Return line and column of the source with this index, a table or a text in a list, or of one of its options."""
     source = sources[index]
     headers = list(re.finditer(r"^[ \t]*\[\[[ \t]*(source)[ \t]*\]\]", text, re.MULTILINE))
     if not isinstance(source, str) and index < len(headers):
@@ -63,7 +63,7 @@ def find_source(text: str, sources: Sequence[object], index: int, key: str = "")
 
 
 def place_at(text: str, start: int) -> Place:
-    """Return line and column of an index into a text; not known for a negative one, as of `str.find`."""
+    """Return line and column of an index into a text; unknown for a negative index, as from `str.find`."""
     if start < 0:
         return None, None
     return text.count("\n", 0, start) + 1, start - text.rfind("\n", 0, start)

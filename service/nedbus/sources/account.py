@@ -1,4 +1,4 @@
-"""The events of all vehicles of a file, detected in the messages of its replay."""
+"""Detect the events of all vehicles in a log or a recording, by replaying it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .source import ReplaySource, SourceMessage
 from .spec import parse_source, source_text_of_file
 
 KEPT_OF_FILE: Final = 100_000
-"""Events that are kept of a file, the last ones."""
+"""Events kept per file; the oldest are discarded."""
 
-_CHECK_INTERVAL: Final = 0.5  # s of the flight between two checks for silent streams, and for events that settled
-_SETTLE_TIME: Final = 10.0  # s after the last message at which unsettled events are reported
+_CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
+_SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
 
 
 @dataclass(frozen=True, slots=True)
 class FileAccount:
-    """The account of a file at its end: its clock is seconds since the first message; `end`: of the last one."""
+    """The events of a whole file. Times are seconds since its first message; `end` is the time of the last one."""
 
     account: Account
     times: Times
@@ -33,9 +33,9 @@ class FileAccount:
 
 
 def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
-    """Return the events of a .ulg or .mcap file; `vehicle` is that of a log of one vehicle.
+    """Return the events of a .ulg or .mcap file; `vehicle` renames the vehicle of a file that has only one.
 
-    Raises ConfigError and SourceError for a file that cannot be read.
+    Raises ConfigError or SourceError if the file cannot be read.
     """
     spec = parse_source(source_text_of_file(path, vehicle=vehicle))
     run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
@@ -46,7 +46,7 @@ def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
 
 
 def times_of(path: Path, addresses: Iterable[Address]) -> Times:
-    """Return the clock for the times of a file: UTC for each vehicle whose messages contain it."""
+    """Return the offsets of a file's times to UTC, for each vehicle whose messages contain UTC."""
     vehicles = {address.vehicle for address in addresses}
     found = {name: recording.utc_of(path, vehicle=name) for name in vehicles}
     return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found.items() if utc is not None})
@@ -55,13 +55,13 @@ def times_of(path: Path, addresses: Iterable[Address]) -> Times:
 def follow(
     messages: Iterable[SourceMessage], account: Account
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account, and yield each with the reason of its rejection, or its payload."""
+    """Add the messages of a replay to an account; yield each with its rejection reason or its payload."""
     checked = due = 0.0
     for message in messages:
         due, reason, payload = message.due, message.error, None
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
-            account.look(checked)
+            account.update(checked)
         if reason is None:
             definition = message.definition or BY_TOPIC[message.address.topic]
             try:
@@ -73,5 +73,5 @@ def follow(
         if reason is not None:
             account.reject(message.address, reason, due)
         yield message, reason, payload
-    account.look(due)
+    account.update(due)
     account.settle(due + _SETTLE_TIME)

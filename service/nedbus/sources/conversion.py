@@ -1,4 +1,4 @@
-"""Convert a replay to a recording, message by message, validated."""
+"""Convert a replay to an MCAP recording, validating each message."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from .source import SourceMessage
 
 _log = logging.getLogger(__name__)
 
-_MAX_START: Final = 2**63  # ns: later times must fit as well
-_CHUNK: Final = 1024  # messages that are written together
-_CHUNK_BYTES: Final = 2**18  # lost to damage, some seconds of a flight
-_MAX_LOGGED: Final = 5  # rejected messages that are logged
+_MAX_START: Final = 2**63  # ns; leaves room for later times in 64 bits
+_CHUNK: Final = 1024  # messages per write
+_CHUNK_BYTES: Final = 2**18  # per MCAP chunk: damage to one loses only a few seconds of flight
+_MAX_LOGGED: Final = 5  # rejected messages logged per file
 
 
 def convert(
@@ -32,12 +32,12 @@ def convert(
     source: str,
     on_progress: Callable[[int], object],
 ) -> str:
-    """Write messages to a new MCAP file and return a summary; without success there is no file.
+    """Write messages to a new MCAP file and return a summary; leave no file behind on failure.
 
-    A message is published at PX4's own time, and recorded when it is due, from the first one's time on.
-    `source` is the kind of source that they come from; `on_progress` gets the number of messages handled so far.
+    The publish time of a message is its PX4 timestamp, its log time that of the first message plus `due`.
+    `source`: the kind of source, such as `ulog`. `on_progress`: called with the number of messages handled so far.
 
-    Raises ConfigError for another suffix than .mcap, OutputError when the file exists already or cannot be written.
+    Raises ConfigError for a suffix other than .mcap, OutputError if the file exists or cannot be written.
     """
     recording.check_recording(path)
     try:

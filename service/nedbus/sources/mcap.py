@@ -1,4 +1,4 @@
-"""Replay an MCAP file, at the times at which its messages were recorded."""
+"""Replay an MCAP file, paced by its log times."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from nedbus_msgs import Address, decode_with
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
 
-_MAX_GAP: Final = 60 * 10**9  # ns: a longer step is a damaged time, or a pause, and not waited for
-_REORDERED: Final = 8192  # messages among which those of several kinds are put in order
+_MAX_GAP: Final = 60 * 10**9  # ns; a longer step is a pause or a damaged time, and is skipped
+_REORDERED: Final = 8192  # messages in the reorder buffer
 
 
 class McapSource:
-    """An MCAP file, read one chunk at a time."""
+    """An MCAP file, read chunk by chunk."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path, self._default_vehicle = path, context.vehicle
@@ -27,7 +27,7 @@ class McapSource:
         self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
-        """Check the file; raise SourceError when it is not an MCAP file, or has none of the topics."""
+        """Check the file; raise SourceError if it is not an MCAP file or has none of the requested topics."""
         with self._reader() as reader:
             reader.check()
         counts = {stream: count for stream, count in reader.counts.items() if self._delivers(stream)}
@@ -35,10 +35,10 @@ class McapSource:
         addresses = sorted(definitions)
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
-            found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "none of PX4's topics"
-            raise SourceError(self._path, f"no message of these topics is in this recording, which has {found}")
+            found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "no topics of PX4"
+            raise SourceError(self._path, f"this recording has none of the requested topics; it has {found}")
         if self._vehicle is not None and len(vehicles) > 1:
-            raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): leave it out")
+            raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): remove it")
         total = sum(counts.values())
         absent = self._options.absent_from({each.topic for each in addresses}, "this recording")
         return ReplayRun(
@@ -47,7 +47,7 @@ class McapSource:
             total=total,
             summary=f"vehicle {', '.join(vehicles[:5])}, {total} messages of {len(addresses)} streams",
             warnings=(*reader.warnings, *absent),
-            damage=f"{self._path}: damage cost messages: {'; '.join(reader.warnings)}" if reader.damaged else None,
+            damage=f"{self._path}: messages lost to damage: {'; '.join(reader.warnings)}" if reader.damaged else None,
         )
 
     def _reader(self) -> RecordingReader:
@@ -84,9 +84,9 @@ class McapSource:
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:
-    """Yield messages as they were recorded: a file has some hundred of one kind, and then those of another.
+    """Yield messages in order of log time; writers batch a few hundred messages of one stream at a time.
 
-    Where time goes back by more than _MAX_GAP, a damaged time or another clock, all before comes first.
+    When time goes back by more than _MAX_GAP (a damaged time, another clock), flush the buffer first.
     """
     waiting: list[tuple[int, int, RecordedMessage]] = []
     newest = 0

@@ -43,7 +43,7 @@ def _check_layout(name: str) -> str:
 
 
 def _parse_topics(text: object) -> object:
-    """Parse `TOPIC,TOPIC`, where the name of a message stands for all of its topics."""
+    """Parse `TOPIC,TOPIC`; the name of a message stands for all of its topics."""
     if not isinstance(text, str):
         return text
     names = tuple(part.strip() for part in text.split(","))
@@ -54,7 +54,7 @@ def _parse_topics(text: object) -> object:
 
 
 def _topics_of(name: str) -> Set[str]:
-    """Return the topics that a name stands for: those of a message, or itself."""
+    """Return all topics of a message, or the topic itself."""
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
@@ -63,25 +63,25 @@ Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
 
 class Options(BaseModel):
-    """Options of every kind."""
+    """Options of every kind of source."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     topics: Annotated[tuple[str, ...], BeforeValidator(_parse_topics)] = Field(
-        (), description="topics or messages, separated by commas, or * for all that there are"
+        (), description="topic or message names, separated by commas, or * for all"
     )
 
     @property
     def chosen_topics(self) -> Collection[str] | None:
-        """The topics to deliver: by default those that have a file here; None is all, whatever they are."""
+        """The topics to deliver, by default those that nedbus has a file for; None means all."""
         if ANY in self.topics:
             return None
         return {topic for name in self.topics for topic in _topics_of(name)} or TOPICS
 
     def absent_from(self, topics: Collection[str], where: str) -> list[str]:
-        """Return a warning that names the requested topics and messages that are none of these topics."""
+        """Return a warning that names the requested topics and messages missing from `topics`."""
         absent = [name for name in self.topics if name != ANY and _topics_of(name).isdisjoint(topics)]
-        return [f"no message of {', '.join(absent)} is in {where}"] if absent else []
+        return [f"{where} has no messages of {', '.join(absent)}"] if absent else []
 
 
 class ReplayOptions(Options):
@@ -90,22 +90,22 @@ class ReplayOptions(Options):
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -")
     speed: Annotated[
         Annotated[float, Field(ge=0.001, le=1000)] | None, BeforeValidator(lambda text: None if text == "max" else text)
-    ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive it")
-    wait: bool = Field(False, description="1 to start when a subscriber is there, or 0")
+    ] = Field(1.0, description="a factor from 0.001 to 1000, or max: as fast as readers receive")
+    wait: bool = Field(False, description="1 to wait for a subscriber before the start, or 0")
 
 
 class RecordedOptions(ReplayOptions):
     """Options of `ulog:` and `mcap:`."""
 
-    loop: bool = Field(False, description="1 to start again at the end, or 0")
+    loop: bool = Field(False, description="1 to restart at the end, or 0")
 
 
 class SimulatorOptions(ReplayOptions):
     """Options of `sim:`."""
 
-    seed: int = Field(0, description="a whole number: same seed, same flight")
+    seed: int = Field(0, description="an integer; the same seed gives the same flight")
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
-        None, description="seconds, 0.01 to 1e8; endless without it"
+        None, description="seconds, 0.01 to 1e8 (default: endless)"
     )
 
 
@@ -113,24 +113,24 @@ class Px4ZenohOptions(Options):
     """Options of `px4-zenoh:`."""
 
     domain: Annotated[int, Field(ge=0, le=232)] | None = Field(
-        None, description="a ROS domain, 0 to 232; all without it"
+        None, description="a ROS domain, 0 to 232 (default: all)"
     )
     vehicle: Vehicle | None = Field(None, description="1 to 64 of A-Z a-z 0-9 _ -, for topics without a namespace")
     vehicles: Vehicles = Field({}, description="NAMESPACE:VEHICLE or DOMAIN:VEHICLE, separated by commas")
     layout: Annotated[str, AfterValidator(_check_layout)] | None = Field(
-        None, description=f"the release of PX4 whose layouts keys without a type hash have: {', '.join(RELEASES)}"
+        None, description=f"the PX4 release whose layouts apply to keys without a type hash: {', '.join(RELEASES)}"
     )
-    msg: str = Field("", description="PX4's definitions of messages: .msg files or folders, separated by commas")
+    msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
 
 
 class MavlinkOptions(Options):
     """Options of `mavlink:`."""
 
     rate: Annotated[float, Field(ge=0.1, le=200)] = Field(
-        30.0, description="positions a second to request from the vehicle, 0.1 to 200"
+        30.0, description="positions per second to request from the vehicle, 0.1 to 200"
     )
     baud: Annotated[int, Field(ge=300, le=12_000_000)] = Field(
-        57600, description="of a serial port, or of the radio on the way, 300 to 12000000"
+        57600, description="baud rate of the serial port, or of a radio on the link, 300 to 12000000"
     )
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"

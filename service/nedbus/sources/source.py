@@ -1,4 +1,4 @@
-"""The two kinds of sources, replays and live ones, and the messages that they yield."""
+"""The two kinds of sources, replay and live, and the messages they yield."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from nedbus_msgs import Address, Definition
 
 @dataclass(frozen=True, slots=True)
 class SourceMessage:
-    """One message as a source has it, not validated yet.
+    """One message from a source, not yet validated.
 
-    `due`: in a replay, seconds since the start of its recording; a live message is due when it arrives.
-    `fields`: by name, of any PX4 layout.
-    `lost`: messages that were lost between the vehicle and the source, just before this one.
-    `rebooted`: this is the first message after the vehicle rebooted.
-    `error`: why it cannot be decoded, if so; it has no fields then.
-    `definition`: that of its message, None for that of its topic.
+    `due`: in a replay, seconds since the start of the recording; live messages are due on arrival.
+    `fields`: by name, in any PX4 layout.
+    `lost`: number of messages lost between the vehicle and the source, just before this one.
+    `rebooted`: True for the first message after the vehicle rebooted.
+    `error`: the reason if it cannot be decoded; `fields` is empty then.
+    `definition`: its message definition; None for the default of its topic.
     """
 
     due: float
@@ -35,8 +35,8 @@ class SourceMessage:
 class Rejection:
     """Input that a live source could not turn into a message.
 
-    `where`: the key, the link or the address that it came from; the log names each one once.
-    `count`: the number of messages that it stands for.
+    `where`: its key, link or address; each is logged once.
+    `count`: number of rejected messages.
     """
 
     where: str
@@ -47,10 +47,10 @@ class Rejection:
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """Topics that vehicles publish and a live source does not deliver; yielded when they change.
+    """Topics that vehicles announce but a live source does not deliver; yielded on change.
 
-    `not_carried`: messages that have no definition here.
-    `silent`: addresses that are announced, and of which nothing arrives while other topics of their vehicles do.
+    `not_carried`: names of messages without a definition, or not selected.
+    `silent`: announced addresses without messages, while other topics of the same vehicle arrive.
     """
 
     not_carried: tuple[str, ...] = ()
@@ -62,10 +62,10 @@ class ReplayRun:
     """One run of a replay.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: every address that occurs in the messages, with the definition of these, None for that of its topic.
-    `total`: the number of messages, None if they never end.
-    `summary`: a description for the log; `warnings`: damage, and parts that are left out.
-    `damage`: the cost of damage, if messages were lost; at its end the run has failed then.
+    `addresses`: every address in the messages, with its definition, or None for the default of its topic.
+    `total`: number of messages; None if endless.
+    `summary`: a description for the log; `warnings`: damage, and skipped parts.
+    `damage`: a description of messages lost to damage; with it, the run ends as failed.
     """
 
     messages: Iterator[SourceMessage]
@@ -80,8 +80,8 @@ class ReplayRun:
 class SourceContext:
     """Settings of the service that runs a source.
 
-    `vehicle`: the default for a source that has no vehicle name of its own.
-    `routers`: endpoints of the service's router, and `tls` to connect to them.
+    `vehicle`: the name for sources that set none.
+    `routers`: endpoints of the service's router; `tls`: the files to connect to them.
     """
 
     vehicle: str
@@ -92,8 +92,8 @@ class SourceContext:
 class ReplaySource(Protocol):
     """A source that can be replayed, once or repeatedly.
 
-    `finite`: it ends by itself; `loop`: it starts again at its end; `wait`: it starts when there is a subscriber.
-    `speed`: the factor of real time; None for as fast as readers receive it, without loss.
+    `finite`: it ends by itself; `loop`: it restarts at its end; `wait`: it waits for a subscriber before it starts.
+    `speed`: factor of real time; None for as fast as readers receive, without loss.
     """
 
     finite: bool
@@ -102,20 +102,20 @@ class ReplaySource(Protocol):
     speed: float | None
 
     def open(self) -> ReplayRun:
-        """Open it for one run; raise SourceError when it cannot be opened or has no messages."""
+        """Open it for one run; raise SourceError if it cannot be opened or has no messages."""
         ...
 
 
 @runtime_checkable
 class LiveSource(Protocol):
-    """A source that receives from vehicles; which addresses it has is known when messages arrive."""
+    """A source that receives from vehicles; its addresses become known as messages arrive."""
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
-        """Yield events until the iterator is closed, and None at least twice a second when there is none.
+        """Yield events until the iterator is closed; yield None at least twice a second while idle.
 
-        `router`: the session of the service where that is a router itself; it is lent, and must not be closed.
+        `router`: the service's own session if it is a router; borrowed, so do not close it.
 
-        Raises SourceError when it cannot be opened, or when the connection breaks.
+        Raises SourceError if the source cannot be opened or the connection breaks.
         """
         ...
 

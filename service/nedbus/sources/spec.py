@@ -1,4 +1,4 @@
-"""The table of source kinds, and the parser of sources: `KIND:TARGET?OPTION=VALUE&...`, or a table of TOML."""
+"""Table of source kinds, and parser for sources: `KIND:TARGET?OPTION=VALUE&...`, or a TOML table."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from .source import Source, SourceContext
 
 @dataclass(frozen=True, slots=True)
 class SourceKind:
-    """One kind of source: its options, its target, and the class that implements it, imported on first use.
+    """One kind of source: its options, its target, and its class, which is imported on first use.
 
-    `target`: the part after the colon; None if there is none, in brackets if it is optional.
-    `extra`: the extra of nedbus that it needs.
+    `target`: name of the part after the colon; None without one, in brackets if it is optional.
+    `extra`: the extra of nedbus that it requires.
     """
 
     options: type[Options]
@@ -35,7 +35,7 @@ class SourceKind:
     extra: str = ""
 
     def accepts(self, target: str) -> bool:
-        """Return whether this target, which may be empty, is allowed."""
+        """Return whether this target is allowed; "" stands for none."""
         return self.target is not None if target else self.target is None or self.target.startswith("[")
 
 
@@ -46,12 +46,12 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
-"""The one table of sources."""
+"""All kinds of source, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceSpec:
-    """One source as it was configured."""
+    """One configured source."""
 
     text: str
     kind: str
@@ -59,24 +59,23 @@ class SourceSpec:
     options: Options
 
     def open_source(self, *, vehicle: str, routers: tuple[str, ...] = (), tls: Tls | None = None) -> Source:
-        """Return the source, for a service with this default vehicle, router endpoints and TLS files.
+        """Create the source, for a service with this default vehicle, router endpoints and TLS files.
 
-        Raises ConfigError for an invalid target, for a file that cannot be read twice, and when the extra of this kind
-        is not installed.
+        Raises ConfigError for an invalid target, a path that is not a regular file, or a missing extra.
         """
         kind, path = SOURCE_KINDS[self.kind], Path(self.target).expanduser()
-        # The reader of a pipe, a socket or a device would wait for ever, or find nothing again.
+        # A pipe, socket or device may block forever, and cannot be read twice.
         if kind.target == "FILE" and path.exists() and not (path.is_file() or path.is_dir()):
-            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one, then give that")
+            raise ConfigError(f"source {self.text!r}", f"{path} is not a regular file: save it as one first")
         make = cast("Callable[..., Source]", getattr(needs(kind.extra, kind.module), kind.class_name))
         return make(self.target, self.options, SourceContext(vehicle, routers, tls))
 
 
 def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
-    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path `%3F` stands for `?`, and `%25` for `%`.
+    """Parse a text such as `ulog:flight.ulg?speed=2&vehicle=7`; in a path, write `?` as `%3F` and `%` as `%25`.
 
-    A mapping has the kind, the target under its name (`file`, `link` or `endpoint`) and the options instead, such as
-    {"kind": "ulog", "file": "flight.ulg", "speed": 2, "vehicle": 7}: its text is made of them.
+    A mapping holds the kind, the target by name (`file`, `link` or `endpoint`) and the options, such as
+    {"kind": "ulog", "file": "flight.ulg", "speed": 2, "vehicle": 7}.
 
     Raises ConfigError for an unknown kind, a missing target, or an unknown or invalid option.
     """
@@ -99,7 +98,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
         reason, name = _explain(exc, kind)
         raise ConfigError(f"source {text!r}", reason, key=name) from exc
     except ValueError:
-        hint = ", and a path with ? in it has %3F instead" if kind.target == "FILE" else ""
+        hint = "; in a path, write ? as %3F" if kind.target == "FILE" else ""
         raise ConfigError(f"source {text!r}", f"{query!r} is not OPTION=VALUE&OPTION=VALUE{hint}") from None
     if len(dict(pairs)) < len(pairs):
         raise ConfigError(f"source {text!r}", "an option occurs twice: remove one")
@@ -109,16 +108,16 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
 
 
 def source_text_of_file(path: str | PurePath, **options: str | None) -> str:
-    """Return the text of the source that replays a file, such as `ulog:flight.ulg?vehicle=7`, with these options.
+    """Return the source that replays a file with these options, as text: `ulog:flight.ulg?vehicle=7`.
 
-    Raises ConfigError for a file suffix that belongs to no kind.
+    Raises ConfigError for an unknown file suffix.
     """
     name = format_of(path)
     return _join(name, SOURCE_KINDS[name], str(path), {key: value for key, value in options.items() if value})
 
 
 def _text_of_table(table: Mapping[str, object]) -> str:
-    """Return the text of a source that is given as a table; raise ConfigError for a mistake."""
+    """Convert a table to the text of a source; raise ConfigError if the kind or target is missing or invalid."""
     options = dict(table)
     name = options.pop("kind", None)
     kind = SOURCE_KINDS.get(name) if isinstance(name, str) else None
@@ -133,7 +132,7 @@ def _text_of_table(table: Mapping[str, object]) -> str:
 
 
 def _text_of_value(value: object) -> str:
-    """Return an option's value as a text has it: 1 for true, NAME:VEHICLE,NAME:VEHICLE for a table."""
+    """Format the value of an option: 1 for true, NAME:VEHICLE,NAME:VEHICLE for a table."""
     if isinstance(value, Mapping):
         return ",".join(f"{name}:{each}" for name, each in value.items())
     if isinstance(value, list | tuple):
@@ -142,14 +141,14 @@ def _text_of_value(value: object) -> str:
 
 
 def _join(name: str, kind: SourceKind, target: str, options: Mapping[str, str]) -> str:
-    """Return the text of a source; a path has its percent and question marks escaped."""
+    """Return the text of a source, with % and ? escaped in a path."""
     path = target.replace("%", "%25").replace("?", "%3F") if kind.target == "FILE" else target
     query = urlencode(options, safe=":,/")
     return f"{name}:{path}?{query}" if query else f"{name}:{path}"
 
 
 def _explain(error: ValidationError, kind: SourceKind) -> tuple[str, str]:
-    """Return the mistake in an option, and its name."""
+    """Return the error text for an invalid option, and its name."""
     detail = error.errors()[0]
     name = str(detail["loc"][0])
     field = kind.options.model_fields.get(name)

@@ -1,4 +1,4 @@
-"""Replay a PX4 .ulg log: its topics with every instance, paced by their timestamps."""
+"""Replay a PX4 .ulg log with all instances of its topics, paced by their timestamps."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nedbus_msgs import ALL, DEFAULT, Definition
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
 
-_MAX_GAP: Final = 60_000_000  # us: a longer gap in a log is a damaged timestamp, not a time to wait for
-_CHUNK: Final = 1000  # rows that are converted to Python values at a time
+_MAX_GAP: Final = 60_000_000  # us; a longer gap is a damaged timestamp, and is skipped
+_CHUNK: Final = 1000  # rows converted to Python values at a time
 
 
 class UlogSource:
@@ -31,7 +31,7 @@ class UlogSource:
         self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
-        """Read the log; raise SourceError when it is not a ULog file, or has none of the topics."""
+        """Read the log; raise SourceError if it is not a ULog file or has none of the requested topics."""
         options = self._options
         log = read_ulog(
             self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
@@ -44,11 +44,11 @@ class UlogSource:
                 warnings.append(f"{topic.address}: {outliers} timestamps out of order; the log's own order is kept")
             unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
             if unknown and _is_newer(topic):
-                warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than this version")
+                warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than nedbus")
         warnings += options.absent_from({topic.address.topic for topic in topics}, "this log")
         dues, gaps = _pace(clocks)
         if gaps:
-            warnings.append(f"{gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in its timestamps are skipped")
+            warnings.append(f"skipped {gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
         total = sum(map(len, clocks))
         layouts = " and ".join(sorted({_layout_name(topic) for topic in topics if topic.definition is DEFAULT}))
         layout = f", layout {layouts}" if layouts else ""
@@ -59,12 +59,12 @@ class UlogSource:
             summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
             f" {max(due[-1] for due in dues):.1f} s",
             warnings=tuple(warnings),
-            damage=f"{self._path}: damage cost messages: {'; '.join(log.warnings)}" if log.damaged else None,
+            damage=f"{self._path}: messages lost to damage: {'; '.join(log.warnings)}" if log.damaged else None,
         )
 
 
 def _messages(topic: UlogTopic, dues: npt.NDArray[np.float64]) -> Iterator[SourceMessage]:
-    """Yield the rows of a topic, each when it is due."""
+    """Yield the rows of a topic as messages with these due times."""
     definition, names = topic.definition, tuple(topic.columns)
     for start in range(0, len(dues), _CHUNK):
         rows = slice(start, start + _CHUNK)
@@ -74,7 +74,7 @@ def _messages(topic: UlogTopic, dues: npt.NDArray[np.float64]) -> Iterator[Sourc
 
 
 def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
-    """Return a column as values that the model accepts: int, float, bool, or tuples of them."""
+    """Convert a column to values that the model accepts: int, float, bool, or tuples of them."""
     values: list[object] = column.tolist()
     if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
         return [_to_bool(value) for value in values]
@@ -82,18 +82,18 @@ def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[n
 
 
 def _to_bool(value: object) -> object:
-    """Return 0 and 1 as a bool, and any other byte as it is: the model rejects it."""
+    """Convert 0 and 1 to bool; leave any other byte for the model to reject."""
     if isinstance(value, list):
         return tuple(map(_to_bool, value))
     return bool(value) if value in (0, 1) else value
 
 
 def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
-    """Return timestamps that never decrease, with as few changes as possible: one outlier must not delay the rest."""
+    """Make timestamps non-decreasing with the fewest changes, so one outlier does not delay the rest."""
     times = timestamps.astype(np.uint64)
     if not np.any(times[1:] < times[:-1]):
         return times
-    # The longest non-decreasing subsequence keeps its times; each other row takes the time of the one before it.
+    # The longest non-decreasing subsequence keeps its times; every other row takes the time of the row before it.
     tails: list[int] = []  # the smallest time that ends a subsequence, by its length
     lengths: list[int] = []  # of the longest subsequence that ends with each row
     for time in times.tolist():
@@ -109,7 +109,7 @@ def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
 
 
 def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.float64]], int]:
-    """Return when each row of each track is due, in seconds since the first row, and the number of gaps removed."""
+    """Return the due time of each row of each topic [s since the first row], and the number of gaps removed."""
     times = np.unique(np.concatenate(clocks))
     steps = np.diff(times)
     gaps = steps > _MAX_GAP
@@ -119,7 +119,7 @@ def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.flo
 
 
 def _is_newer(topic: UlogTopic) -> bool:
-    """Return whether a log has all fields of the newest layout: it may have more."""
+    """Return whether a log may be newer than this version: it has all fields of the newest known layout."""
     newest = [layout for layout in topic.definition.layouts.values() if layout.name != ALL][-1]
     return newest.types.keys() <= topic.columns.keys()
 

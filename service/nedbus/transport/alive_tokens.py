@@ -1,4 +1,4 @@
-"""Liveliness tokens: those that there are, and those that appear and go."""
+"""Liveliness tokens: the present ones, and changes as they appear and disappear."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from .session import Session, while_open
 
 _log = logging.getLogger(__name__)
 
-_MAX_WAITING: Final = 131_072  # answers; Zenoh must never wait for room while it holds the lock of its session
-_MAX_CHANGES: Final = 4096  # that wait
+_MAX_WAITING: Final = 131_072  # answers; large, as Zenoh would hold its session lock while it waits for room
+_MAX_CHANGES: Final = 4096  # waiting changes
 _MAX_KEY_LENGTH: Final = MAX_ANSWER_BYTES // MAX_ANSWERS
-_INCOMPLETE_PAUSE: Final = 10.0  # s after an incomplete answer
-_CONTRADICTED_PAUSE: Final = 0.2  # s after one that looks complete, and lacks known tokens
+_INCOMPLETE_PAUSE: Final = 10.0  # s until the next query, after an incomplete answer
+_CONTRADICTED_PAUSE: Final = 0.2  # s until the next query, after an answer that lacks known tokens
 
 
 def alive_keys(session: Session, key_expr: str, *, timeout: float) -> list[str]:
-    """Return the keys of the liveliness tokens that match, each once, sorted, at most 10,000."""
+    """Return the keys of matching liveliness tokens: unique, sorted, at most 10,000."""
     replies = wait_for_answers([_ask(session, key_expr, timeout)])
     return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})[:MAX_ANSWERS]
 
 
 class AliveTokens:
-    """The liveliness tokens that match a key expression, followed by one thread.
+    """The liveliness tokens that match a key expression; used by one thread.
 
-    A query for all tokens costs all clients of a router, and following them costs nothing while nothing changes: the
-    router is asked on request of the caller, and after an overflow of the changes. Zenoh 1.10 leaves out of an answer
-    any tokens that it sends to the subscriber of the same session meanwhile, and the answer looks complete: it is asked
-    again until the answer has all known tokens. At most 10,000 tokens are kept; more of them, or a router that is too
-    slow to list them, are logged.
+    A subscription costs nothing while no token changes, but a query for all tokens loads every client of a router. So
+    the router is queried only on request, and after the queue of changes has overflowed. From an answer Zenoh 1.10
+    omits tokens that it sends to a subscriber of the same session meanwhile, and the answer looks complete; so the
+    query is repeated until an answer has all known tokens. At most 10,000 tokens are kept; more tokens, or a router
+    that is too slow to list them, are logged.
     """
 
     def __init__(self, session: Session, key_expr: str) -> None:
@@ -51,30 +51,30 @@ class AliveTokens:
         self._keys: set[str] = set()
         self._next_query = math.inf
         self._answers: Answers | None = None
-        self._expected: set[str] = set()  # known when the router was asked
+        self._expected: set[str] = set()  # tokens known at the time of the query
         self._answered: set[str] = set()
 
     @property
     def is_asking(self) -> bool:
-        """True while an answer has not come: another `take` gets it."""
+        """True while a query is open; a later `take` receives its answer."""
         return self._answers is not None
 
     def ask(self) -> None:
-        """Ask the router for all tokens with the next `take`."""
+        """Query the router for all tokens at the next `take`."""
         self._next_query = -math.inf
 
     def take(self, *, timeout: float) -> list[tuple[str, bool]]:
-        """Return the key of each token that changed since the last call, and whether it appeared, in order.
+        """Return the changes since the last call, in order: the key of a token, and True if it appeared.
 
-        A router that is asked for all has `timeout` seconds to answer.
+        `timeout`: seconds for the router to answer a query.
         """
         changed = self._take_changes()
         changes: list[tuple[str, bool]] = []
-        if len(changed) == _MAX_CHANGES:  # others were dropped, of tokens that appeared or went
+        if len(changed) == _MAX_CHANGES:  # further changes were dropped
             changes += [(key, False) for key in self._keys]
             self._answers = None
             self.ask()
-        if self._answers is not None:  # taken after the changes, and older than they are
+        if self._answers is not None:  # after the changes, as the answers may be older
             changes += self._take_answers(self._answers)
         changes = [change for change in changes + changed if self._note(*change)]
         if self._answers is None and time.monotonic() >= self._next_query:
@@ -102,7 +102,7 @@ class AliveTokens:
         return [(key, True) for key in keys]
 
     def _note(self, key: str, alive: bool) -> bool:
-        """Return whether this changes anything."""
+        """Apply a change; return whether it made a difference."""
         if (key in self._keys) == alive or len(key) > _MAX_KEY_LENGTH:
             return False
         if alive and len(self._keys) >= MAX_ANSWERS:
@@ -114,12 +114,12 @@ class AliveTokens:
     def _ask_later(self) -> None:
         if self._next_query == math.inf:
             self._next_query = time.monotonic() + _INCOMPLETE_PAUSE
-            text = "%s: not all liveliness tokens are known, after %d: some vehicles are missing"
+            text = "%s: not all liveliness tokens are known, only %d: some vehicles are missing"
             _log.warning(text, self._key_expr, len(self._keys), extra=about("incomplete"))
 
 
 def _ask(session: Session, key_expr: str, timeout: float) -> Answers:
-    """Ask for the tokens that match, and return at once; one token is in each answer that has no error."""
+    """Query matching tokens and return at once; each answer without an error holds one token."""
     channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(_MAX_WAITING)
     timeout = zenoh_timeout(timeout)
     with while_open():

@@ -1,4 +1,4 @@
-"""Zenoh endpoints: the default, their form, and where a client on this host dials a router."""
+"""Zenoh endpoints: the default, their syntax, and the address to dial for a listening endpoint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 from nedbus.errors import ConfigError
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""The default: `nedbus serve` listens here, and clients connect to it."""
+"""The default endpoint: `nedbus serve` listens on it, and clients connect to it."""
 
 _ENDPOINT: Final = re.compile(
     r"(?P<protocol>tcp|tls|udp|ws|quic)/(?P<host>\S+):(?P<port>\d{1,9})(?:[?#]\S*)?|unixsock-stream/\S+"
@@ -18,7 +18,7 @@ _ENDPOINT: Final = re.compile(
 
 
 def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
-    """Raise ConfigError, with `where` as the name of the setting, unless each of these is a Zenoh endpoint."""
+    """Raise ConfigError unless these are all Zenoh endpoints; `where` is the name of the setting."""
     for endpoint in endpoints:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is None:
@@ -29,7 +29,7 @@ def check_endpoints(endpoints: Sequence[str], *, where: str) -> None:
 
 
 def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
-    """Return protocol, host (without brackets) and port of an endpoint; None for a socket in the file system."""
+    """Return protocol, host (without brackets) and port of an endpoint; None for a Unix socket."""
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or found["host"] is None:
         return None
@@ -37,7 +37,7 @@ def split_endpoint(endpoint: str) -> tuple[str, str, int] | None:
 
 
 def explain_endpoints(endpoints: Sequence[str]) -> str | None:
-    """Return the reason if none of these can be reached, as this host finds no address of their names; else None."""
+    """Return the error text if name resolution fails for all endpoints, else None."""
     hosts = []
     for parts in map(split_endpoint, endpoints):
         if parts is None:
@@ -49,9 +49,9 @@ def explain_endpoints(endpoints: Sequence[str]) -> str | None:
         else:
             return None
     names = " and ".join(hosts)
-    return f"this host finds no address of {names}: correct the name, or write the IP address" if hosts else None
+    return f"cannot resolve {names}: correct the name, or give the IP address" if hosts else None
 
 
 def dial_endpoint(endpoint: str) -> str:
-    """Return the endpoint for a client on this host of a router that listens here, perhaps on all interfaces."""
+    """Return the endpoint to dial from this host for one that a router listens on, which may be a wildcard address."""
     return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")

@@ -1,8 +1,8 @@
-"""Queries: the answers on a key expression.
+"""Zenoh queries and their answers.
 
-Answers wait in channels in Rust until a thread of ours takes them: a Python callback, or its drop, would wait for the
-interpreter's lock on a thread of Zenoh's, for a liveliness query even while that thread holds the lock of the session,
-and whatever else needs that lock stops the process.
+Answers wait in channels in Rust until a thread of nedbus polls them. A Python callback, or its drop, would wait for the
+GIL on a thread of Zenoh's, which for a liveliness query holds the session lock meanwhile: a deadlock as soon as another
+thread needs that lock.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from .session import RawSample, Session, while_open
 _log = logging.getLogger(__name__)
 
 MAX_ANSWERS: Final = 10_000
-"""Answers that are kept of one query; more are not sent by honest peers."""
+"""Answers accepted per query; honest peers send fewer."""
 
 MAX_ANSWER_BYTES: Final = 2**26
-"""Bytes of payloads and keys that are accepted from one query."""
+"""Bytes of payloads and keys accepted per query."""
 
-_MAX_WAITING: Final = 1024  # answers
-_GRACE: Final = 1.0  # s beyond the timeout that Zenoh has to report the end of a query
-_PAUSES: Final = (0.0005, 0.01)  # s between two polls for answers: the first, and the longest
+_MAX_WAITING: Final = 1024  # answers in the channel
+_GRACE: Final = 1.0  # s beyond the timeout for Zenoh to report the end of a query
+_PAUSES: Final = (0.0005, 0.01)  # s between polls for answers: the first pause, and the longest
 
 
 class Answers:
-    """The answers to one query, which the thread that sent it takes by polling."""
+    """The answers to one query, polled by the thread that sent it."""
 
     def __init__(self, handler: zenoh.Handler[zenoh.Reply], *, timeout: float) -> None:
         self.ended = False
-        """True once the last answer was taken: all have answered, or the timeout has passed."""
+        """True once the last answer was taken: every queryable has answered, or the timeout has passed."""
         self.failed = False
         """True once an answer was an error, such as a timeout."""
         self._handler = handler
         self._end = time.monotonic() + timeout + _GRACE
 
     def take(self) -> list[zenoh.Reply]:
-        """Return the answers that came since the last call."""
+        """Return the answers received since the last call."""
         taken: list[zenoh.Reply] = []
         try:
             while len(taken) < MAX_ANSWERS and (reply := self._handler.try_recv()) is not None:
@@ -51,7 +51,7 @@ class Answers:
                 self.failed |= reply.ok is None
             if time.monotonic() > self._end:
                 self.ended = self.failed = True
-        except zenoh.ZError:  # it is empty, and closed
+        except zenoh.ZError:  # empty and closed
             self.ended = True
         return taken
 
@@ -66,7 +66,7 @@ def ask(
     priority: zenoh.Priority | None = None,
     congestion_control: zenoh.CongestionControl | None = None,
 ) -> Answers:
-    """Query all that answer on a selector, and return at once; while `room` answers wait, the session waits too."""
+    """Query all matching queryables and return at once; the session blocks while `room` answers wait."""
     timeout = zenoh_timeout(timeout)
     with while_open():
         handler = session.get(
@@ -83,9 +83,9 @@ def ask(
 
 
 def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True) -> list[RawSample]:
-    """Return the answers on any of these within `timeout` seconds: the newest answer for each key, or all.
+    """Return the answers to these key expressions within `timeout` seconds: the newest for each key, or all.
 
-    At most 10,000 answers of 64 MB in all are accepted, from any peers; that there are more is logged.
+    At most 10,000 answers and 64 MB in total are accepted; the number of answers beyond that is logged.
     """
     kept: dict[object, RawSample] = {}
     size = left_out = 0
@@ -101,12 +101,13 @@ def query(session: Session, *key_exprs: str, timeout: float, newest: bool = True
         else:
             kept[key], size = sample, new_size
     if left_out:
-        _log.warning("%s: %d answers too many are left out", ", ".join(key_exprs), left_out, extra=about("incomplete"))
+        text = "%s: %d answers left out, beyond the limits of a query"
+        _log.warning(text, ", ".join(key_exprs), left_out, extra=about("incomplete"))
     return list(kept.values())
 
 
 def wait_for_answers(queries: Sequence[Answers]) -> Iterator[zenoh.Reply]:
-    """Yield answers as they come, until all queries have ended."""
+    """Yield answers as they arrive, until all queries have ended."""
     pause, longest = _PAUSES
     while still := [answers for answers in queries if not answers.ended]:
         taken = [reply for answers in still for reply in answers.take()]
@@ -122,5 +123,5 @@ def _is_newer(sample: RawSample, other: RawSample) -> bool:
 
 
 def zenoh_timeout(timeout: float) -> float:
-    """Return a timeout that Zenoh accepts: neither 0 nor infinity."""
+    """Limit a timeout to the range that Zenoh accepts: neither 0 nor infinity."""
     return min(max(timeout, 0.001), 86_400.0)

@@ -1,4 +1,4 @@
-"""Keys, attachments and liveliness tokens of ROS 2 over Zenoh: of rmw_zenoh, and of PX4's own Zenoh module.
+"""Keys, attachments and liveliness tokens of ROS 2 over Zenoh, as in rmw_zenoh and PX4's own Zenoh module.
 
     key          <domain>/<topic>/<DDS type>/RIHS01_<hash>
     attachment   sequence number, time, 16, gid: 33 bytes, little-endian
@@ -20,28 +20,28 @@ import xxhash
 from nedbus_msgs import DecodeError
 
 NO_HASH: Final = "TypeHashNotSupported"
-"""The type hash in keys of ROS 2 Humble, and of a PX4 that is built for it."""
+"""The type hash in the keys of ROS 2 Humble, and of a PX4 built for it."""
 
 BRIDGED_ENCODING: Final = "application/cdr;nedbus"
-"""The encoding of messages that nedbus published to ROS 2: they must not be bridged back. ROS 2 does not look at it."""
+"""The encoding of messages that nedbus publishes to ROS 2, which must not be bridged back; ROS 2 ignores it."""
 
-_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, the last 10: as PX4 offers
+_QOS: Final = "2::,10:,:,:,,"  # best effort, volatile, keep last 10: as PX4 offers
 _ATTACHMENT: Final = struct.Struct("<qqB16s")
 _GID: Final = 16
-_MAX_KEY: Final = 512  # characters; PX4 and ROS 2 have half of that
+_MAX_KEY: Final = 512  # characters; keys of PX4 and ROS 2 have up to half of it
 _KEY: Final = re.compile(r"([0-9]{1,9})/([^*]+)/([^*/]+)/([^*/]+)")
 _PX4_NODE: Final = re.compile(r"px4_([0-9a-f]{32})")
 
 LONGEST_TOKEN: Final = 2 * _MAX_KEY
-"""Characters of a liveliness token; a longer one is none of ROS 2's."""
+"""Characters of the longest liveliness token accepted; those of ROS 2 are shorter."""
 
 PX4_TYPES: Final = "px4_msgs$*"
-"""The DDS types of PX4's messages, as a chunk of a key expression; those of its translation node too."""
+"""The DDS types of PX4's messages and of its translation node, as a chunk of a key expression."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicKey:
-    """The key of one topic: `topic` without a leading slash, `dds_type`, and its `type_hash` or NO_HASH."""
+    """The key of one topic: `topic` without a leading slash, `dds_type`, and `type_hash`, which may be NO_HASH."""
 
     domain: int
     topic: str
@@ -50,7 +50,7 @@ class TopicKey:
 
     @classmethod
     def parse(cls, key: str) -> Self:
-        """Parse a key; raise DecodeError for any key that is not one of rmw_zenoh."""
+        """Parse a key of rmw_zenoh; raise DecodeError for any other key."""
         if len(key) > _MAX_KEY:
             raise DecodeError(f"a key of {len(key)} characters")
         found = _KEY.fullmatch(key)
@@ -66,7 +66,7 @@ class TopicKey:
 class Attachment:
     """The attachment of each message: its sequence number, its source time, and its publisher's gid.
 
-    `time` is in us since boot from PX4, in ns since the epoch from rmw_zenoh.
+    `time`: us since boot from PX4, ns since the epoch from rmw_zenoh.
     """
 
     sequence: int
@@ -75,7 +75,7 @@ class Attachment:
 
     @classmethod
     def parse(cls, data: bytes) -> Self:
-        """Parse an attachment; raise DecodeError for anything else."""
+        """Parse an attachment of rmw_zenoh; raise DecodeError for anything else."""
         if len(data) != _ATTACHMENT.size or data[_GID] != _GID:
             raise DecodeError(f"an attachment of {len(data)} bytes that is not rmw_zenoh's of {_ATTACHMENT.size}")
         sequence, time, _, gid = _ATTACHMENT.unpack(data)
@@ -89,9 +89,9 @@ class Attachment:
 
 @dataclass(frozen=True, slots=True)
 class PublisherToken:
-    """The liveliness token of a publisher: its session, its node's name, and the key of its messages.
+    """The liveliness token of a publisher: its session, the name of its node, and the key of its messages.
 
-    `text` is the whole token, by which two publishers of one session differ.
+    `text`: the whole token, which is unique to each publisher.
     """
 
     text: str
@@ -111,31 +111,31 @@ class PublisherToken:
 
     @property
     def gid(self) -> bytes | None:
-        """The gid of its messages, if its node is named by that: PX4's is, and in simulation all have the same."""
+        """The gid of its messages, if its node is named by it, as PX4's is; all simulated PX4s have the same one."""
         found = _PX4_NODE.fullmatch(self.node)
         return bytes.fromhex(found[1]) if found else None
 
 
 def gid_of_token(token: str) -> bytes:
-    """Return the gid that ROS 2 shows for the owner of a token, and that its messages carry.
+    """Return the gid of the owner of a token, as ROS 2 shows it and its messages carry it.
 
-    Source: rmw_zenoh, liveliness_utils.cpp: the XXH3 of the token in 128 bits, the lower half first.
+    Source: rmw_zenoh, liveliness_utils.cpp: the 128-bit XXH3 of the token, lower half first.
     """
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(_GID, "little")
 
 
 def node_token(domain: int, session: str, node: str) -> str:
-    """Return the liveliness token of a node without namespace, by which ROS 2 lists it."""
+    """Return the liveliness token of a node without a namespace, for ROS 2 to list."""
     return f"@ros2_lv/{domain}/{session}/0/0/NN/%/%/{node}"
 
 
 def publisher_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's publisher, by which ROS 2 lists its topic."""
+    """Return the liveliness token of a node's publisher, for ROS 2 to list its topic."""
     return _endpoint_token("MP", key, session, node, entity)
 
 
 def subscription_token(key: TopicKey, session: str, node: str, entity: int) -> str:
-    """Return the liveliness token of a node's subscription, by which a publisher in ROS 2 sees that it has one."""
+    """Return the liveliness token of a node's subscription, for publishers in ROS 2 to match."""
     return _endpoint_token("MS", key, session, node, entity)
 
 
@@ -145,5 +145,5 @@ def _endpoint_token(kind: str, key: TopicKey, session: str, node: str, entity: i
 
 
 def px4_publishers_key_expr(domain: int | None) -> str:
-    """Return the key expression for the tokens of all publishers of PX4's messages, in one domain or in all."""
+    """Return the key expression for the tokens of all publishers of PX4's messages, in one domain or all."""
     return f"@ros2_lv/{'*' if domain is None else domain}/*/*/*/MP/*/*/*/*/{PX4_TYPES}/*/*"

@@ -1,4 +1,4 @@
-"""A Zenoh router in this process: with our settings, or with a configuration file that `zenohd` reads too."""
+"""An embedded Zenoh router, with nedbus's settings or a configuration file of `zenohd`."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from .tls import Tls
 
 _log = logging.getLogger(__name__)
 
-# Longer than that of clients, so that a router gives up a client that falls silent before that one goes to another
-# router. Zenoh 1.10.2 forgets queryables of a client that two routers have for a moment, where a third one joins later.
+# Longer than the lease of clients: a router drops a silent client before that client joins another router. If two
+# routers have the same client for a moment, Zenoh 1.10.2 loses its queryables on a third router that joins later.
 _LEASE: Final = 8.0  # s
-_OTHER_FILES: Final = 100  # open files that are no sessions: a router has 21, a service its sources and HTTP clients
+_OTHER_FILES: Final = 100  # open files besides sessions: 21 of a router, and the sources and HTTP clients of a service
 
 
 def open_router(
@@ -36,16 +36,16 @@ def open_router(
     config_file: Path | None = None,
     tls: Tls | None = None,
 ) -> Session:
-    """Open a session that is itself a router, by default on loopback, or as a JSON5 file for `zenohd` configures it.
+    """Open a session that is a router, by default on loopback, or as configured by a `zenohd` file.
 
-    Endpoints that are given replace those of the file, as the flags of `zenohd` do.
-    `tls` is for the `tls/` routers that it joins, unless the file has a TLS section of its own.
+    Endpoints given here replace those of the file, as the flags of `zenohd` do.
+    `tls`: for the `tls/` routers that it joins, unless the file has a TLS section.
 
-    Plugins of the file are not loaded, as Zenoh's Python library has none: they are logged.
-    The admin space shows `max_sessions` in `metadata`, and the soft limit of open files is raised to the hard one.
+    Plugins in the file are not loaded, as Zenoh's Python library has none, and are logged.
+    The admin space shows `max_sessions` in `metadata`. The soft limit of open files is raised to the hard limit.
 
-    Raises ListenError when it cannot listen, ConfigError for a malformed endpoint or file, a TLS file that cannot be
-    read, or a plugin that the file requires.
+    Raises ListenError if it cannot listen; ConfigError for a malformed endpoint or file, an unreadable TLS file, or a
+    plugin that the file requires.
     """
     check_endpoints(listen, where="listen")
     check_endpoints(connect, where="connect")
@@ -55,7 +55,7 @@ def open_router(
             **COMMON_SETTINGS,
             "mode": "router",
             "transport/link/tx/lease": round(1000 * _LEASE),
-            "scouting/delay": 0,  # scouting is off: there are no answers to wait 0.5 s for
+            "scouting/delay": 0,  # scouting is off, so do not wait 0.5 s for answers
             "listen/endpoints": list(router_endpoints(listen)),
             "connect/endpoints": list(connect),
             "connect/retry": draw_retry(),
@@ -74,7 +74,7 @@ def open_router(
         insert_settings(config, files, where="tls")
     sessions = _get(config, "transport/unicast/max_sessions")
     metadata = _get(config, "metadata")
-    if metadata is None or isinstance(metadata, dict):  # it is the user's: it may be anything
+    if metadata is None or isinstance(metadata, dict):  # the user may have set anything
         insert_settings(config, {"metadata": {**(metadata or {}), "max_sessions": sessions}}, where="metadata")
     allow_sessions(sessions)
     try:
@@ -84,25 +84,24 @@ def open_router(
 
 
 def allow_sessions(sessions: int) -> None:
-    """Raise the soft limit of open files of this process to the hard one, as each session of a router is an open file.
+    """Raise this process's soft limit of open files to the hard limit, as each session of a router is an open file.
 
-    At the limit a router accepts no more connections, and Zenoh does not log it. Logs a warning when there is no room
-    for all sessions.
+    At the limit a router silently accepts no more connections. Logs a warning if the limit is too low for `sessions`.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with suppress(OSError, ValueError):  # a kernel may allow less than the hard limit says
+    with suppress(OSError, ValueError):  # a kernel may allow less than the hard limit
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < sessions + _OTHER_FILES:
         text = (
-            "only %s open files are allowed: room for about %s sessions, and not for the %s of max_sessions:"
+            "the limit of %s open files has room for about %s sessions, but max_sessions is %s:"
             " raise the limit (ulimit -n, LimitNOFILE=)"
         )
         _log.warning(text, soft, max(0, soft - _OTHER_FILES), sessions, extra=about("router"))
 
 
 def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None) -> tuple[str, ...]:
-    """Return the endpoints of a router with these settings: those given, else those of the file, else the default.
+    """Return the listening endpoints of a router: those given, else those of the file, else the default.
 
     Raises ConfigError for a malformed file.
     """
@@ -112,7 +111,7 @@ def router_endpoints(listen: Sequence[str] = (), config_file: Path | None = None
 
 
 class RouterConfig(NamedTuple):
-    """The configuration of a router: endpoints, the PEM files of its TLS section by name, and its limit of sessions."""
+    """Configuration of a router: endpoints, PEM files of its TLS section by name, and its limit of sessions."""
 
     listen: tuple[str, ...]
     connect: tuple[str, ...]
@@ -121,9 +120,9 @@ class RouterConfig(NamedTuple):
 
 
 def read_router_config(path: Path | None = None) -> RouterConfig:
-    """Read a file for zenohd or for a router of ours, by default Zenoh's defaults.
+    """Read a configuration file of a router; without a file, return Zenoh's defaults.
 
-    Raises ConfigError, with line and column, for a mistake.
+    Raises ConfigError, with line and column, for a malformed file.
     """
     config = zenoh.Config() if path is None else _parse_config(path)
     sessions = int(_get(config, "transport/unicast/max_sessions"))
@@ -145,23 +144,23 @@ def _tls_files(config: zenoh.Config) -> dict[str, Path]:
 
 
 def _read_config(path: Path) -> zenoh.Config:
-    """Read a file that a router in this process is to use; raise ConfigError if it requires a plugin."""
+    """Read the file of an embedded router; raise ConfigError if it is malformed or requires a plugin."""
     config = _parse_config(path)
     plugins = _get(config, "plugins").items()
     if required := [name for name, settings in plugins if settings and settings.get("__required__")]:
-        reason = f"it requires {_names(required)}, and this router loads no plugins: start it with zenohd -c"
+        reason = f"it requires {_names(required)}, but this router loads no plugins: run it with zenohd -c"
         raise ConfigError.in_file(path, reason)
     return config
 
 
 def _check_files(path: Path, config: zenoh.Config) -> None:
-    """Log the plugins of a file, and raise ConfigError for a TLS file that cannot be read: Zenoh would not name it."""
+    """Log the plugins of a file; raise ConfigError for an unreadable TLS file, as Zenoh would not name it."""
     if plugins := _get(config, "plugins"):
-        text = "%s: without %s: this router loads no plugins, as zenohd does"
+        text = "%s: %s not loaded: unlike zenohd, this router loads no plugins"
         _log.warning(text, path, _names(plugins), extra=about("router"))
     for name, file in _tls_files(config).items():
         if not os.access(file, os.R_OK):
-            reason = f"{name}: {file} cannot be read: does it exist, and may this user read it?"
+            reason = f"{name}: {file} cannot be read: check that it exists and that this user may read it"
             raise ConfigError.in_file(path, reason)
 
 
@@ -171,7 +170,7 @@ def _names(plugins: Iterable[str]) -> str:
 
 def _parse_config(path: Path) -> zenoh.Config:
     if path.suffix not in {".json5", ".json", ".yaml", ".yml"}:
-        raise ConfigError.in_file(path, "a Zenoh configuration is a .json5, .json, .yaml or .yml file")
+        raise ConfigError.in_file(path, "not a Zenoh configuration: expected a .json5, .json, .yaml or .yml file")
     if not path.is_file():
         raise ConfigError.in_file(path, "there is no such file")
     try:
@@ -182,7 +181,7 @@ def _parse_config(path: Path) -> zenoh.Config:
         text = str(exc)
         position = re.search(r"(?:line: |--> )(\d+)(?:, column: |:)(\d+)", text)
         line, column = map(int, position.groups()) if position else (None, None)
-        # Without the drawing of Zenoh's parser and its source paths.
+        # Without the source excerpt and the source paths that Zenoh's parser adds.
         message = re.search(r'(?:msg: "|= )(.*?)(?: at /|", location)', text, re.DOTALL)
         reason = message[1].replace("`", "'") if message else "not a Zenoh configuration"
         raise ConfigError.in_file(path, reason, line=line, column=column) from exc

@@ -1,6 +1,6 @@
-"""Events of a router that Zenoh does not log: links to other routers that come up or break, clients that are refused.
+"""Log events of an embedded router: links to other routers that come up or break, and refused clients.
 
-Zenoh writes refusals to its own log only, on stdout.
+Zenoh does not report links, and writes refusals only to its own log, on stdout.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from .tls import Tls
 _log = logging.getLogger(__name__)
 
 UPLINK_POLL: Final = 1.0
-"""Seconds between two checks."""
+"""Seconds between checks of the links."""
 
-_LINK_TIMEOUT: Final = 3.0  # s until a link that is not up is worth a warning
+_LINK_TIMEOUT: Final = 3.0  # s until a link that does not come up is logged
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
-_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # of its listener: all have a hint
-_REASONS: Final = {  # by a part of Zenoh's text
+_REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # of a listener; all have a hint
+_REASONS: Final = {  # by substring of Zenoh's text
     "certificate expired": "its certificate has expired",
-    "BadSignature": "its certificate is of another authority",
-    "UnknownIssuer": "its certificate is of another authority",
-    "sent no certificates": "it shows no certificate",
+    "BadSignature": "its certificate is signed by another authority",
+    "UnknownIssuer": "its certificate is signed by another authority",
+    "sent no certificates": "it sent no certificate",
     "fatal alert": "it does not accept the certificate of this router",
     "corrupt message": "it does not speak TLS",
-    "handshake eof": "it breaks off the handshake",
+    "handshake eof": "it aborted the handshake",
 }
 
 
 class Uplinks:
-    """Log when the link to each of these routers comes up, does not come up, or is lost; call `check` every second."""
+    """Log when the links to other routers come up, fail to come up, or are lost; call `check` every second."""
 
     def __init__(
         self,
@@ -55,11 +55,11 @@ class Uplinks:
         self._tls = tls
         self._now = now
         self._due = now() + _LINK_TIMEOUT
-        self._is_up: dict[str, bool | None] = dict.fromkeys(endpoints)  # as logged last, None before that
+        self._is_up: dict[str, bool | None] = dict.fromkeys(endpoints)  # last logged state; None before the first
 
     def check(self) -> None:
-        """Compare the links that there should be with those that there are."""
-        # The other side of a link that this router opened is the endpoint that it dialled, under another host name.
+        """Compare the expected links with the open ones."""
+        # The destination of an open link is the dialled endpoint, but its host name may have been resolved.
         dialled = {_protocol_and_port(link.dst) for link in self._session.info.links()}
         for endpoint, was_up in self._is_up.items():
             is_up = _protocol_and_port(endpoint) in dialled
@@ -78,7 +78,7 @@ class Uplinks:
         if not endpoint.startswith(("tls/", "quic/")):
             return ""
         if self._tls is None:
-            return ", and no certificate was given for it: set tls_ca, and tls_certificate and tls_key"
+            return " (no certificates are given for it: set tls_ca, tls_certificate and tls_key)"
         explanation = self._tls.explain()
         return f" ({explanation})" if explanation else ""
 
@@ -89,9 +89,9 @@ def _protocol_and_port(locator: str) -> tuple[str, str]:
 
 
 def log_refusals() -> None:
-    """Log each client that a router of this process refuses from now on; Zenoh does not log its address.
+    """Log each client that a router of this process refuses from now on; its address is not known.
 
-    It takes the place of stdout, and passes on all other lines, such as those that RUST_LOG asks of Zenoh.
+    Redirects stdout through a pipe, reads refusals from Zenoh's log, and passes on all other lines.
     """
     stdout = os.dup(1)
     read, write = os.pipe()

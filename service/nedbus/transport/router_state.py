@@ -1,4 +1,4 @@
-"""The state of the routers of a network, from their admin spaces: sessions and their limit."""
+"""State of the routers of a network from their admin spaces: number and limit of sessions."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .session import Session
 
 _KEY: Final = re.compile(r"@/([0-9a-f]{1,32})/router")
 _MAX_ANSWER_BYTES: Final = 2**20  # about 5,700 sessions
-_MAX_SESSIONS: Final = 2**32  # that are believed
-_MAX_ROUTERS: Final = 1000  # that are returned: any peer may claim to be a router
+_MAX_SESSIONS: Final = 2**32  # greatest limit accepted from a router
+_MAX_ROUTERS: Final = 1000  # returned routers; any peer may claim to be one
 
 
 @dataclass(frozen=True, slots=True)
 class RouterState:
-    """A router by its Zenoh id, its sessions now, those with other routers included, and the number it accepts.
+    """A router: its Zenoh id, its open sessions, including those with other routers, and their limit.
 
-    `max_sessions` is None if it is not in `metadata` of the configuration of the router: Zenoh has no other place.
+    `max_sessions`: None unless it is in `metadata` of the router's configuration; Zenoh reports it nowhere else.
     """
 
     zid: str
@@ -30,15 +30,15 @@ class RouterState:
 
     @property
     def load(self) -> float | None:
-        """The part of its sessions that a router has in use, 1.0 when it is full; None if the limit is unknown."""
+        """Open sessions divided by their limit, 1.0 when full; None if the limit is unknown."""
         return None if self.max_sessions is None else self.sessions / self.max_sessions
 
 
 def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
-    """Return the state of each router that answers within `timeout` seconds, by their ids.
+    """Return the state of each router that answers within `timeout` seconds, sorted by id.
 
-    A router is left out whose admin space is off or denied, or whose answer is larger than this session takes: 2**18
-    bytes for a client, about 1,400 sessions.
+    A router is missing if its admin space is off or denied, or if its answer exceeds the message size of this session:
+    2**18 bytes for a client, about 1,400 sessions.
     """
     answers = query(session, "@/*/router", timeout=timeout)
     small = (answer for answer in answers if len(answer.payload) <= _MAX_ANSWER_BYTES)
@@ -47,7 +47,7 @@ def ask_routers(session: Session, *, timeout: float) -> list[RouterState]:
 
 
 def read_state(key: str, payload: bytes) -> RouterState | None:
-    """Return the state in an answer; None if it is not that of a router, as any peer may answer anything."""
+    """Parse the state in an answer; return None if it is not a router's, as any peer may answer anything."""
     found = _KEY.fullmatch(key)
     try:
         answer = json.loads(payload)
@@ -58,5 +58,5 @@ def read_state(key: str, payload: bytes) -> RouterState | None:
         return None
     metadata = answer.get("metadata")
     limit = metadata.get("max_sessions") if isinstance(metadata, dict) else None
-    is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # and no bool
+    is_limit = type(limit) is int and 0 < limit <= _MAX_SESSIONS  # not a bool
     return RouterState(found[1], len(sessions), limit if is_limit else None)

@@ -1,4 +1,4 @@
-"""Zenoh sessions of clients, and the translation of Zenoh's errors."""
+"""Zenoh sessions of clients, and translation of Zenoh's errors."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ RawSample = zenoh.Sample
 SourceInfo = zenoh.SourceInfo
 
 LEASE: Final = 5.0
-"""Seconds without a sign of life after which a peer is closed: a frozen host, a cut cable."""
+"""Seconds of silence after which a link is closed, as with a frozen host or a cut cable."""
 
-# Shared memory costs 351 sessions per router and gains nothing at 244 bytes.
+# Shared memory limits a router to 351 fewer sessions, and gains nothing at 244 bytes.
 # Gossip and multicast would let peers find each other and bypass the router.
-# Longer queues than Zenoh's own take up the bursts of a fleet, where two batches are full in a moment.
-# Sessions do not stamp: a publisher stamps each message itself, so that a router never replaces a timestamp.
+# Queues are longer than Zenoh's default, whose two batches are too few for the bursts of a fleet.
+# Sessions add no timestamps: publishers stamp each message, so a router never replaces a timestamp.
 COMMON_SETTINGS: Final = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
@@ -49,7 +49,7 @@ _forked = False
 
 
 def is_forked() -> bool:
-    """Return whether this process was forked from one with Zenoh sessions, in which Zenoh works no more."""
+    """Return whether this process was forked from one with Zenoh sessions; Zenoh does not work in it."""
     return _forked
 
 
@@ -70,7 +70,7 @@ def _mark_forked() -> None:
 
 
 def open_session(config: zenoh.Config) -> Session:
-    """Open a session; raise ForkError in a process that was forked from one with sessions, where Zenoh would hang."""
+    """Open a session; raise ForkError in a process forked from one with sessions, where Zenoh would hang."""
     require_unforked()
     _watch_forks()
     return zenoh.open(config)
@@ -81,10 +81,10 @@ def open_client(
 ) -> Session:
     """Open a session as a client of the first router that answers; Ctrl-C, or setting `stop`, ends the wait.
 
-    It reconnects by itself whenever the link breaks.
+    The session reconnects by itself when its link breaks.
 
-    Raises ConnectError when no endpoint answers within `timeout` seconds (never, if it is None), ConfigError for a
-    malformed endpoint or a TLS file that cannot be read.
+    Raises ConnectError if no endpoint answers within `timeout` seconds (None: wait forever), ConfigError for a
+    malformed endpoint or an unreadable TLS file.
     """
     check_endpoints(endpoints, where="connect")
     settings: dict[str, object] = {
@@ -95,7 +95,7 @@ def open_client(
         "connect/timeout_ms": 0,
         "connect/retry": draw_retry(),
         "listen/endpoints": [],
-        # No peer on the network is trusted: the largest answer that is expected is a status of many sources.
+        # No peer is trusted with more; the largest expected answer is the status of many sources.
         "transport/link/rx/max_message_size": 2**18,
     }
     timeout = math.inf if timeout is None else timeout
@@ -103,8 +103,8 @@ def open_client(
     stop = stop or threading.Event()
     reason = ""
     for pause in chain(_PAUSES, repeat(1.0)):
-        # An endpoint that accepts and then sends nothing may not use up much more than the time that there is; but the
-        # session will reconnect with the same timeout, over a slow link perhaps.
+        # Short, as an endpoint may accept and then send nothing; but at least 1 s, as the session will reconnect with
+        # the same timeout, and perhaps over a slow link.
         open_timeout = min(3.0, max(1.0, end - time.monotonic()))
         settings["transport/unicast/open_timeout"] = round(1000 * open_timeout)
         try:
@@ -114,19 +114,19 @@ def open_client(
             left = end - time.monotonic()
             if left <= 0 or stop.wait(min(left, pause)):
                 break
-    # For most failures Zenoh reports no more than "Unable to connect".
+    # For most failures Zenoh reports only "Unable to connect".
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 
 
 def draw_retry() -> dict[str, float]:
-    """Return random pauses between attempts to reconnect, so that a fleet does not come back all at once."""
-    first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - no secret
+    """Return random pauses between attempts to reconnect, so a fleet does not reconnect all at once."""
+    first, longest = random.uniform(100, 300), random.uniform(1000, 3000)  # noqa: S311 - not a secret
     return {"period_init_ms": round(first), "period_max_ms": round(longest), "period_increase_factor": 1.5}
 
 
 def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, where: str) -> zenoh.Config:
-    """Put settings into a Zenoh configuration and return it; raise ConfigError for a value that Zenoh rejects."""
+    """Add settings to a Zenoh configuration and return it; raise ConfigError for a value that Zenoh rejects."""
     for key, value in settings.items():
         try:
             config.insert_json5(key, json.dumps(value))
@@ -136,13 +136,13 @@ def insert_settings(config: zenoh.Config, settings: Mapping[str, object], *, whe
 
 
 def entity_name(entity: zenoh.EntityGlobalId) -> str:
-    """Return the id of a publisher or reader as text: the id of its session, and its own in that."""
+    """Return the id of a publisher or reader as text: the id of its session, and its id within the session."""
     return f"{entity.zid}:{entity.eid}"
 
 
 @contextmanager
 def while_open() -> Iterator[None]:
-    """Translate Zenoh's errors: ClosedError when the session was closed, else NedbusError with Zenoh's reason."""
+    """Translate Zenoh's errors: to ClosedError if the session was closed, else to NedbusError with Zenoh's reason."""
     try:
         yield
     except zenoh.ZError as exc:
@@ -150,15 +150,15 @@ def while_open() -> Iterator[None]:
 
 
 def translate_error(error: zenoh.ZError) -> NedbusError:
-    """Return the error that `while_open` raises for this one.
+    """Return the error that `while_open` raises for an error of Zenoh's.
 
-    The session itself is not asked: `is_closed` waits for a lock of Zenoh's without giving up the interpreter's.
+    Decides by the text: `Session.is_closed` would wait for a lock of Zenoh's without releasing the GIL.
     """
     return ClosedError() if _CLOSED.search(str(error)) else NedbusError(f"Zenoh reports: {error_reason(error)}")
 
 
 def error_reason(error: zenoh.ZError) -> str:
-    """Return the reason that the operating system gave, or else the whole text without source paths."""
+    """Return the reason from the operating system, else the whole text without source paths."""
     text = re.sub(r" at /\S+", "", str(error)).strip()
     found = re.search(r": ([A-Z][a-z][^:\[\]]*) \(os error", text)
     return found[1].lower() if found else text

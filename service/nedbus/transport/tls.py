@@ -1,4 +1,4 @@
-"""TLS of a client: the files that it needs for `tls/` endpoints, and the mistakes in them."""
+"""TLS files of a client for `tls/` endpoints, and the detection of mistakes in them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
 _VERIFY_REASONS: Final = {  # by OpenSSL's codes
-    9: "or its authority is not valid yet: is the clock of this host right?",
+    9: "or its authority is not valid yet: check the clock of this host",
     10: "or its authority has expired",
     **dict.fromkeys((7, 18, 19, 20, 21), "is not signed by the authority in tls_ca"),
 }
@@ -25,9 +25,9 @@ class Tls:
     """PEM files for `tls/` endpoints.
 
     `ca`: certificate of the authority that signed the router's certificate.
-    `certificate`, `key`: this client's own, where a router asks for them (mutual TLS); both or none.
+    `certificate`, `key`: this client's own, for routers that require them (mutual TLS); both or neither.
 
-    Raises ConfigError for one of the pair without the other.
+    Raises ConfigError for a certificate without its key, or a key without its certificate.
     """
 
     ca: str | Path
@@ -36,12 +36,12 @@ class Tls:
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.key is None):
-            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: give both or none")
+            raise ConfigError("tls", "a certificate needs its key, and a key its certificate: give both or neither")
 
     def zenoh_settings(self) -> dict[str, object]:
         """Return Zenoh's `transport/link/tls` section.
 
-        Raises ConfigError for a file that cannot be read or is none of its kind, and for a key that does not fit.
+        Raises ConfigError for a file that cannot be read or is of another kind, and for a key that does not match.
         """
         check_pem(self.ca, "CERTIFICATE")
         settings: dict[str, object] = {"root_ca_certificate": str(self.ca)}
@@ -54,10 +54,9 @@ class Tls:
         return settings
 
     def explain(self) -> str | None:
-        """Return the reason if a router may refuse these files: expired, or not of one authority; else None.
+        """Return the reason if a router would refuse these files, such as an expired certificate; else None.
 
-        It needs no network, and no package but Python's: the certificate is shown to a server in this process that
-        trusts the authority.
+        Needs no network and no other package: performs a handshake in memory, with a server that trusts the authority.
         """
         try:
             authority = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -67,20 +66,20 @@ class Tls:
         if self.certificate is not None and self.key is not None:
             return _verify(authority, self.certificate, self.key)
         if not authority.get_ca_certs():
-            return f"{self.ca} is not the certificate of an authority: it may sign nothing"
+            return f"{self.ca} is not the certificate of an authority: it cannot sign others"
         until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
         return f"{self.ca} has expired" if until < time.time() else None
 
 
 def check_pem(path: str | Path, kind: str) -> None:
-    """Raise ConfigError unless a file can be read and holds a certificate, or a private key, as PEM."""
+    """Raise ConfigError unless a file holds PEM of this kind, such as CERTIFICATE or PRIVATE KEY."""
     if not os.access(path, os.R_OK) or not Path(path).is_file():
-        raise ConfigError("tls", f"{path} cannot be read: does it exist, and may this user read it?")
+        raise ConfigError("tls", f"{path} cannot be read: check that it exists and that this user may read it")
     text = Path(path).read_text(errors="replace")
     labels = _LABEL.findall(text)
     if not any(label.endswith(kind) for label in labels):
         found = f"a {labels[0].lower()}" if labels else "no PEM" if text else "nothing"
-        hint = "are two files swapped?" if labels else "'nedbus pki' makes such files"
+        hint = "check that two files are not swapped" if labels else "'nedbus pki' makes such files"
         raise ConfigError("tls", f"{path} holds {found}, where a {kind.lower()} is needed: {hint}")
 
 
@@ -88,17 +87,17 @@ def _load_pair(context: ssl.SSLContext, certificate: str | Path, key: str | Path
     try:
         context.load_cert_chain(certificate, key, password=lambda: "")
     except ssl.SSLError as exc:
-        reason = f"{certificate} or {key} is damaged, or the key has a password: make them anew"
+        reason = f"{certificate} or {key} is damaged, or the key has a password: make new ones"
         if exc.reason == "KEY_VALUES_MISMATCH":
             reason = f"{key} is not the key of {certificate}: give the two that were made together"
         raise ConfigError("tls", reason) from exc
 
 
 def _verify(authority: ssl.SSLContext, certificate: str | Path, key: str | Path) -> str | None:
-    """Return the reason if a server that trusts this authority refuses this certificate, else None."""
+    """Return the reason if a server with this authority refuses the certificate, else None."""
     own = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     own.check_hostname = False
-    own.verify_mode = ssl.CERT_NONE  # of the server, which only exists here
+    own.verify_mode = ssl.CERT_NONE  # of the server, which is in this process
     authority.verify_mode = ssl.CERT_REQUIRED
     for context in (authority, own):
         _load_pair(context, certificate, key)

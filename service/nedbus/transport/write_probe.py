@@ -1,7 +1,7 @@
-"""Probe for the permission to publish vehicles: Zenoh drops forbidden messages without an error at the sender.
+"""Probe for permission to publish vehicles, as Zenoh drops forbidden messages without an error at the sender.
 
-One session subscribes to keys under the vehicles that are no topic, another one publishes there.
-The publisher sees a match if the router announced that subscriber. With a match and no message it may not write.
+One session subscribes to keys of the vehicles that are not topics, and another one publishes on them.
+The publisher sees a match once the router has announced the subscriber; a match without a message means denied.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from .session import Session, while_open
 Verdict = Literal["allowed", "denied", "unknown"]
 
 _POLL: Final = 0.02  # s
-_RETRY: Final = 0.2  # s until it is published again: the declarations of a key may still be under way
-_SPARE: Final = 16  # room of the channel beyond one probe of each vehicle
+_RETRY: Final = 0.2  # s until a probe is sent again, as declarations may still be on their way
+_SPARE: Final = 16  # room in the channel beyond one probe per vehicle
 
 
 def probe_writes(
     reader: Session, writer: Session, vehicles: Collection[str], *, prefix: str, timeout: float = 1.0
 ) -> dict[str, Verdict]:
-    """Return the verdict for each vehicle that `writer` may publish or not; unknown if `reader` may not subscribe.
+    """Return for each vehicle whether `writer` may publish it; "unknown" if `reader` may not subscribe.
 
-    `timeout`: seconds until the router has announced the subscriber, and then until an allowed message arrives.
+    `timeout`: seconds for the router to announce the subscriber, and again for an allowed message to arrive.
     """
-    probe = f"@doctor/{secrets.token_hex(8)}"  # `**` of a reader does not match its chunk with @
+    probe = f"@doctor/{secrets.token_hex(8)}"  # chunks with @ are not matched by a reader's `**`
     keys = {f"{prefix}/{vehicle}/{probe}": vehicle for vehicle in vehicles}
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(len(keys) + _SPARE)
     missing = dict(keys)
@@ -43,13 +43,13 @@ def probe_writes(
 
     with while_open():
         subscriber = reader.declare_subscriber(f"{prefix}/{ANY}/{probe}", channel)
-        # It ends when nothing refers to it: `undeclare` keeps the interpreter's lock while it waits.
+        # Dropped rather than undeclared: `undeclare` waits without releasing the GIL.
         publisher = writer.declare_publisher(next(iter(keys)))
         # Zenoh's stubs call the status a bool; it is an object, always true.
         matched = _wait(lambda: cast("zenoh.MatchingStatus", publisher.matching_status).matching, timeout)
         for _ in range(round(timeout / _RETRY)):
             for key in missing:
-                # Not behind the data in a queue that is full, where it would be dropped.
+                # Ahead of the data, whose queue may be full: the probe would be dropped there.
                 writer.put(
                     key,
                     b"probe",

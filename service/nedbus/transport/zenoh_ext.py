@@ -1,7 +1,7 @@
-"""Formats of zenoh-ext: heartbeats of its advanced publishers, and queries for the samples in their caches.
+"""Formats of zenoh-ext: heartbeats of advanced publishers, and queries for the samples in their caches.
 
-Read in zenoh-ext 1.10.2. They are no stable interface of Zenoh's: with them advanced subscribers of any language
-recover from our publishers, and ours from any advanced publisher.
+Source: the code of zenoh-ext 1.10.2; Zenoh does not document them as stable. They let advanced subscribers of any
+language recover samples from nedbus's publishers, and nedbus's from any advanced publisher.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from .queries import MAX_ANSWERS, Answers, ask
 from .session import RawSample, Session, entity_name, while_open
 
 Heartbeats = dict[tuple[str, str], int]
-"""The number of the newest message, by the key of a stream and the name of its publisher."""
+"""The newest sequence number, by the key of a stream and the name of its publisher."""
 
-_MAX_HEARTBEATS: Final = 16_384  # that wait in the channel
+_MAX_HEARTBEATS: Final = 16_384  # in the channel
 _KEY: Final = re.compile(r"([^*$]+)/@adv/pub/([0-9a-f]{1,32})/(\d{1,10})/_")
-_MAX_KEY: Final = 1024  # characters of the key of a heartbeat, which is cached
+_MAX_KEY: Final = 1024  # characters of a heartbeat's key, as keys are cached
 _PAYLOAD_BYTES: Final = 4
 _SPARE: Final = 64  # room for unexpected answers, of other publishers
 
 
 def heartbeat_key(key: str, publisher: str) -> str:
-    """Return the key of a publisher's heartbeats and of its cache; `publisher` is its name from `entity_name`."""
+    """Return the key of a publisher's heartbeats and cache; `publisher` is its name from `entity_name`."""
     return f"{key}/@adv/pub/{publisher.replace(':', '/')}/_"
 
 
 def heartbeat_payload(published: int) -> bytes:
-    """Return the heartbeat of a publisher that has published this number of messages, 1 or more."""
+    """Return the heartbeat of a publisher that has published `published` messages, at least 1."""
     return ((published - 1) % 2**32).to_bytes(_PAYLOAD_BYTES, "little")
 
 
 def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Heartbeats], Callable[[], object]]:
-    """Subscribe to the heartbeats of advanced publishers; return functions that drain them, and that end it."""
+    """Subscribe to the heartbeats of advanced publishers; return functions to drain them and to unsubscribe."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(_MAX_HEARTBEATS)
     with while_open():
         subscriber = session.declare_subscriber(f"{key_expr}/@adv/pub/**", channel)
 
     def drain() -> Heartbeats:
         newest: Heartbeats = {}
-        with suppress(zenoh.ZError):  # ended meanwhile
+        with suppress(zenoh.ZError):  # undeclared meanwhile
             for heartbeat in islice(iter(subscriber.handler.try_recv, None), _MAX_HEARTBEATS):
                 key, payload = str(heartbeat.key_expr), heartbeat.payload.to_bytes()
                 publisher = _parse_key(key) if len(key) <= _MAX_KEY else None
@@ -59,13 +59,13 @@ def follow_heartbeats(session: Session, key_expr: str) -> tuple[Callable[[], Hea
 
 @lru_cache(_MAX_HEARTBEATS)
 def _parse_key(heartbeat: str) -> tuple[str, str] | None:
-    """Return the stream and the name of the publisher in the key of a heartbeat."""
+    """Return the stream and publisher in the key of a heartbeat, None for any other key."""
     found = _KEY.fullmatch(heartbeat)
     return None if found is None else (found[1], f"{found[2]}:{found[3]}")
 
 
 class RetransmitRequest:
-    """A request for the samples `numbers` of one publisher, and its answers, for the thread that requested them."""
+    """A request for samples of one publisher by sequence number, and its answers; used by one thread."""
 
     def __init__(self, answers: Answers, key: str, publisher: str, numbers: range) -> None:
         self._answers = answers
@@ -79,7 +79,7 @@ class RetransmitRequest:
         return self._answers.ended
 
     def take(self) -> dict[int, RawSample]:
-        """Return the samples that came since the last call, by sequence number."""
+        """Return the samples received since the last call, by sequence number."""
         samples: dict[int, RawSample] = {}
         for sample in filter(None, (reply.ok for reply in self._answers.take())):
             info = sample.source_info
@@ -91,10 +91,10 @@ class RetransmitRequest:
 
 
 def request_samples(session: Session, key: str, publisher: str, numbers: range, *, timeout: float) -> RetransmitRequest:
-    """Request samples from the cache of an advanced publisher, by sequence numbers, and return at once.
+    """Request samples from the cache of an advanced publisher by sequence number, and return at once.
 
-    `publisher` is its name as `entity_name` returns it. The key is that of its cache, without wildcards: a router finds
-    it at once, while a key expression is compared with the queryables of all publishers.
+    `publisher`: its name from `entity_name`. The key has no wildcards, which lets a router look it up instead of
+    matching it against the queryables of all publishers.
     """
     selector = f"{heartbeat_key(key, publisher)}?_sn={numbers.start}..{numbers.stop - 1}"
     room = min(len(numbers), MAX_ANSWERS) + _SPARE

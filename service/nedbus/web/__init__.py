@@ -1,4 +1,4 @@
-"""The page in the browser: a map, a table and plots of all vehicles, live or of a recording; needs the extra `web`."""
+"""Web page with a map, a table and plots of all vehicles, live or from a recording; needs the extra `web`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The background of the map: GeoJSON, or a picture with a world file beside it, both in WGS 84."""
+"""Background of the map: GeoJSON, or a picture with a world file, in WGS 84."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from nedbus_msgs import MapProjection
 from .style import Style
 
 _PICTURES: Final = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}  # world files
-_MAX_SIDE: Final = 2000  # pixels of a picture
+_MAX_SIDE: Final = 2000  # pixels; larger pictures are scaled down
 _PARTS: Final = {"FeatureCollection": "features", "GeometryCollection": "geometries", "Feature": "geometry"}
 
 Ring = list[tuple[float, float]]
 
 
 class Background:
-    """A file that is read once, and drawn for each viewer when the common origin is known.
+    """A background file, read once and drawn for each viewer when the common origin is known.
 
-    Raises ConfigError for a file that is neither, and says what to do.
+    Raises ConfigError if the file is neither GeoJSON nor a picture with a world file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,13 +43,13 @@ class Background:
             raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
         except (ValueError, TypeError, LookupError, RecursionError) as exc:
             reason = f"{exc} is missing" if isinstance(exc, KeyError) else str(exc)
-            wanted = "GeoJSON, or a picture with a world file, in WGS 84, is expected"
-            raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {wanted}") from exc
+            expected = "expected GeoJSON, or a picture with a world file, in WGS 84"
+            raise ConfigError("--map", f"{path} cannot be drawn ({reason}): {expected}") from exc
         if not self.rings and self.pixels is None:
-            raise ConfigError("--map", f"{path}: it has no lines, polygons or points")
+            raise ConfigError("--map", f"{path} has no lines, polygons or points")
 
     def draw(self, plot: figure, style: Style, projection: MapProjection) -> None:
-        """Draw it once on a map whose metres are from this origin."""
+        """Draw the background on a map in metres from the origin of `projection`."""
 
         def place(longitude: float, latitude: float) -> tuple[float, float]:
             north, east = projection.project(latitude, longitude)
@@ -68,15 +68,13 @@ class Background:
     def _read_picture(self, path: Path) -> None:
         from PIL import Image
 
-        worlds = [path.with_suffix(suffix) for suffix in (_PICTURES[path.suffix.lower()], ".wld")]  # GDAL's is .wld
+        worlds = [path.with_suffix(suffix) for suffix in (_PICTURES[path.suffix.lower()], ".wld")]  # GDAL writes .wld
         world = next((each for each in worlds if each.exists()), None)
         if world is None:
-            raise ValueError(
-                f"no world file {worlds[0].name} beside it, as gdal_translate -co WORLDFILE=YES writes one"
-            )
+            raise ValueError(f"world file {worlds[0].name} not found: create it with gdal_translate -co WORLDFILE=YES")
         width, skew, other_skew, height, west, north = map(float, world.read_text().split()[:6])
         if skew or other_skew or not (width > 0 > height) or not (abs(west) <= 180 and abs(north) <= 90):
-            raise ValueError("the world file is not north up in degrees: gdalwarp -t_srs EPSG:4326 makes it so")
+            raise ValueError("world file is not north up in degrees: convert with gdalwarp -t_srs EPSG:4326")
         try:
             with Image.open(path) as picture:
                 columns, rows = picture.size
@@ -85,12 +83,12 @@ class Background:
         except Image.DecompressionBombError as exc:
             raise ValueError(str(exc)) from exc
         self.pixels = np.ascontiguousarray(pixels).view(np.uint32).reshape(pixels.shape[:2])
-        left, top = west - width / 2, north - height / 2  # the file names the centre of the first pixel
+        left, top = west - width / 2, north - height / 2  # the file has the centre of the first pixel
         self._corners = [(left, top + rows * height), (left + columns * width, top)]
 
 
 def _rings(shape: Any) -> Iterator[Ring]:
-    """Yield the lines of a GeoJSON object, or of its coordinates, however deeply nested; a point is a line of one."""
+    """Yield the lines of a GeoJSON object or of nested coordinates; a point is a line of length 1."""
     if not shape:
         return
     if isinstance(shape, dict):
@@ -107,5 +105,5 @@ def _rings(shape: Any) -> Iterator[Ring]:
 def _place(point: Sequence[Any]) -> tuple[float, float]:
     longitude, latitude = float(point[0]), float(point[1])
     if not (math.isfinite(longitude) and abs(latitude) <= 90 and abs(longitude) <= 180):
-        raise ValueError(f"{point} is no longitude and latitude")
+        raise ValueError(f"{point} is not a longitude and latitude in degrees")
     return longitude, latitude

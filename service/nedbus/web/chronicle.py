@@ -1,23 +1,23 @@
-"""The events of a page in the order of their time, and their spans, states, stories and times in words."""
+"""Events of a page in time order, with the spans, states and stories derived from them, and times as text."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from nedbus.events import Account, Event, Span, State, Story, Times, about, spans_of, state_at, tell, to_clock
+from nedbus.events import Account, Event, Span, State, Story, Times, spans_of, state_at, stories_of, story_of, to_clock
 
 PAST: Final = 600.0
-"""Seconds of what is over that a live page shows."""
+"""Seconds of history on a live page."""
 
-_MAX_EVENTS: Final = 500  # of a vehicle, the last ones, that stories are told of
-_TENTH: Final = 0.1  # s: an address names moments no more exactly
+_MAX_EVENTS: Final = 500  # latest events of a vehicle used for its stories
+_TENTH: Final = 0.1  # s; time resolution of the page's URL
 
 
 class Chronicle:
-    """The account of a page, and the events `before` it; evaluated anew only when more has happened.
+    """The events of an account and those `before` it; re-evaluated only after new events.
 
-    `start`: the beginning of a recording, s since the epoch, where it is known.
+    `start`: start of a recording in seconds since the Unix epoch, None if unknown.
     """
 
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:
@@ -25,7 +25,7 @@ class Chronicle:
         self.times = times or Times(is_live=True)
         self.start: float | None = None
         self._before = before
-        self._told = -1
+        self._taken = -1
         self._events: list[Event] = []
         self._spans: dict[str, list[Span]] = {}
         self._by_vehicle: dict[str, list[Event]] = {}
@@ -39,7 +39,7 @@ class Chronicle:
 
     @property
     def spans(self) -> Mapping[str, Sequence[Span]]:
-        """The spans of all conditions, by vehicle."""
+        """Spans of all conditions, by vehicle."""
         self._read()
         return self._spans
 
@@ -49,22 +49,24 @@ class Chronicle:
 
     @property
     def has_utc(self) -> bool:
-        """True where its times are known in UTC."""
+        """True if times are available in UTC."""
         return self.times.is_live or self.start is not None
 
     def moment(self, seconds: float) -> str:
-        """Return a time of the account in words: in UTC, else minutes and seconds since the start."""
+        """Format a time of the account in UTC, or as minutes and seconds since the start if UTC is unknown."""
         return to_clock(seconds + (self.start or 0.0))[:-2] if self.has_utc else _elapsed(seconds)
 
     def clock(self, seconds: float) -> str:
-        """Return a time of the account as the header has it: in UTC, and of a recording since its start."""
-        utc = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
-        return ", ".join(utc if self.times.is_live else [*utc, _elapsed(seconds)])
+        """Format a time of the account for the header: in UTC and, for a recording, since its start."""
+        parts = [f"{self.moment(seconds)} UTC"] if self.has_utc else []
+        if not self.times.is_live:
+            parts.append(_elapsed(seconds))
+        return ", ".join(parts)
 
     def story(self, vehicle: str, now: float, at: Event | float | None) -> Story | None:
-        """Return the story of a condition that holds now or ended lately, or of a chosen event or time.
+        """Return the story of the selected event or time, or of a current or recent condition.
 
-        `at`: the event or time that is chosen, None for now.
+        `at`: the selected event or time, None for now.
         """
         self._read()
         stories = self._tell(vehicle, at)
@@ -78,23 +80,23 @@ class Chronicle:
         return recent[-1] if recent else None
 
     def _tell(self, vehicle: str, at: Event | float | None) -> list[Story]:
-        """Return the stories of an event, a time, or all times; told once for all viewers until more happens."""
+        """Return the stories of an event, a time, or all times; cached for all viewers until the next event."""
         if (vehicle, at) not in self._stories:
             known, events = self.account.vehicles.get(vehicle), self._by_vehicle.get(vehicle, [])
             topics, initial = ([], []) if known is None else (list(known.topics), list(known.initial))
             if isinstance(at, Event):
-                story = about(at, events, topics=topics)
+                story = story_of(at, events, topics=topics)
                 self._stories[vehicle, at] = [] if story is None else [story]
             else:
                 moment = None if at is None else at + _TENTH
-                self._stories[vehicle, at] = tell(events[-_MAX_EVENTS:], initial, topics=topics, at=moment)
+                self._stories[vehicle, at] = stories_of(events[-_MAX_EVENTS:], initial, topics=topics, at=moment)
         return self._stories[vehicle, at]
 
     def _read(self) -> None:
-        if self._told == self.account.told:
+        if self._taken == self.account.reported:
             return
-        told, self._told = self.account.take(0)
-        self._events = sorted([*self._before, *told], key=lambda event: event.time)
+        events, self._taken = self.account.events_since(0)
+        self._events = sorted([*self._before, *events], key=lambda event: event.time)
         self._stories.clear()
         vehicles = dict(self.account.vehicles)
         self._by_vehicle = {name: [] for name in vehicles}

@@ -1,4 +1,4 @@
-"""Column data of a viewer, updated by new points and changed columns alone."""
+"""Bokeh column data of a viewer, updated incrementally."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from .fleet import TRUTH
 from .stream import COLUMNS, History
 from .style import PALETTE
 
-_MAX_POINTS: Final = 6_000  # of all tracks together: what a browser draws ten times a second
+_MAX_POINTS: Final = 6_000  # points of all tracks together; a browser can draw these ten times a second
 _MIN_TRACK_POINTS: Final = 60
 _EAST, _NORTH, _DOUBTFUL = (COLUMNS.index(name) for name in ("east", "north", "doubtful"))
 _DOUBT, _TRUE = "doubtful", "truth"
 NAMES: Final = (*(f"valid{number}" for number in range(PALETTE)), _DOUBT, _TRUE)
-"""The kinds of lines: valid ones in the colours of vehicles, doubtful ones, and ground truth."""
+"""Line types: valid tracks in each vehicle colour, doubtful tracks, and ground truth."""
 
-Track = tuple[History, int]  # with the number of its colour
+Track = tuple[History, int]  # points, and number of the colour
 
 
 def table(*names: str) -> ColumnDataSource:
-    """Return a source with these columns, without rows."""
+    """Return an empty source with these columns."""
     return ColumnDataSource({name: [] for name in names})
 
 
 def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Send the columns that are different, or all when the number of rows is."""
+    """Replace the rows; send only changed columns, or all columns if the number of rows changes."""
     old = source.data
     new = {name: [row[name] for row in rows] for name in old}
     if any(len(column) != len(rows) for column in old.values()):
@@ -44,10 +44,10 @@ def replace(source: ColumnDataSource, rows: Sequence[Mapping[str, Any]]) -> None
 
 
 class Tracks:
-    """The tracks of all streams: a column of east, and one of north for each kind of line, NaN where it does not go.
+    """Tracks of all streams: a column for east, and one for north per line type, NaN where that line is interrupted.
 
-    Each track has a ring of slots, with a gap that moves on before its newest point, and behind it a copy of its first
-    slot and a gap for good.
+    Each track is a ring of slots with a moving gap after the newest point, followed by a copy of its first slot and a
+    permanent gap that separates it from the next track.
     """
 
     def __init__(self) -> None:
@@ -57,8 +57,8 @@ class Tracks:
         self._step = self._slots = 1
 
     def update(self, tracks: Mapping[Address, Track]) -> None:
-        """Send the new points of these."""
-        if tracks != self._tracks:  # as after a jump of the time, which makes other histories
+        """Send the new points of these tracks."""
+        if tracks != self._tracks:  # for example after a seek, which creates new histories
             self._lay_out(tracks)
         cells: dict[str, dict[int, float]] = {name: {} for name in ("east", *NAMES)}
         for index, (address, track) in enumerate(tracks.items()):
@@ -67,21 +67,21 @@ class Tracks:
             self.source.patch({name: list(changed.items()) for name, changed in cells.items() if changed})
 
     def _lay_out(self, tracks: Mapping[Address, Track]) -> None:
-        """Choose the number of slots, and of points in each."""
+        """Choose the number of slots and the number of points per slot."""
         self._tracks = dict(tracks)
         self._seen = [0] * len(tracks)
         longest = max((history.size for history, _ in tracks.values()), default=1)
         points = max(_MIN_TRACK_POINTS, min(longest, _MAX_POINTS // max(1, len(tracks))))
         written = max((min(history.written, history.size) for history, _ in tracks.values()), default=1)
         self._step = -(-min(longest, max(2 * written, _MAX_POINTS)) // points)
-        self._slots = longest // self._step + 2  # with the one that is not complete yet, and the gap
+        self._slots = longest // self._step + 2  # plus the incomplete slot and the gap
         self.source.data = {name: np.full((self._slots + 2) * len(tracks), math.nan) for name in ("east", *NAMES)}
 
     def _add_points(self, cells: dict[str, dict[int, float]], index: int, address: Address, track: Track) -> None:
-        """Add the cells that change, by column and slot."""
+        """Add the changed cells, by column and slot."""
         history, number = track
         step, ring = self._step, self._slots
-        seen, end = self._seen[index], history.written  # once: another thread adds points
+        seen, end = self._seen[index], history.written  # read once: another thread adds points
         if end == seen:
             return
         self._seen[index] = end
@@ -89,7 +89,7 @@ class Tracks:
 
         def put(slot: int, point: Mapping[str, float]) -> None:
             for name in ("east", *names):
-                for place in (0, ring) if slot == 0 else (slot,):  # so that the line goes on from the last slot
+                for place in (0, ring) if slot == 0 else (slot,):  # the copy continues the line after the last slot
                     cells[name][index * (ring + 2) + place] = point.get(name, math.nan)
 
         points = history.points(seen // step * step, end)

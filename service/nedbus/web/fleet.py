@@ -1,4 +1,4 @@
-"""All streams of a page, and the one picture of their states that everything on the page shows; no I/O."""
+"""Streams of a page, and the snapshot of their states that all parts of the page show; no I/O."""
 
 from __future__ import annotations
 
@@ -13,45 +13,45 @@ from nedbus.client import Health, RejectionReport, Sample, StreamState, describe
 from nedbus.events import FIXES, MODES, State
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
-from .stream import LONG, Origin, Stream, is_position
+from .stream import LONG, Origin, PageStream, is_position
 
 GRADES: Final = ("bad", "watch", "ok")
 
 TRUTH: Final = "vehicle_local_position_groundtruth"
 MAX_STREAMS: Final = 1000
-"""Streams that a page shows, positions before others; more are counted."""
+"""Streams shown on a page, positions before others; further streams are only counted."""
 
-_FORGOTTEN: Final = 600.0  # s after which what has gone is no longer the worst
-_SILENT: Final = 60.0  # s after which a stream makes room for another
-_MAX_REPORTS: Final = 100  # rejected messages that are kept
+_FORGOTTEN: Final = 600.0  # s after which a vehicle that has gone is listed last instead of first
+_SILENT: Final = 60.0  # s without a message after which a stream makes room for another
+_MAX_REPORTS: Final = 100  # rejection reports kept
 _ARMED: Final = 2
 _DIGITS: Final = re.compile(r"(\d+)")
-_DETAIL: Final = re.compile(r":| \(|, | within ")  # behind it a state goes into details
-_MAX_BRIEF: Final = 32  # characters of a state in a row
+_DETAIL: Final = re.compile(r":| \(|, | within ")  # separates a state from its details
+_MAX_BRIEF: Final = 32  # characters of the state in a row
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One stream at one moment: its health and its state."""
+    """Snapshot of one stream: its health and state."""
 
     address: Address
-    stream: Stream
+    stream: PageStream
     health: Health
     state: StreamState
     rejected: int
 
     @property
     def words(self) -> str:
-        """Its state and its flags, in words."""
+        """Description of the state and flags."""
         return describe_stream(self.health, self.state)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One vehicle at one moment: its state and its streams.
+    """Snapshot of one vehicle: its state and its streams.
 
-    `main`: the stream that its marker shows; `facts`: mode, armed, battery and gps of its other messages, "" where
-    there are none; `number`: for its colour.
+    `main`: the stream shown as its marker; `facts`: mode, armed, battery and gps from its other messages, "" if
+    unknown; `number`: determines its colour.
     """
 
     vehicle: str
@@ -63,21 +63,21 @@ class Row:
 
     @property
     def grade(self) -> str:
-        """The severity of its state, "ok" where that is none."""
+        """The severity of the state, with "ok" for "info"."""
         return "ok" if self.state.severity == "info" else self.state.severity
 
     @property
     def brief(self) -> str:
-        """Its state in a few words."""
+        """The state without details, up to 32 characters."""
         text = _DETAIL.split(self.state.text, maxsplit=1)[0]
         return text if len(text) <= _MAX_BRIEF else f"{text[: _MAX_BRIEF - 1]}…"
 
     @property
     def where(self) -> str:
-        """Its last valid position, in words."""
+        """Description of the last valid position."""
         place, projection = self.main.stream.valid, self.main.stream.origin.projection
         if place is None:
-            return "nowhere: it never had a valid position"
+            return "none yet"
         text = f"{place.north:z.1f} m north, {place.east:z.1f} m east"
         text += f", altitude {place.altitude:z.1f} m" if math.isfinite(place.altitude) else ""
         if not place.common or projection is None:
@@ -87,7 +87,7 @@ class Row:
 
     @property
     def is_here(self) -> bool:
-        """True while its position is valid and arrives."""
+        """True while valid positions arrive."""
         last = self.main.stream.last
         fresh = self.main.state.name not in ("disconnected", "gone", "stale")
         return fresh and last is not None and is_position(self.main.address) and bool(last.message.xy_valid)
@@ -95,9 +95,9 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """All vehicles at one moment, the worst first.
+    """Snapshot of all vehicles, the most severe first.
 
-    `link`: "" or why there is none; `own`: "" or what this page did not read in time.
+    `link`: the fault of the link, "" if it is up; `own`: the backlog of this page, "" while it keeps up.
     """
 
     time: float
@@ -110,39 +110,39 @@ class Picture:
 
     @property
     def rate(self) -> float:
-        """Messages a second, of all streams."""
+        """Messages per second of all streams."""
         return sum(line.health.rate or 0.0 for row in self.rows for line in row.lines)
 
     @property
     def lost(self) -> int:
-        """Messages that were lost, of all streams."""
+        """Lost messages of all streams."""
         return sum(line.health.lost for row in self.rows for line in row.lines)
 
     def row(self, vehicle: str | None) -> Row | None:
-        """Return the row of a vehicle."""
+        """Return the row of a vehicle, None if there is none."""
         return next((row for row in self.rows if row.vehicle == vehicle), None)
 
 
 class Fleet:
-    """All streams; samples may come from another thread than the one that asks for pictures.
+    """All streams; one thread may add samples while another one takes pictures.
 
-    `origin`: the common one, by default that of the first message that has one; `long`: size and step of the longer
-    histories.
+    `origin`: the common origin, by default the first global origin in any message.
+    `long`: the number of points in the longer histories, and the seconds between two points.
     """
 
     def __init__(self, origin: Origin | None = None, long: tuple[int, float] = LONG) -> None:
         self.origin = origin or Origin()
-        self.streams: dict[Address, Stream] = {}
+        self.streams: dict[Address, PageStream] = {}
         self.picture = Picture(0.0)
         self._long = long
         self._numbers: dict[str, int] = {}
-        self._truths: dict[str, Stream] = {}
+        self._truths: dict[str, PageStream] = {}
         self._left_out: set[Address] = set()
         self._rejected: Counter[Address] = Counter()
         self._reports: deque[RejectionReport] = deque(maxlen=_MAX_REPORTS)
 
     def add(self, sample: Sample[Any], time: float) -> None:
-        """Add a sample at this time [s since the epoch]."""
+        """Add a sample received at `time`, in seconds since the Unix epoch or since the start of a recording."""
         address = sample.address
         stream = self.streams.get(address)
         if stream is None:
@@ -150,7 +150,7 @@ class Fleet:
                 if len(self._left_out) < MAX_STREAMS:
                     self._left_out.add(address)
                 return
-            stream = self.streams[address] = Stream(self.origin, self._long)
+            stream = self.streams[address] = PageStream(self.origin, self._long)
             self._left_out.discard(address)
             if address.topic == TRUTH:
                 self._truths[address.vehicle] = stream
@@ -164,20 +164,20 @@ class Fleet:
                 self._rejected[report.address] += 1
 
     def clear(self) -> None:
-        """Forget all but the common origin: the time has jumped."""
+        """Remove all streams and reports, but keep the common origin; called before a seek."""
         for part in (self.streams, self._truths, self._left_out, self._rejected, self._reports):
             part.clear()
 
-    def look(
+    def update(
         self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
         alive: Collection[Address] | None = None, link: str = "", own: str = "",
     ) -> Picture:  # fmt: skip
-        """Make and keep the picture at this time [s].
+        """Take a picture at `time` [s], keep it in `picture` and return it.
 
-        `states`: of vehicles, by name. `alive`: the addresses that are published now, None if that is not known.
+        `states`: states by vehicle; `alive`: the currently published addresses, None if unknown.
         """
         lines: dict[str, list[Line]] = {}
-        for address, stream in sorted([*self.streams.items()]):  # at once: another thread adds streams
+        for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
                 continue
             health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
@@ -193,7 +193,7 @@ class Fleet:
     def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, own: str) -> Row:
         main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
         state = state or State("info", "ok", None, ())
-        if state.severity == "info" and main.state.name == "slow" and not own:  # else it is this page that is slow
+        if state.severity == "info" and main.state.name == "slow" and not own:  # otherwise the page itself is slow
             state = replace(state, severity="watch", text=str(main.state))
         number = self._numbers.setdefault(vehicle, len(self._numbers)) if len(self._numbers) < MAX_STREAMS else 0
         return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number)
@@ -216,7 +216,7 @@ class Fleet:
         return stream.last.message if stream is not None and stream.last is not None else None
 
     def _make_room(self, time: float) -> bool:
-        """Forget a stream of other messages, or one that is silent; return whether there was one."""
+        """Remove the oldest stream other than positions, else the oldest silent one; return whether one was removed."""
         address = min(self.streams, key=lambda each: (is_position(each), self.streams[each].time))
         if is_position(address) and time - self.streams[address].time < _SILENT:
             return False
@@ -227,7 +227,7 @@ class Fleet:
 
 
 def _rank(row: Row, time: float) -> int:
-    """Return the place of a vehicle among others, 0 for bad ones; those that went long ago come last."""
+    """Return the sort rank of a vehicle: 0 for bad ones, the highest for those gone long ago."""
     is_forgotten = any(each.kind == "gone" and time - each.since > _FORGOTTEN for each in row.state.conditions[:1])
     return len(GRADES) if is_forgotten else GRADES.index(row.grade)
 

@@ -1,4 +1,4 @@
-"""The map: where every vehicle is, in metres, north up."""
+"""Map of all vehicles in metres, north up."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ from .style import MARKERS, Style
 
 FOCUSES: Final = ("all", "follow", "vehicle")
 MIN_SIDE: Final = 20.0
-"""Metres that a map shows at least: less is the noise of a vehicle at rest."""
+"""Minimum side of the map [m]; anything smaller shows the noise of a vehicle at rest."""
 
-_MIN_ZOOM: Final = 0.01  # m that a browser shows after zooming in
-_MARGIN: Final = 0.08  # of what is shown, around it
-_FOLLOWED_SIDE: Final = 60.0  # m around a vehicle that is followed
-_LETTER, _HEIGHT = 6.5, 15.0  # pixels of a label
-_MAX_EVENTS: Final = 60
+_MIN_ZOOM: Final = 0.01  # m; smallest visible range taken from the browser
+_MARGIN: Final = 0.08  # margin on each side, as a fraction of the extent
+_FOLLOWED_SIDE: Final = 60.0  # m; side of the map while following a vehicle
+_LETTER, _HEIGHT = 6.5, 15.0  # pixels; width of a character and height of a label
+_MAX_EVENTS: Final = 60  # latest events marked on the map
 _SIZE: Final = re.compile(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})")
 
 
 class Map:
-    """The map of one viewer; `marks` has a row for each of `shown`, `events` for each of `told`; both can be tapped.
+    """The map of one viewer.
 
-    `focus`: one of FOCUSES; `is_long`: whether trails are longer than a minute; `truth`: whether it is drawn.
+    `marks` has a row per vehicle in `shown`, `events` a row per event in `shown_events`; both can be tapped.
+    `focus`: one of FOCUSES; `is_long`: True for trails longer than a minute; `truth`: True to draw ground truth.
     """
 
     def __init__(self, style: Style, background: Background | None) -> None:
@@ -45,8 +46,8 @@ class Map:
         )
         self.events = table("east", "north", "marker", "colour", "words")
         self.shown: list[str] = []
-        self.told: list[Event] = []
-        self.size = 600.0, 500.0  # pixels, until the browser has said how many
+        self.shown_events: list[Event] = []
+        self.size = 600.0, 500.0  # pixels, until the browser reports its own
         self.focus, self.is_long, self.truth = "all", False, True
         self._style, self._background = style, background
         self._tracks = Tracks()
@@ -55,7 +56,7 @@ class Map:
         self.figure = self._draw()
 
     def update(self, picture: Picture, whole: Fleet, row: Row | None) -> None:
-        """Move the vehicles, and send the new points of their tracks; `row` is chosen, `whole` has the long tracks."""
+        """Move the markers and extend the tracks; `row` is the selected vehicle, `whole` has the long tracks."""
         tracks: dict[Address, Track] = {}
         for each in sorted(picture.rows, key=lambda each: each.number):
             for line in each.lines:
@@ -82,14 +83,14 @@ class Map:
             self._background = None
 
     def mark(self, events: Sequence[Event], row: Row | None, whole: Fleet) -> None:
-        """Show where events of the chosen vehicle happened."""
+        """Mark the positions of the selected vehicle at its events."""
         placed: list[tuple[Event, Place]] = []
         if row is not None:
             stream = whole.streams.get(row.main.address, row.main.stream)
             events = events[-_MAX_EVENTS:]
             places = stream.places_at([event.time for event in events])
             placed = [(event, place) for event, place in zip(events, places, strict=True) if place is not None]
-        self.told = [event for event, _ in placed]
+        self.shown_events = [event for event, _ in placed]
         marks = [
             {"east": at.east, "north": at.north, "marker": MARKERS[event.severity], "words": event.text[:80],
              "colour": self._style.grades[event.severity]}
@@ -98,7 +99,7 @@ class Map:
         replace(self.events, marks)
 
     def resize(self, size: str) -> None:
-        """Take the size of the map from a browser, such as 600x500 [pixels]."""
+        """Set the size of the map as reported by the browser, such as 600x500 [pixels]; ignore other text."""
         if found := _SIZE.fullmatch(size):
             self.size = float(found[1]), float(found[2])
 
@@ -110,21 +111,21 @@ class Map:
         sides = []
         for low, high in zip(np.nanmin(found, axis=0).tolist(), np.nanmax(found, axis=0).tolist(), strict=True):
             grow = max(MIN_SIDE - (high - low), 2 * _MARGIN * (high - low)) / 2
-            step = max(1.0, (high - low) / 20)  # the map does not creep
+            step = max(1.0, (high - low) / 20)  # move the map in steps, not continuously
             sides.append([math.floor((low - grow) / step) * step, math.ceil((high + grow) / step) * step])
         return sides
 
     def _labels(
         self, placed: Sequence[tuple[Row, Place]], row: Row | None, frame: list[list[float]]
     ) -> dict[str, tuple[str, bool]]:
-        """Return the labels that do not overlap, the worst first, and whether each is on the left of its mark."""
+        """Return labels without overlap by vehicle, the most severe first, and whether each is left of its marker."""
         (west, east), (south, north) = frame
         width, height = self.size
-        scale, right = max((east - west) / width, (north - south) / height), east  # m a pixel
+        scale, right = max((east - west) / width, (north - south) / height), east  # m per pixel
         start, end = (getattr(self.figure.x_range, side) for side in ("start", "end"))
         if isinstance(start, float | int) and isinstance(end, float | int) and end - start > _MIN_ZOOM:
             scale, right = (end - start) / width, end
-        taken = [  # by marks that have to be seen
+        taken = [  # keep labels off these markers
             (each.vehicle, at.east / scale - _HEIGHT / 2, at.north / scale, _HEIGHT)
             for each, at in placed
             if each.grade == "bad" or each is row
@@ -133,7 +134,7 @@ class Map:
         for each, place in sorted(placed, key=lambda known: known[0] is not row):
             text = each.vehicle if each.grade == "ok" else f"{each.vehicle} {each.brief}"
             x, y, size = place.east / scale, place.north / scale, len(text) * _LETTER + 14
-            is_left = x + size > right / scale  # it would leave the map
+            is_left = x + size > right / scale  # it would extend beyond the map
             x -= size * is_left
             if each is row or all(
                 abs(y - top) > _HEIGHT or x + size < left or left + wide < x or owner == each.vehicle
@@ -144,7 +145,7 @@ class Map:
         return labels
 
     def _mark(self, row: Row, place: Place, label: str, is_left: bool) -> dict[str, Any]:
-        """Return a marker: filled where the vehicle is now, or open where it was last; its shape is its grade."""
+        """Return a vehicle's marker, shaped by grade: filled at its current position, open at its last valid one."""
         last = row.main.stream.last
         heading = getattr(last.message, "heading", math.nan) if last is not None else math.nan
         colour = self._style.vehicle(row.number)

@@ -1,4 +1,4 @@
-"""A recording on the page: the messages of a file, its events, and a time that runs, is paused, and is set."""
+"""Playback of a recording: its messages and events, and a clock with play, pause and seek."""
 
 from __future__ import annotations
 
@@ -34,20 +34,21 @@ from .stream import is_position
 
 _log = logging.getLogger(__name__)
 
-_MINUTE: Final = 60.0  # s that are shown before the time that is chosen
-_WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two of them
-_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # whose values are shown
+_MINUTE: Final = 60.0  # s of history loaded before the playback position
+_WHOLE: Final = 20_000, 0.5  # points of a whole flight, and s between two points
+_KEPT: Final = ("vehicle_status", "vehicle_gps_position", "sensor_gps", "battery_status")  # topics shown as values
 _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
-    """All positions of a .ulg or .mcap file, as bytes, in the order of their time; read in a thread of its own.
+    """The messages of a .ulg or .mcap file in time order, loaded in a background thread.
 
-    Of most other messages, which outnumber them, only PX4's time is kept. `whole`: the flight at two points a second;
-    `chronicle`: its events, whose clock is seconds since the first message.
-    `entries`: of each message its address, and its payload, timestamp or reason of rejection; `dues`: its time [s].
+    Positions and the topics whose values are shown are kept as payloads; of all others, only PX4's timestamp.
+    `whole`: the flight at two points per second; `chronicle`: the events, in seconds since the first message.
+    `entries`: for each message its address, and its payload, timestamp or reason of rejection.
+    `dues`: for each message its time since the first message [s].
 
-    Raises ConfigError and SourceError for a file that cannot be read.
+    Raises ConfigError and SourceError if the file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,7 +60,7 @@ class Recording:
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
         self._path = path
-        self._indices: dict[Address, list[int]] = {}  # of each stream in `entries`
+        self._indices: dict[Address, list[int]] = {}  # indices in `entries`, by stream
         self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
         for warning in self._run.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
@@ -67,15 +68,15 @@ class Recording:
 
     @property
     def length(self) -> float:
-        """Seconds that have been read so far."""
+        """Duration read so far [s]."""
         return self.dues[-1] if self.dues else 0.0
 
     def has(self, seconds: float) -> bool:
-        """Return whether this time was read already, or will not come."""
+        """Return whether the file has been read up to this time, or completely."""
         return self.is_read or seconds <= self.length
 
     def before(self, index: int) -> list[int]:
-        """Return the last entry of each stream before this one, in order."""
+        """Return the index of each stream's last entry before `index`, in order."""
         found = (known[at - 1] for known in list(self._indices.values()) if (at := bisect_left(known, index)))
         return sorted(found)
 
@@ -106,9 +107,9 @@ class Recording:
 
 
 class Player:
-    """One viewer's time in a recording; its fleet is as it was then.
+    """Playback of a recording for one viewer; `fleet` shows the playback position.
 
-    `on_jump` is called when the time has jumped; `controls`: a button, the speed, and the slider, for the page.
+    `on_jump` is called after each seek; `controls`: the play button, speed menu and slider of the page.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -129,7 +130,7 @@ class Player:
         self._slider.on_change("value_throttled", lambda _, __, value: self.jump(value))
 
     def tick(self) -> None:
-        """Let the time run on."""
+        """Advance the playback position by the elapsed time."""
         now = time.monotonic()
         elapsed, self._ticked = now - self._ticked, now
         if self._play.active:
@@ -141,16 +142,16 @@ class Player:
         self._feed()
 
     def toggle(self, *, pause: bool = False) -> None:
-        """Pause, or play on."""
+        """Toggle between play and pause; with `pause`, pause."""
         self._play.active = not (pause or self._play.active)
 
     def jump(self, seconds: float) -> None:
-        """Set the time, as far as the recording has it, with the minute before it."""
+        """Seek to a time within the part read so far, and load the minute before it."""
         self._is_dragged = False
         self.fleet.clear()
         self._monitor, self.time = Monitor(), min(max(0.0, seconds), self.recording.length)
         self._next = bisect_left(self.recording.dues, self.time - _MINUTE)
-        for index in self.recording.before(self._next):  # the last message of streams that are silent by then
+        for index in self.recording.before(self._next):  # the last message of streams that are silent in this minute
             self._show(index)
         for address, stream in self.fleet.streams.items():
             whole = self.recording.whole.streams.get(address)
@@ -163,14 +164,14 @@ class Player:
         self._is_dragged = self._is_dragged or seconds != self._shown
 
     def _feed(self) -> None:
-        """Show the messages up to this time."""
+        """Add the messages up to the playback position."""
         end = bisect_right(self.recording.dues, self.time)
         for index in range(self._next, end):
             self._show(index)
         self._next = max(self._next, end)
         chronicle = self.recording.chronicle
         states = {name: chronicle.state(name, self.time) for name in chronicle.spans}
-        self.fleet.look(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
+        self.fleet.update(self.time, self._monitor.snapshot(round(self.time * 1e9)), states)
 
     def _show(self, index: int) -> None:
         due, (address, kept) = self.recording.dues[index], self.recording.entries[index]

@@ -1,4 +1,4 @@
-"""The server of the page, of live vehicles or of a recording: Bokeh's, on this host alone unless told otherwise."""
+"""Bokeh server of the web page, for live vehicles or a recording."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tornado.web import HTTPError, RequestHandler
 from nedbus.client import Bus
 from nedbus.errors import ListenError
 from nedbus.events import ALL
-from nedbus.monitoring import Exporter, Page, Sight, leads_here
+from nedbus.monitoring import Exporter, Page, Snapshot, leads_here
 from nedbus.settings import is_loopback
 from nedbus_msgs import Selection
 
@@ -34,18 +34,18 @@ from .playback import Player, Recording
 from .viewer import Viewer
 
 MAX_VIEWERS: Final = 32
-"""Pages that are open at the same time."""
+"""Maximum number of pages open at the same time."""
 
-_ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - hosts that stand for all addresses
-_STOP_POLL: Final = 100  # ms until the end is noticed
-_MAX_BODY_BYTES: Final = 2**16  # of a request, which has none: Tornado keeps it before its Host is checked
-_MAX_MESSAGE_BYTES: Final = 2**20  # of a browser about its page
-_UNUSED_LIFETIME: Final = 15_000  # ms that a page without a browser is kept: a laptop that wakes up within it goes on
+_ANY: Final = {"0.0.0.0", "::"}  # noqa: S104 - wildcard hosts, only compared
+_STOP_POLL: Final = 100  # ms between checks of `stop`
+_MAX_BODY_BYTES: Final = 2**16  # request body, normally empty; Tornado buffers it before Host is checked
+_MAX_MESSAGE_BYTES: Final = 2**20  # WebSocket message from a browser
+_UNUSED_LIFETIME: Final = 15_000  # ms; a page is kept this long without its browser, for example during a short sleep
 
 
 @dataclass(frozen=True, slots=True)
 class Where:
-    """The address of a page, further ORIGINs that browsers may call it by, and the file that is drawn under the map."""
+    """Options of a page: host, port, further origins that browsers may use, and the background file of the map."""
 
     host: str
     port: int
@@ -53,37 +53,37 @@ class Where:
     background: Path | None = None
 
     def open_background(self) -> Background | None:
-        """Read the file under the map."""
+        """Load the background of the map, None without a file."""
         return None if self.background is None else Background(self.background)
 
 
 def serve_live(
     bus: Bus, selection: Selection, where: Where, *, version: str, stop: threading.Event, tell: Callable[[str], object]
 ) -> None:
-    """Serve the page of a selection until `stop` is set; call `tell` with its address when it listens.
+    """Serve the page of a selection until `stop` is set; call `tell` with its URL once it listens.
 
-    Raises ConfigError for a bad background, ListenError if it cannot listen.
+    Raises ConfigError for an invalid background, ListenError if it cannot listen.
     """
     live = LiveFleet(bus, selection, version=version)
     background = where.open_background()
     server = WebServer(where, lambda page: Viewer(page, live.fleet, live.chronicle, background=background), live.pages)
     with ThreadPoolExecutor(1, thread_name_prefix="nedbus-web") as pool:
-        reading = pool.submit(live.run, stop)  # which sets `stop` when it fails
+        reading = pool.submit(live.run, stop)  # sets `stop` when it fails
         tell(server.url)
         server.run(stop)
         reading.result()
 
 
 def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:
-    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has a time of its own.
+    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has its own playback position.
 
-    Raises ConfigError and SourceError for a file that cannot be read, and as `serve_live`.
+    Raises ConfigError and SourceError if the file cannot be read, and the errors of `serve_live`.
     """
     recording, background = Recording(path), where.open_background()
 
     def open_page(document: Document) -> None:
         player = Player(recording)
-        Viewer(document, player.fleet, recording.chronicle, title=path.name, background=background, player=player)
+        Viewer(document, player.fleet, recording.chronicle, title=recording.name, background=background, player=player)
 
     server = WebServer(where, open_page, {"/healthz": lambda: Page.text("ok")})
     tell(server.url)
@@ -91,16 +91,16 @@ def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Ca
 
 
 class LiveFleet:
-    """Read a selection into a fleet and a chronicle.
+    """Subscribe to a selection, and keep its fleet and chronicle.
 
-    `run` reads until an event is set; `pages`: metrics and health, as `nedbus export` serves them.
+    `run`: read until an event is set; `pages`: metrics and health, as served by `nedbus export`.
     """
 
     def __init__(self, bus: Bus, selection: Selection, *, version: str) -> None:
         self.fleet = Fleet()
         self._exporter = Exporter(
-            bus, selection, version=version, on_look=self._look,
-            watch=lambda sample: self.fleet.add(sample, time.time()),
+            bus, selection, version=version, on_poll=self._update,
+            on_sample=lambda sample: self.fleet.add(sample, time.time()),
         )  # fmt: skip
         now = time.time()
         remembered = [
@@ -112,19 +112,19 @@ class LiveFleet:
         self.chronicle = Chronicle(self._exporter.account, before=remembered)
         self.run, self.pages = self._exporter.run, self._exporter.pages
 
-    def _look(self, sight: Sight) -> None:
+    def _update(self, snapshot: Snapshot) -> None:
         account = self._exporter.account
-        self.fleet.reject(sight.rejected)
-        states = {vehicle: account.state(vehicle, sight.time) for vehicle in list(account.vehicles)}
-        own = sight.behind.replace("this reader", "this page")
-        self.fleet.look(sight.time, sight.healths, states, alive=sight.alive, link=sight.link, own=own)
+        self.fleet.reject(snapshot.rejected)
+        states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in list(account.vehicles)}
+        own = snapshot.behind.replace("this reader", "this page")
+        self.fleet.update(snapshot.time, snapshot.healths, states, alive=snapshot.alive, link=snapshot.link, own=own)
 
 
 class WebServer:
-    """Serve a page, and pages of text by their path.
+    """Serve the Bokeh page, and text pages by path.
 
-    A foreign page that is open in the same browser gets nothing, also where its own name leads here (DNS rebinding):
-    browsers have to call this one by a name that only leads here, as `HttpServer` has it, or by one of `where.origins`.
+    Protects against cross-site requests and DNS rebinding by other sites in the same browser: requests must use a host
+    name that such a site cannot control, as for `HttpServer`, or one of `where.origins`.
 
     Raises ListenError when it cannot listen there.
     """
@@ -133,13 +133,13 @@ class WebServer:
         self, where: Where, open_page: Callable[[Document], object], pages: Mapping[str, Callable[[], Page]]
     ) -> None:
         for name in ("bokeh", "tornado.access", "tornado.general"):
-            logging.getLogger(name).setLevel(logging.ERROR)  # each tab that is closed would be a warning
+            logging.getLogger(name).setLevel(logging.ERROR)  # they log a warning for each closed tab
         host = where.host
         self._loop = IOLoop()
 
         def open_or_refuse(document: Document) -> None:
             if len(self._server.get_sessions("/")) >= MAX_VIEWERS:
-                document.add_root(Div(text=f"{MAX_VIEWERS} pages are open, which is the limit: close one"))
+                document.add_root(Div(text=f"limit of {MAX_VIEWERS} open pages reached: close one"))
             else:
                 open_page(document)
 
@@ -166,15 +166,15 @@ class WebServer:
         self._loop.add_callback(poll.start)
         self._loop.add_callback(self._server.start)
         self._loop.start()
-        poll.stop()  # it would stop the loop once more, amid the end of the server
+        poll.stop()  # otherwise it would stop the loop again while the server shuts down
         self._server.stop()
         self._loop.close(all_fds=True)
 
 
 class _Names(NullAuth):
-    """Refuse requests under foreign names."""
+    """Reject requests under foreign host names."""
 
-    login_url = "/"  # Bokeh demands it where users are checked; no browser is sent there
+    login_url = "/"  # required by Bokeh, never used
 
     def __init__(self, where: Where) -> None:
         self._where = where
@@ -182,7 +182,7 @@ class _Names(NullAuth):
 
     @property
     def get_user_async(self) -> Callable[[Any], Any]:
-        """Return the check of a request, before any answer; all viewers are the same user."""
+        """Return the check that runs before each response; all viewers are the same user."""
 
         async def check(handler: RequestHandler) -> str:
             _require_name(handler, self._where)
@@ -194,11 +194,11 @@ class _Names(NullAuth):
 def _require_name(handler: RequestHandler, where: Where) -> None:
     headers = handler.request.headers
     host = headers.get("Host", "")
-    origin = headers.get("Origin", f"//{host}").partition("//")[2]  # Origin: null has no name
+    origin = headers.get("Origin", f"//{host}").partition("//")[2]  # "Origin: null" has no host
     is_own = host in where.origins or leads_here(host, local=is_loopback(where.host))
     if not is_own or origin not in (host, *where.origins):
         name = origin if is_own else host
-        raise HTTPError(403, reason=f"this page is not called {name[:100]}: --origin lets browsers call it so")
+        raise HTTPError(403, reason=f"host name {name[:100]} is not allowed: add it with --origin")
 
 
 class _Text(RequestHandler):

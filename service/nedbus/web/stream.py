@@ -1,4 +1,4 @@
-"""One stream of a page: its last sample and, of positions, the last minute at 10 Hz and longer at 1 Hz; no I/O."""
+"""Stream of a page: its last sample and, for positions, histories at 10 Hz and 1 Hz; no I/O."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from nedbus.client import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, MapProjection, ResetTracker, VehicleLocalPosition, to_global
 
 POINTS: Final = 600
-"""Points of the last minute."""
+"""Number of points in the history of the last minute."""
 LONG: Final = 900, 1.0
-"""Points of the history beyond it, and seconds between two of them: a quarter of an hour."""
+"""Number of points in the longer history, and seconds between two points: 15 minutes."""
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
-"""Of a history: ms since the epoch, m, m/s, and 1 while dead reckoning; NaN where the message was not valid.
+"""Columns of a history, NaN where the message was not valid.
 
-`height` is above the vehicle's own origin, `speed` horizontal, `error` the distance to the ground truth of then.
+`time`: ms since the Unix epoch or the start of a recording; `doubtful`: 1 while dead reckoning, else 0.
+`speed`: horizontal [m/s]. The others are in m: `height` above the vehicle's own origin, `error` from the ground truth.
 """
 
 _STEP: Final = 0.095  # s between two points
-_MAX_TRUTH_AGE: Final = 0.5  # s between an estimate and the ground truth that it is compared with
+_MAX_TRUTH_AGE: Final = 0.5  # s between an estimate and the ground truth it is compared with
 _state_of = attrgetter(
     "xy_reset_counter", "z_reset_counter", "vxy_reset_counter", "vz_reset_counter", "xy_global", "xy_valid", "z_valid",
     "dead_reckoning",
@@ -32,14 +33,15 @@ _state_of = attrgetter(
 
 
 def is_position(address: Address) -> bool:
-    """Return whether there are positions at an address, which a map and plots can show."""
+    """Return whether the messages of an address are positions."""
     return BY_TOPIC.get(address.topic) is DEFAULT
 
 
 class Place(NamedTuple):
-    """The place of a message [m]; `altitude` is above mean sea level where that is known.
+    """A position [m].
 
-    Without a common origin (`common`) east, north and altitude are from the vehicle's own.
+    `common`: True if east and north are from the common origin, False if from the vehicle's own.
+    `altitude`: above mean sea level if that is known, else above the vehicle's own origin.
     """
 
     east: float
@@ -49,15 +51,15 @@ class Place(NamedTuple):
 
 
 class History:
-    """A ring of the last points: array of shape (size, columns), of which `written` have been written so far."""
+    """Ring buffer of the last points, shape (size, columns); `written` counts all points written so far."""
 
     def __init__(self, size: int, step: float) -> None:
         self.size, self.step = size, step
         self.written = 0
-        self._points = np.empty((size, len(COLUMNS)))  # no memory until it is written, as it never is for others
+        self._points = np.empty((size, len(COLUMNS)))  # uses no memory until written, which only positions are
 
     def points(self, begin: int = 0, end: int | None = None) -> npt.NDArray[np.float64]:
-        """Return the points with these numbers that are still there, in order, shape (n, columns)."""
+        """Return points `begin` to `end` in order, without those already overwritten; shape (n, columns)."""
         end = self.written if end is None else end
         return self._points[np.arange(max(begin, end - self.size, 0), end) % self.size]
 
@@ -69,12 +71,12 @@ class History:
 
 @dataclass(slots=True)
 class Origin:
-    """The common origin: that of the first message that has one."""
+    """The common origin: the first global origin in any message."""
 
     projection: MapProjection | None = None
 
     def place(self, message: VehicleLocalPosition) -> Place:
-        """Return the place of a message; NaN where it is not valid."""
+        """Return the position in a message; NaN where it is not valid."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:
@@ -86,10 +88,10 @@ class Origin:
         return Place(east, north, altitude if message.z_valid else math.nan, bool(position))
 
 
-class Stream:
-    """The histories of one stream, of the last minute and longer.
+class PageStream:
+    """Last sample and histories of one stream.
 
-    `last`: the last sample; `time`: when it came [s since the epoch]; `valid`: the last valid place, None without one.
+    `last`: the last sample; `time`: its time of arrival [s]; `valid`: the last valid position, None if there was none.
     """
 
     def __init__(self, origin: Origin, long: tuple[int, float] = LONG) -> None:
@@ -102,8 +104,8 @@ class Stream:
         self._state: object = None
         self._sampled = self._sampled_long = -math.inf
 
-    def add(self, sample: Sample[Any], time: float, truth: Stream | None = None) -> None:
-        """Add the next sample of the stream at this time [s], beside the ground truth of its vehicle."""
+    def add(self, sample: Sample[Any], time: float, truth: PageStream | None = None) -> None:
+        """Add a sample received at `time` [s]; `truth` is the ground truth of its vehicle."""
         before, self.last, self.time = self.last, sample, time
         if not is_position(sample.address):
             return
@@ -112,12 +114,12 @@ class Stream:
             if time - self._sampled < _STEP:
                 return
         elif before is not None:
-            self._tracker.add(before.message)  # so that the jump is seen between these two
+            self._tracker.add(before.message)  # the tracker must see the last message before a jump
         self._state, self._sampled = state, time
         self._add_point(sample.message, time, truth)
 
     def places_at(self, times: list[float]) -> list[Place | None]:
-        """Return the last valid places at these times [s]; None where the histories do not reach back."""
+        """Return the last valid position at each time [s]; None before the beginning of the histories."""
         points = np.concatenate([self.long.points(), self.minute.points()])
         points = points[~np.isnan(points[:, 1])]
         points = points[points[:, 0].argsort(kind="stable")]
@@ -125,10 +127,10 @@ class Stream:
         found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
         return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
 
-    def _add_point(self, message: VehicleLocalPosition, time: float, truth: Stream | None) -> None:
+    def _add_point(self, message: VehicleLocalPosition, time: float, truth: PageStream | None) -> None:
         track, place = self._tracker.add(message), self.origin.place(message)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
-            gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # the line breaks here
+            gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
             self.minute.write(gap)
             self.long.write(gap)
             self._sampled_long = -math.inf
@@ -145,8 +147,8 @@ class Stream:
             self.long.write(point)
 
 
-def _distance(place: Place, message: VehicleLocalPosition, truth: Stream | None) -> float:
-    """Return the distance to the ground truth of the same moment [m], NaN without one."""
+def _distance(place: Place, message: VehicleLocalPosition, truth: PageStream | None) -> float:
+    """Return the distance to the ground truth at the same time [m], NaN if there is none."""
     if truth is None or truth.last is None or not math.isfinite(place.north):
         return math.nan
     real = truth.last.message

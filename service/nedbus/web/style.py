@@ -1,4 +1,4 @@
-"""The style of the page: a dark and a light theme, shapes of states, and the template of its text."""
+"""Style of the page: dark and light theme, shapes of states, and text templates."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from .fleet import GRADES, MAX_STREAMS
 from .stream import is_position
 
 SHAPES: Final[Mapping[str, str]] = {"bad": "■", "watch": "▲", "ok": "●", "info": "●"}
-"""The shape of a grade, or of the severity of an event, in text."""
+"""Text symbol of a grade or of an event's severity."""
 MARKERS: Final[Mapping[str, str]] = {"bad": "square", "watch": "triangle", "ok": "circle", "info": "circle"}
-"""The same shape in a plot, as Bokeh calls it."""
+"""Bokeh marker of the same shape."""
 PALETTE: Final = 8
-"""Number of colours of vehicles: none is like those of states."""
+"""Number of vehicle colours, all distinct from the colours of states."""
 
 
 def read_asset(name: str) -> str:
-    """Return a file of `assets/`: CSS, JavaScript, the template, the theme of plots."""
+    """Return the text of a file in `assets/`."""
     return (Path(__file__).parent / "assets" / name).read_text()
 
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """The colours of a page, its theme and its CSS; text on its ground has a contrast of 4.5 and more."""
+    """Colours of a page, with its plot theme and CSS; the contrast of text on the ground is at least 4.5."""
 
     name: str
     ground: str
@@ -56,23 +56,23 @@ class Style:
 
     @property
     def colours(self) -> dict[str, str]:
-        """The colours by the names that CSS and the theme of plots have for them."""
+        """Colours by their names in CSS and in the plot theme."""
         plain = {name: getattr(self, name) for name in ("ground", "panel", "line", "text", "quiet", "chosen")}
         return {**plain, **self.grades, **{f"{grade}-fill": colour for grade, colour in self.fills.items()}}
 
     @property
     def theme(self) -> Theme:
-        """Bokeh's theme for plots."""
+        """Bokeh theme of the plots."""
         return Theme(json=json.loads(Template(read_asset("theme.json")).substitute(self.colours)))
 
     @property
     def page_css(self) -> str:
-        """CSS of the page itself: the colours as variables, for all that is on it."""
+        """CSS of the document, with the colours as variables."""
         variables = " ".join(f"--{name}: {colour};" for name, colour in self.colours.items())
         return f":root {{ {variables} }} html, body {{ margin: 0; background: var(--ground); }}"
 
     def open_panels(self, moment: Callable[[float], str]) -> Any:
-        """Return the macros of `panels.html`, which write the text; `moment` writes a time of the account's clock."""
+        """Return the macros of `panels.html`; `moment` formats a time of the account."""
         return _panels().make_module({"style": self, "moment": moment})
 
 

@@ -1,4 +1,4 @@
-"""The plots over time: the timeline of events of all vehicles, and numbers of the chosen one."""
+"""Plots over time: the event timeline of all vehicles, and values of the selected one."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from .column_data import replace, table
 from .stream import COLUMNS, History
 from .style import MARKERS, Style
 
-_PHASES: Final = frozenset({"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"})  # of a flight
-_MAX_ROWS: Final = 7
-_MIN_ROWS: Final = 4  # bars of few vehicles are no walls
+_PHASES: Final = frozenset(
+    {"armed", "disarmed", "takeoff", "landed", "mode", "reboot", "gps_fix"}
+)  # phases of a flight
+_MAX_ROWS: Final = 7  # vehicles
+_MIN_ROWS: Final = 4  # rows of height, to keep the bars of a few vehicles thin
 _PLOTS: Final = {
-    "height above its origin [m]": ("height",),
+    "height above own origin [m]": ("height",),
     "horizontal speed [m/s]": ("speed",),
-    "eph, epv, distance to the ground truth [m]": ("eph", "epv", "error"),
+    "eph, epv, error to ground truth [m]": ("eph", "epv", "error"),
 }
-_LABELS: Final = {"error": "off truth"}
 _NO_POINTS: Final = np.empty((0, len(COLUMNS)))
 _OF_TRUTH: Final = {"height", "speed"}
 
 
 def is_notable(event: Event) -> bool:
-    """Return whether an event is shown: bad ones, those to be watched, and the phases of a flight."""
+    """Return whether an event is shown: severity bad or watch, or a phase of a flight."""
     return event.severity != "info" or event.kind in _PHASES
 
 
 def move(axis: Range1d, begin: float, end: float) -> None:
-    """Move a time axis [s]."""
+    """Set the range of a time axis [s]."""
     axis.update(start=begin * 1e3, end=end * 1e3)
 
 
 class Timeline:
-    """The timeline of one viewer: `shown` has an event for each row of `marks`, whose selection was tapped."""
+    """The timeline of one viewer; `shown` has the event of each row of `marks`, whose selection is the tapped one."""
 
     def __init__(self, style: Style, clock: Any) -> None:
         self.marks = table("time", "row", "marker", "colour", "words", "vehicle")
@@ -66,9 +67,9 @@ class Timeline:
         self, events: Sequence[Event], spans: Mapping[str, Sequence[Span]], vehicles: Sequence[str], *,
         begin: float, end: float, now: float,
     ) -> None:  # fmt: skip
-        """Show the events from `begin` to `end` [s]; `vehicles`: the most important first."""
+        """Show the events from `begin` to `end` [s]; `vehicles` in order of importance."""
         events = [event for event in events if begin <= event.time <= end and is_notable(event)]
-        held = [  # watched ones first, so that bad ones lie on them
+        held = [  # bad last, drawn over watch
             (name, span)
             for severity in ("watch", "bad")
             for name in vehicles
@@ -103,7 +104,7 @@ class Timeline:
 
 
 class Plots:
-    """Three plots with one time axis; `chosen` has the points of the stream, beside those of its ground truth."""
+    """Three plots with a shared time axis; `chosen` has the points of the selected stream."""
 
     def __init__(self, style: Style, clock: Any) -> None:
         self.chosen, self._truth = table(*COLUMNS), table(*COLUMNS)
@@ -114,14 +115,14 @@ class Plots:
         self._style, self._clock = style, clock
 
     def draw(self) -> list[figure]:
-        """Return the plots: when the map is there, as they take as long as everything else of the page."""
+        """Return new plots; call this after the map is shown, as they take as long as the rest of the page."""
         return [self._draw(title, names) for title, names in _PLOTS.items()]
 
     def update(self, chosen: History | None, truth: History | None) -> None:
-        """Send the points that are new."""
+        """Send the new points of the selected stream and its ground truth."""
         for source, history in ((self.chosen, chosen), (self._truth, truth if truth is not chosen else None)):
             shown, seen = self._shown.get(source, (None, 0))
-            end = history.written if history is not None else 0  # once: another thread adds points
+            end = history.written if history is not None else 0  # read once: another thread adds points
             self._shown[source] = history, end
             points = _NO_POINTS if history is None else history.points(seen if history is shown else 0, end)
             columns: dict[str, Any] = dict(zip(COLUMNS, points.T, strict=True))
@@ -131,7 +132,7 @@ class Plots:
                 source.stream(columns, rollover=history.size)
 
     def mark(self, events: Sequence[Event], spans: Sequence[Span], end: float) -> None:
-        """Mark the times of events of the vehicle, and shade its conditions, up to `end` [s]."""
+        """Mark the events of the vehicle, and shade its conditions; open ones end at `end` [s]."""
         colours = self._style.grades
         replace(self._marks, [{"time": event.time * 1e3, "colour": colours[event.severity]} for event in events])
         held = [
@@ -145,7 +146,7 @@ class Plots:
         plot = _time_figure(self.range, self._clock, title=title, height=76, min_height=76)
         plot.vstrip(x0="begin", x1="end", source=self._spans, fill_color="colour", fill_alpha=0.12, line_alpha=0.0)
         for name, colour in zip(names, self._style.lines, strict=False):
-            legend: dict[str, Any] = {"legend_label": _LABELS.get(name, name)} if len(names) > 1 else {}
+            legend: dict[str, Any] = {"legend_label": name} if len(names) > 1 else {}
             plot.line("time", name, source=self.chosen, color=colour, line_width=1.5, **legend)
             if name in _OF_TRUTH:
                 plot.line("time", name, source=self._truth, color=self._style.truth, line_dash="dotted", line_width=1.5)

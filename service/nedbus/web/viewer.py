@@ -1,4 +1,4 @@
-"""One viewer: its Document of Bokeh, which needs no browser, and the actions of its clicks and keys."""
+"""Viewer: the Bokeh document of one browser, and the actions of its clicks and keys."""
 
 from __future__ import annotations
 
@@ -27,46 +27,46 @@ from .stream import is_position
 from .style import DARK, LIGHT, read_asset
 from .time_plots import Plots, Timeline, is_notable, move
 
-_TICK: Final = 100  # ms between two moves of the map
-_TEXT_TICKS: Final = 5  # moves of the map between two updates of text and plots
-_MAX_AHEAD: Final = 2  # pictures that are sent before the browser has drawn the first of them
-_MINUTE: Final = 60.0
-_AROUND: Final = 30.0  # s that are shown before and after a moment that is chosen
+_TICK: Final = 100  # ms between updates of the map
+_TEXT_TICKS: Final = 5  # map updates per update of text and plots
+_MAX_AHEAD: Final = 2  # updates sent ahead of the browser's drawing
+_MINUTE: Final = 60.0  # s
+_AROUND: Final = 30.0  # s shown before and after a selected moment
 _SECONDS: Final = re.compile(r"[0-9]{1,10}(\.[0-9])?")
-_MAX_DIGITS: Final = 9  # of the number of a picture
-_MAX_SAID: Final = 300  # characters of what a browser asks for
-_STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s of a recording
+_MAX_DIGITS: Final = 9  # digits of an update number
+_MAX_MESSAGE: Final = 300  # characters of a message or URL argument from the browser
+_STEPS: Final = {"left": -1.0, "right": 1.0, "LEFT": -10.0, "RIGHT": 10.0}  # s to seek
 
 
 class Viewer:
-    """One page in one browser; `update` sends what is new of the fleet, ten times a second.
+    """One page in one browser; `update` sends changes of the fleet ten times a second.
 
-    `world`: the events. `player`: the time in a recording, whose long histories are the whole flight.
-    The address of the page names vehicle, moment, view and theme, and follows them, so that it can be shared.
+    `chronicle`: the events; `player`: the playback of a recording, None for live vehicles.
+    The URL of the page always has the current vehicle, moment, view and theme, and can be shared.
     """
 
     def __init__(
-        self, document: Document, fleet: Fleet, world: Chronicle, *, title: str = "nedbus",
+        self, document: Document, fleet: Fleet, chronicle: Chronicle, *, title: str = "nedbus",
         background: Background | None = None, player: Player | None = None,
     ) -> None:  # fmt: skip
-        asked = _arguments(document)
-        self.chosen: str | None = asked.get("vehicle")
-        self.pinned: float | None = None  # a moment that is chosen, of live vehicles
-        self._asked_time = _seconds_in(asked.get("time", ""))
+        query = _arguments(document)
+        self.chosen: str | None = query.get("vehicle")
+        self.pinned: float | None = None  # selected moment of live vehicles
+        self._requested_time = _seconds_in(query.get("time", ""))
         self._is_choice = self.chosen is not None
-        self._event: Event | None = None  # that is chosen, of the chosen vehicle
-        self._is_open = False  # the table of streams
+        self._event: Event | None = None  # selected event of the selected vehicle
+        self._is_open = False  # the table of streams is open
         self._listed: list[str] = []
-        self._fleet, self._world, self._player = fleet, world, player
+        self._fleet, self._chronicle, self._player = fleet, chronicle, player
         self._whole = player.recording.whole if player is not None else fleet
-        self._style, self._name, self._document = LIGHT if asked.get("theme") == "light" else DARK, title, document
+        self._style, self._name, self._document = LIGHT if query.get("theme") == "light" else DARK, title, document
         self._ticks = self._sent = 0
         self._clock = CustomJSTickFormatter(code=read_asset("clock.js"), args={"start": 0.0})
         self._timeline = Timeline(self._style, self._clock)
         self._plots = Plots(self._style, self._clock)
         self._map = Map(self._style, background)
-        self._map.focus = asked["view"] if asked.get("view") in FOCUSES else "all"
-        self._panels = self._style.open_panels(world.moment)
+        self._map.focus = query["view"] if query.get("view") in FOCUSES else "all"
+        self._panels = self._style.open_panels(chronicle.moment)
         sheets: list[Any] = [read_asset("text.css")]
         names = "head", "list", "why", "nums", "tool", "more", "marks"
         self._text = {name: Div(stylesheets=sheets, sizing_mode="stretch_width", css_classes=[name]) for name in names}
@@ -74,20 +74,20 @@ class Viewer:
             placeholder="search vehicle  /", sizing_mode="stretch_width", css_classes=["find"], stylesheets=sheets
         )
         self._grid = column(sizing_mode="stretch_both", css_classes=["plots"])
-        # Channels between page and viewer: the number of a picture, that it was drawn, a click or a key, the address.
-        self._beat, self._drawn, self._said, self._address = (TextInput(visible=False) for _ in range(4))
+        # Hidden inputs as channels to the browser: number of the update, last update drawn, click or key, URL.
+        self._update_number, self._drawn, self._message, self._url = (TextInput(visible=False) for _ in range(4))
         drawn = "requestAnimationFrame(() => { drawn.value = cb_obj.value })"
-        self._beat.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
-        self._address.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
-        self._said.on_change("value", lambda _, __, said: self._act(*_action_in(said)))
+        self._update_number.js_on_change("value", CustomJS(args={"drawn": self._drawn}, code=drawn))
+        self._url.js_on_change("value", CustomJS(code='history.replaceState(null, "", cb_obj.value)'))
+        self._message.on_change("value", lambda _, __, message: self._act(*_action_in(message)))
         self._search.on_change("value_input", lambda _, __, ___: self._show_now())
         self._on_tap(self._map.marks, lambda: self._map.shown, self._choose)
-        self._on_tap(self._map.events, lambda: self._map.told, self._show)
+        self._on_tap(self._map.events, lambda: self._map.shown_events, self._show)
         self._on_tap(self._timeline.marks, lambda: self._timeline.shown, self._show)
         document.title, document.theme = title, self._style.theme
         document.config.update(reconnect_session=False, notify_connection_status=False)
         document.js_on_event(ConnectionLost, CustomJS(code=read_asset("lost.js")))
-        args = {"said": self._said, "map": self._map.figure, "search": self._search}
+        args = {"message": self._message, "map": self._map.figure, "search": self._search}
         document.js_on_event(DocumentReady, CustomJS(args=args, code=read_asset("actions.js")))
         document.add_root(self._lay_out(sheets))
         document.add_periodic_callback(self.update, _TICK)
@@ -95,27 +95,27 @@ class Viewer:
             player.on_jump = self._show_now
 
     def update(self) -> None:
-        """Send what is new, as soon as the browser has drawn the last: the map each time, the rest twice a second."""
+        """Send changes: the map each time, the rest twice a second; skip this while the browser is behind."""
         if self._player is not None:
             self._player.tick()
         drawn = str(self._drawn.value)[:_MAX_DIGITS]
         if drawn.isdecimal() and self._sent - int(drawn) >= _MAX_AHEAD:
             return
         self._sent += 1
-        if self._drawn.value and not self._grid.children:  # map and list are there sooner without
+        if self._drawn.value and not self._grid.children:  # plots come later, so that map and list appear sooner
             self._grid.children = [*self._plots.draw()]
         picture = self._fleet.picture
-        if not self._is_choice and picture.rows:  # the worst, until one is chosen
+        if not self._is_choice and picture.rows:  # the most severe, until one is selected
             self.chosen = picture.rows[0].vehicle
         chosen = picture.row(self.chosen)
         self._map.update(picture, self._whole, chosen)
         if self._ticks % _TEXT_TICKS == 0:
-            self._go_to_asked()
+            self._go_to_requested()
             moment = picture.time if self.pinned is None else self.pinned
             self._write_all(picture, chosen, moment)
             self._plot(picture, chosen, moment)
         self._ticks += 1
-        self._beat.value = str(self._sent)
+        self._update_number.value = str(self._sent)
 
     def _show_now(self) -> None:
         self._ticks = 0
@@ -130,37 +130,37 @@ class Viewer:
         self.chosen, self._is_choice, self._event = vehicle, True, None
 
     def _go_to(self, seconds: float | None) -> None:
-        """Go to a moment, or back to now."""
+        """Go to a moment, None for now."""
         self._event = None
         if self._player is None:
             self.pinned = seconds
         elif seconds is not None:
             self._player.jump(seconds)
 
-    def _go_to_asked(self) -> None:
-        """Go to the moment in the address, as soon as the recording has been read that far."""
-        asked, player = self._asked_time, self._player
-        if asked is not None and (player is None or player.recording.has(asked)):
+    def _go_to_requested(self) -> None:
+        """Go to the moment in the URL once the recording has been read that far."""
+        time, player = self._requested_time, self._player
+        if time is not None and (player is None or player.recording.has(time)):
             if player is not None:
                 player.toggle(pause=True)
-            self._go_to(asked)
-            self._asked_time = None
+            self._go_to(time)
+            self._requested_time = None
 
     def _write_all(self, picture: Picture, chosen: Row | None, now: float) -> None:
         panels, player = self._panels, self._player
         bad = sum(each.grade == "bad" for each in picture.rows)
         self._document.title = f"({bad} bad) {self._name}" if bad else self._name
-        self._clock.args = {"start": self._world.start or 0.0}
-        clock = self._world.clock(picture.time) if picture.time or player else ""
+        self._clock.args = {"start": self._chronicle.start or 0.0}
+        clock = self._chronicle.clock(picture.time) if picture.time or player else ""
         wanted = str(self._search.value_input or "").strip().lower()
         rows = [each for each in picture.rows if wanted in each.vehicle.lower() or wanted in each.state.text.lower()]
         self._listed = [each.vehicle for each in rows]
         story, then = None, chosen
         if chosen is not None:
             at = self.pinned if self._event is None else self._event
-            story = self._world.story(chosen.vehicle, now, at)
+            story = self._chronicle.story(chosen.vehicle, now, at)
             if self.pinned is not None:
-                then = replace(chosen, state=self._world.state(chosen.vehicle, now))
+                then = replace(chosen, state=self._chronicle.state(chosen.vehicle, now))
         self._text["head"].text = panels.head(self._name, picture, clock)
         self._text["list"].text = panels.vehicles(rows, self.chosen)
         self._text["why"].text = panels.why(then, story, now, self.pinned is not None)
@@ -168,17 +168,17 @@ class Viewer:
         self._text["more"].text = panels.streams(chosen, picture.reports, self._is_open)
         long, projection = "whole flight" if player else "15 min", self._fleet.origin.projection
         self._text["tool"].text = panels.toolbar(self._map, long, self.pinned, picture.rows, projection)
-        asked = {
+        query = {
             "theme": "light" if self._style is LIGHT else None,
             "vehicle": chosen.vehicle if chosen is not None and self._is_choice else None,
             "view": self._map.focus if self._map.focus != "all" else None,
             "time": f"{now:.1f}" if self.pinned is not None or player is not None else None,
         }
-        if self._drawn.value:  # a browser that is not there yet would miss it
-            self._address.value = f"?{urlencode({name: value for name, value in asked.items() if value is not None})}"
+        if self._drawn.value:  # the browser is connected, and will not miss it
+            self._url.value = f"?{urlencode({name: value for name, value in query.items() if value is not None})}"
 
     def _plot(self, picture: Picture, chosen: Row | None, now: float) -> None:
-        """Send the points and events, and move the time axes."""
+        """Update the plots, event marks and time axes."""
         vehicle, is_long_trail = self.chosen or "", self._map.is_long
         is_long = is_long_trail or now < picture.time - _MINUTE
         main = truth = None
@@ -195,22 +195,22 @@ class Viewer:
         else:
             first = max(begin, now - _MINUTE)
             move(self._plots.range, first, first + _MINUTE)
-        told = self._events_of_chosen()
-        self._plots.mark(told, self._world.spans.get(vehicle, ()), picture.time)
+        events = self._events_of_chosen()
+        self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), picture.time)
         order = [vehicle, *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
-        self._timeline.update(self._world.events, self._world.spans, order, begin=begin, end=end, now=now)
+        self._timeline.update(self._chronicle.events, self._chronicle.spans, order, begin=begin, end=end, now=now)
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:
             move(self._timeline.range, begin, max(end, begin + 1.0))
         if self._player is not None:
             self._text["marks"].text = self._panels.strip(self._timeline.shown, self._player.recording.length)
         since = begin if is_long_trail else now - _MINUTE
-        self._map.mark([event for event in told if since < event.time <= now + 1.0], chosen, self._whole)
+        self._map.mark([event for event in events if since < event.time <= now + 1.0], chosen, self._whole)
 
     def _events_of_chosen(self) -> list[Event]:
-        return [event for event in self._world.events if event.vehicle == self.chosen and is_notable(event)]
+        return [event for event in self._chronicle.events if event.vehicle == self.chosen and is_notable(event)]
 
     def _act(self, action: str, value: str) -> None:
-        """Perform the action of a click or a key; ignore anything else."""
+        """Perform the action of a click or key; ignore unknown actions."""
         (name, _, option), player = action.partition(":"), self._player
         match name:
             case "vehicle" if self._fleet.picture.row(value) is not None:
@@ -240,7 +240,7 @@ class Viewer:
         self._show_now()
 
     def _choose_next(self, step: int) -> None:
-        if names := self._listed:  # which goes round
+        if names := self._listed:  # wraps around
             self._choose(names[(names.index(self.chosen) + step if self.chosen in names else 0) % len(names)])
 
     def _show_next(self, *, is_later: bool) -> None:
@@ -254,7 +254,7 @@ class Viewer:
     def _on_tap(
         self, source: ColumnDataSource, shown: Callable[[], Sequence[Any]], show: Callable[[Any], object]
     ) -> None:
-        """Show the tapped row, and clear the selection, so that the same row can be tapped again."""
+        """Call `show` for a tapped row, then clear the selection, so that the row can be tapped again."""
 
         def tap(_: str, __: object, rows: list[int]) -> None:
             if rows and 0 <= rows[0] < len(shown()):
@@ -274,27 +274,27 @@ class Viewer:
                 control.stylesheets = sheets
             marked = column(slider, text["marks"], sizing_mode="stretch_width")
             parts.insert(1, row(*controls, marked, sizing_mode="stretch_width", css_classes=["ctrl"]))
-        parts += [self._beat, self._drawn, self._said, self._address]
+        parts += [self._update_number, self._drawn, self._message, self._url]
         page: list[Any] = [GlobalInlineStyleSheet(css=self._style.page_css), read_asset("layout.css")]
         return column(*parts, sizing_mode="stretch_width", stylesheets=page)
 
 
-def _action_in(said: str) -> tuple[str, str]:
-    """Return the action and its value that `actions.js` sent, empty ones for anything else."""
+def _action_in(message: str) -> tuple[str, str]:
+    """Parse the action and value sent by `actions.js`; return empty strings for anything else."""
     try:
-        action, value, _ = json.loads(said[:_MAX_SAID])
+        action, value, _ = json.loads(message[:_MAX_MESSAGE])
     except (ValueError, TypeError):
         return "", ""
     return str(action), str(value)
 
 
 def _arguments(document: Document) -> Mapping[str, str]:
-    """Return the arguments in the address of the page."""
-    request = getattr(document.session_context, "request", None)  # none without a browser
+    """Return the query arguments of the page's URL."""
+    request = getattr(document.session_context, "request", None)  # None without a browser
     given = request.arguments if request is not None else {}
-    return {name: values[0].decode(errors="replace")[:_MAX_SAID] for name, values in given.items() if values}
+    return {name: values[0].decode(errors="replace")[:_MAX_MESSAGE] for name, values in given.items() if values}
 
 
 def _seconds_in(text: str) -> float | None:
-    """Return a time in an address by the account's clock [s], None if it is none."""
+    """Parse a time by the account's clock [s] from a URL; None if it is invalid."""
     return float(text) if _SECONDS.fullmatch(text) else None

@@ -1,6 +1,6 @@
-"""A subscription's account of messages: publishers, a bad link and a slow reader as a model, and what must hold.
+"""A model of a subscription: publishers, an unreliable link and a slow reader, with the invariants of its counts.
 
-`Account` is what is tested; another receive path is put under the same test by an adapter of its own.
+`Account` is the interface under test; other receive paths can be tested through an adapter.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ UNLIMITED: Final = 100_000
 
 
 class Setting(NamedTuple):
-    """The first state of a world.
+    """The initial state of a world.
 
-    `keeps`: the cache of each publisher, in messages. `capacity`: of the queue.
+    `keeps`: the size of each publisher's history cache, in messages. `capacity`: of the queue.
     """
 
     mode: Mode = "every"
@@ -43,8 +43,9 @@ class Request(NamedTuple):
 class Account(Protocol):
     """The receive path of one subscription, without I/O. Mode `latest` has no heartbeats and no requests.
 
-    `link`: it broke, or did so long ago that a new publisher has sent nothing before. `answer`: with `final` a request
-    is given up that these do not complete. `read`: the timestamps of one message or many, and the losses told.
+    `link`: the link broke, or did so long ago that a new publisher has sent nothing before. `answer`: with `final`, a
+    request that these samples do not complete is given up. `read`: the timestamps of one or more messages, and the
+    reported losses.
     """
 
     def __init__(self, setting: Setting) -> None: ...
@@ -61,7 +62,7 @@ class Account(Protocol):
 
 
 class QueueAccount(PendingQueue):
-    """The account as PendingQueue keeps it, with a clock of the test's."""
+    """The account in PendingQueue, with a fake clock."""
 
     def __init__(self, setting: Setting) -> None:
         self._now, self._since_link = 0.0, 0.0
@@ -88,7 +89,7 @@ class QueueAccount(PendingQueue):
             self._now += 1.0
             for writer in list(self.account.requesting):
                 self.next_request(writer, self._now)
-        asked = [(writer, writer.request.asked) for writer in self.account.requesting if writer.request is not None]
+        asked = [(writer, writer.request.requested) for writer in self.account.requesting if writer.request is not None]
         return [Request(writer, writer.name, numbers) for writer, numbers in asked if numbers is not None]
 
     def answer(self, request: Request, samples: Sequence[RawSample], *, final: bool) -> None:
@@ -112,10 +113,10 @@ class QueueAccount(PendingQueue):
 
 @dataclass(eq=False)
 class Life:
-    """One life of a publisher: its messages are numbered from 0.
+    """One life of a publisher; its messages are numbered from 0.
 
-    `known`: the newest number that the reader knows of. `exact`: it was heard from its first message on. `whole`: it
-    was, or was asked for all that it had sent before. `given_up`: it could, or was let, answer no more.
+    `known`: the newest number that the reader knows of. `exact`: the reader received its first message. `whole`: that,
+    or the reader requested all earlier messages. `given_up`: a request may have been left unanswered.
     """
 
     index: int
@@ -140,7 +141,10 @@ class Life:
 
 
 class World:
-    """Publishers, the link to one reader, and what it got. Each public method is a step; positions are taken modulo."""
+    """Publishers, the link to one reader, and the messages that it read.
+
+    Each public method is a step; positions are taken modulo.
+    """
 
     def __init__(self, setting: Setting, account: Account) -> None:
         self.setting, self.account = setting, account
@@ -154,7 +158,7 @@ class World:
         self._running = list(self._lives)
 
     def step(self, name: str, *arguments: int) -> None:
-        """Take a step, and check what must hold at any time."""
+        """Take a step, then check the invariants."""
         self.intact = False
         getattr(self, name)(*arguments)
         counts, self.open = self.account.counts, self.account.requests()
@@ -177,7 +181,7 @@ class World:
         self._lives.append(self._running[life.slot])
 
     def deliver(self, count: int, dropped: int = 0) -> None:
-        """Put what comes next; `dropped`: out of a channel that was full, and dropped up to this many of the oldest."""
+        """Put the next samples; `dropped`: up to this number of the oldest are dropped by a full channel."""
         taken = self._take(0, count)
         del taken[: min(dropped, len(taken) - 1)]
         for life, number in taken:
@@ -198,7 +202,7 @@ class World:
         self.flight += taken
 
     def link(self, broken: int) -> None:
-        """Break the link, or let the time pass in which a new publisher may have sent something before."""
+        """Break the link, or advance the time after which a new publisher counts as new."""
         self._unsettled = bool(broken)
         self._take(0, broken * len(self.flight))
         self.account.link(broken=self._unsettled)
@@ -211,7 +215,7 @@ class World:
             self.account.heartbeat(life.key, name_of(life.name), life.sent - 1)
 
     def answer(self, position: int, missing: int = 0, final: int = 0) -> None:
-        """Answer a request with what is kept; of that, those do not arrive whose bits are set in `missing`."""
+        """Reply to a request from the history cache; samples whose bits are set in `missing` are lost."""
         requests = self.account.requests()
         request = requests[position % len(requests)]
         life, numbers = self._lives[int(request.publisher.partition(":")[0])], request.numbers
@@ -236,7 +240,7 @@ class World:
                 life.read.append(number)
 
     def settle(self) -> None:
-        """Let all arrive, be answered and read; then publish once more, for losses that the next message tells."""
+        """Deliver, reply to and read everything, then publish once more: the next message reports all losses."""
         self._settle()
         for life in self._running:
             self.publish(life.slot, 1)
@@ -269,7 +273,7 @@ class World:
         return counts.received + counts.lost + counts.dropped + counts.invalid
 
     def _unknown(self, life: Life) -> int:
-        """Return how many messages may have been sent before the reader heard of this life."""
+        """Return the maximum number of messages sent before the reader heard of this life."""
         return 0 if life.exact else min(life.read, default=life.known + 1)
 
     def _take(self, position: int, count: int) -> list[tuple[Life, int]]:

@@ -1,4 +1,4 @@
-"""A lossless publisher's readers, and Zenoh between them, in a time that goes on only while somebody waits."""
+"""Readers of a lossless publisher, and Zenoh between them, with a clock that advances only by waiting."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .raw_samples import Payload
 
 KEY: Final = "nedbus/1/vehicle_local_position"
 _TICK: Final = 0.01  # s
-END: Final = 600.0  # s after which whoever still waits is stuck
+END: Final = 600.0  # s after which a wait is stuck
 
 
 class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
@@ -33,7 +33,7 @@ class Stuck(Exception):  # noqa: N818 - not an error: what a test expects
 
 @dataclass(eq=False)
 class Reader:
-    """A reader of `rate` messages a second; its connection breaks `lease` seconds after it was stopped."""
+    """A reader of `rate` messages per second; its lease expires LEASE seconds after it is suspended."""
 
     name: str
     rate: float = math.inf
@@ -52,7 +52,7 @@ class Reader:
 
 @dataclass(eq=False)
 class Query:
-    """A query of the publisher, and the readers that still have to answer it."""
+    """A query of the publisher, and the readers that have not replied yet."""
 
     number: int
     read: bool
@@ -63,7 +63,7 @@ class Query:
     lost: bool = False  # a full queue dropped it
 
     def try_recv(self) -> SimpleNamespace | None:
-        """Return the next answer, as the channel of a query does."""
+        """Return the next reply, like the channel of a query."""
         if not self.replies and self.ended:
             raise zenoh.ZError("ended")
         return self.replies.popleft() if self.replies else None
@@ -71,7 +71,7 @@ class Query:
 
 @dataclass(eq=False)
 class World:
-    """The session of the publisher, and its clock; everything happens in the thread that waits."""
+    """The session of the publisher, and its clock; everything runs in the waiting thread."""
 
     readers: list[Reader] = field(default_factory=list)
     now: float = 0.0
@@ -82,17 +82,17 @@ class World:
     plans: list[tuple[float, Callable[[], object]]] = field(default_factory=list)
     routers: list[str] = field(default_factory=lambda: ["r1"])
     closed: bool = False
-    dropping: bool = False  # whether a full queue drops the questions that are asked
+    dropping: bool = False  # a full queue drops all requests
 
     def flow_control(self, monkeypatch: pytest.MonkeyPatch, *, needs_router: bool = True) -> FlowControl:
-        """Return a flow control that lives here."""
+        """Return a flow control in this world."""
         monkeypatch.setattr(module, "_POLLS", (0.0005, _TICK))
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: self.now, sleep=self.advance))
         writer = SimpleNamespace(session=self, key=KEY, name="p:1", priority=zenoh.Priority.DATA)
         return FlowControl(cast("Writer", writer), SharedWindow(), needs_router=needs_router)
 
     def publish(self, control: FlowControl, count: int, *, rate: float = 10_000.0) -> None:
-        """Publish `count` messages, `rate` a second where nothing holds it up."""
+        """Publish `count` messages, `rate` per second if there is credit."""
         for _ in range(count):
             self.advance(1 / rate)
             self.published += 1
@@ -100,28 +100,28 @@ class World:
             control.wait_for_credit(self.published)
 
     def plan(self, seconds: float, action: Callable[[], object]) -> None:
-        """Let something happen after a number of seconds."""
+        """Schedule an action in a number of seconds."""
         self.plans.append((self.now + seconds, action))
         self.plans.sort(key=itemgetter(0))
 
     def cut(self, reader: Reader, at: float, *, until: float) -> None:
-        """Let the link of a reader break."""
+        """Break the link of a reader."""
         self.plan(at, lambda: setattr(reader, "alive", False))
         self.plan(until, lambda: setattr(reader, "alive", True))
 
     def restart_router(self, reader: Reader, at: float, *, until: float) -> None:
-        """Let the link of the publisher break for a second, and that of a reader for longer."""
+        """Break the link of the publisher for a second, and that of a reader for longer."""
         self.cut(reader, at, until=until)
         self.plan(at, self.routers.clear)
         self.plan(at + 1.0, lambda: self.routers.append("r2"))
 
     def stop(self, reader: Reader, at: float, *, until: float) -> None:
-        """Let the process of a reader be stopped (SIGSTOP)."""
+        """Suspend the process of a reader (SIGSTOP)."""
         self.plan(at, lambda: setattr(reader, "stopped", self.now))
         self.plan(until, lambda: setattr(reader, "stopped", None))
 
     def advance(self, seconds: float) -> None:
-        """Let time go by."""
+        """Advance the clock."""
         self.now += seconds
         if self.now > END:
             raise Stuck
@@ -134,11 +134,11 @@ class World:
             self._answer(query)
 
     def is_linked(self, reader: Reader) -> bool:
-        """Return true if a query reaches this reader."""
+        """Return True if a query reaches this reader."""
         return bool(self.routers) and reader.is_linked(self.now)
 
     def longest_pause(self, since: float = 0.0) -> float:
-        """Return for how long at most no message was sent."""
+        """Return the longest time without a sent message."""
         times = [since, *(each for each in self.sent if each >= since)]
         return max(later - earlier for earlier, later in pairwise(times))
 

@@ -1,4 +1,4 @@
-"""Samples and sequences made by hand: Python cannot make Zenoh's samples, these have the attributes that are read."""
+"""Hand-made samples with the attributes of Zenoh's samples, which cannot be created in Python."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SOURCE = encoding_of("sim")
 
 
 class Payload(bytes):
-    """Zenoh's bytes."""
+    """A stand-in for zenoh.ZBytes."""
 
     def to_bytes(self) -> bytes:
         return bytes(self)
@@ -35,17 +35,17 @@ INVALID = Payload(bytes(len(VALID)))  # of the right size, so that only its read
 
 
 class Raw(SimpleNamespace):
-    """The attributes of a Zenoh sample that are read; unlike its base, weak references to it are possible."""
+    """The attributes of a Zenoh sample that are read; unlike its base, it supports weak references."""
 
 
 def source_info(number: int, publisher: str) -> zenoh.SourceInfo:
-    """Return the sequence number of a message, and its publisher: the first of the session with this name."""
+    """Return a message's sequence number and its publisher, the first one in the session of this name."""
     entity = SimpleNamespace(zid=publisher, eid=1)
     return cast("zenoh.SourceInfo", SimpleNamespace(source_sn=number, source_id=entity))
 
 
 def name_of(publisher: str) -> str:
-    """Return what a reader calls a publisher."""
+    """Return the name by which a reader knows a publisher."""
     return f"{publisher}:1"
 
 
@@ -59,7 +59,7 @@ def raw(
     encoding: str = SOURCE,
     stamp: object = None,
 ) -> RawSample:
-    """Return a sample with a publisher's sequence number, None for one without."""
+    """Return a sample with a publisher's sequence number, None for a sample without one."""
     info = None if number is None else source_info(number, publisher)
     if payload is None:
         payload = VALID if timestamp == 1 else Payload(encode(message(timestamp)))
@@ -68,7 +68,7 @@ def raw(
 
 
 def junk(payload: bytes, key: str = KEY) -> RawSample:
-    """Return a sample with this payload, and without a sequence number."""
+    """Return a sample with this payload and without a sequence number."""
     return raw(None, payload=Payload(payload), key=key)
 
 
@@ -78,16 +78,16 @@ def make_queue(mode: Mode, *, clock: Callable[[], float] = time.monotonic) -> Pe
 
 
 def put(pending_queue: PendingQueue, samples: Sequence[RawSample], *, overflowed: bool = False) -> None:
-    """Put samples into a queue; what is missing is given up, as nobody has it."""
+    """Put samples into a queue, and give up all gaps, as no publisher replies."""
     pending_queue.put(samples, overflowed=overflowed)
     pending_queue.give_up()
 
 
 def drain(pending_queue: PendingQueue) -> list[nedbus.Sample]:
-    """Take all that is queued."""
+    """Take all queued samples."""
     return list(iter(partial(pending_queue.pop, rows=False), None))
 
 
 def timestamps(pending_queue: PendingQueue) -> list[int]:
-    """Take all that is queued, and return the timestamp of each."""
+    """Take all queued samples and return their timestamps."""
     return [sample.message.timestamp for sample in drain(pending_queue)]

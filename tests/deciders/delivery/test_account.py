@@ -1,4 +1,4 @@
-"""The account of a subscription: received + lost + dropped = sent, in order and once, whatever the link does."""
+"""The account of a subscription: received + lost + dropped = sent, in order and without duplicates, on any link."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MISSING = st.sampled_from([0, 0, -1]) | st.integers(0, 255)
 
 
 def step(name: str, *arguments: st.SearchStrategy[int], when: str = "world") -> Callable[..., None]:
-    """Return the rule that takes a step of World, `when` there is any of this."""
+    """Return a Hypothesis rule for a step of World, enabled if `when` is not empty."""
 
     def take(machine: AccountMachine, arguments: tuple[int, ...]) -> None:
         machine.world.step(name, *arguments)
@@ -29,7 +29,7 @@ def step(name: str, *arguments: st.SearchStrategy[int], when: str = "world") -> 
 
 
 class AccountMachine(RuleBasedStateMachine):
-    """Take any steps, then settle."""
+    """Take random steps, then settle."""
 
     @initialize(
         mode=st.sampled_from(["every", "every", "latest"]),
@@ -67,13 +67,13 @@ SEEDS = [
     (Setting("latest"), "publish 0 2, delay 0 1, deliver 2"),
     # 1 is counted as lost before it comes.
     (Setting("latest"), "publish 0 3, deliver 1, delay 0 1, deliver 2"),
-    # 1 and 2 are missing, only 2 is answered: 1 is not asked for again, and lost.
+    # 1 and 2 are requested, only 2 arrives: 1 is not requested again, and lost.
     (Setting(), "publish 0 4, deliver 1, drop 0 2, deliver 1, answer 0 1 0"),
     # 6 is expected of the first life: that of the second is taken for it, is read before 0 to 5, and again.
     (Setting(), "publish 0 6, deliver 6, link 1, restart 0, publish 0 8, drop 0 6, deliver 2"),
-    # 1 is asked for, 2 told of by a heartbeat, and nobody is there to answer: 1 is lost, and 2 is not counted.
+    # 1 is requested, 2 announced by a heartbeat, and the publisher has gone: 1 is lost, and 2 is not counted.
     (Setting(), "publish 0 2, deliver 1, heartbeat 0, publish 0 1, heartbeat 0, link 1, restart 0"),
-    # Only 2 to 4 are kept, and then 3 to 5: 1 is lost, and 5 is asked for all the same.
+    # The cache has 2 to 4, then 3 to 5: 1 is lost, and 5 is still requested.
     (Setting(keeps=(3,)), "publish 0 5, deliver 1, heartbeat 0, answer 0, publish 0 1, link 1"),
     # 1 and 3 are missing, and 3 to 5 are kept: 2, which is here, is not passed over.
     (Setting(keeps=(3,)), "publish 0 6, deliver 1, drop 0 1, drop 1 1"),
@@ -82,7 +82,7 @@ SEEDS = [
 
 @pytest.mark.parametrize(("setting", "steps"), SEEDS)
 def test_steps_that_found_a_fault(setting: Setting, steps: str) -> None:
-    """The account is right after these steps too, which an earlier receive path got wrong."""
+    """The account is right after step sequences that once found a bug in an earlier receive path."""
     world = World(setting, QueueAccount(setting))
     for name, *arguments in map(str.split, f"{steps}, settle".split(", ")):
         world.step(name, *map(int, arguments))

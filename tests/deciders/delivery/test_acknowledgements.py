@@ -1,4 +1,4 @@
-"""Acknowledgements of a reader of mode `every`, and their times: without Zenoh, and without a publisher."""
+"""Acknowledgements of a reader of mode `every`, without Zenoh and without a publisher."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .raw_samples import INVALID, KEY, OTHER_KEY, Payload, make_queue, name_of, 
 
 @dataclass
 class Asked:
-    """A queue that is asked, and the names of the questions that were answered, in order.
+    """A queue that receives acknowledgement requests, and the names of the acknowledged ones, in order.
 
-    `drained`: nothing is left to receive when it is asked.
+    `drained`: the ring is empty when a request arrives.
     """
 
     now: float = 0.0
@@ -28,18 +28,18 @@ class Asked:
         self.queue = make_queue("every", clock=lambda: self.now)
 
     def ask(self, number: int, *, read: bool = False, publisher: str = "a", name: str = "") -> list[str]:
-        """Ask the queue, and return what is answered so far."""
+        """Send a request; return the names of all acknowledged ones."""
         reply = partial(self.answered.append, name or str(number))
         self.queue.add(AckRequest(KEY, name_of(publisher), number, read, reply), drained=self.drained)
         return self.answered
 
     def take(self, count: int) -> list[str]:
-        """Read samples, and return what is answered so far."""
+        """Read samples; return the names of all acknowledged requests."""
         assert all(self.queue.pop(rows=False) for _ in range(count))
         return self.answered
 
     def put(self, *samples: RawSample) -> list[str]:
-        """Put samples into the queue, and return what is answered so far."""
+        """Put samples into the queue; return the names of all acknowledged requests."""
         self.queue.put(samples)
         return self.answered
 
@@ -50,7 +50,7 @@ def asked() -> Asked:
 
 
 def test_read_is_answered_when_all_up_to_it_was_taken(asked: Asked) -> None:
-    """With `read` the reader must have taken whatever was queued when the message had arrived."""
+    """A request with `read` is acknowledged once the reader has taken all samples queued when the message arrived."""
     asked.put(raw(0))
     asked.ask(1, read=True)
     assert asked.take(1) == []  # it is still on its way
@@ -61,9 +61,9 @@ def test_read_is_answered_when_all_up_to_it_was_taken(asked: Asked) -> None:
 
 
 def test_unknown_publisher_is_answered_once_all_is_queued(asked: Asked) -> None:
-    """It sent nothing to this reader, which is certain only when nothing is left in the ring.
+    """An unknown publisher has sent nothing to this reader, which is certain only when the ring is empty.
 
-    Its message may be among what was queued at that moment: with `read` all of that has to be taken.
+    Its message may be among those queued at that time: with `read` all of them have to be taken.
     """
     asked.ask(5, publisher="b")
     assert asked.ask(6, publisher="b", read=True) == []
@@ -73,7 +73,7 @@ def test_unknown_publisher_is_answered_once_all_is_queued(asked: Asked) -> None:
 
 
 def test_publishers_are_answered_apart(asked: Asked) -> None:
-    """None waits for another, nor is one on another key taken for it, whatever its name."""
+    """Requests of different publishers, or on different keys, neither delay nor replace each other."""
     asked.put(raw(0), raw(0, publisher="b"), raw(1, publisher="b"))
     asked.ask(1)
     assert asked.ask(1, publisher="b", name="b") == ["b"]
@@ -81,7 +81,7 @@ def test_publishers_are_answered_apart(asked: Asked) -> None:
 
 
 def test_of_too_many_requests_the_oldest_is_forgotten(asked: Asked) -> None:
-    """No peer can make a reader remember more: an honest one asks again."""
+    """The number of open requests is bounded; publishers repeat theirs."""
     asked.put(raw(0))
     for number in range(1, MAX_ACK_REQUESTS + 3):
         asked.ask(number)
@@ -89,7 +89,7 @@ def test_of_too_many_requests_the_oldest_is_forgotten(asked: Asked) -> None:
 
 
 def test_queue_answers_when_the_message_is_put(asked: Asked) -> None:
-    """A publisher that flushes is told at once, however slow the script is."""
+    """A publisher that flushes is acknowledged at once, however slow the script is."""
     asked.put(raw(0))
     assert asked.ask(0) == ["0"]
     assert asked.ask(1) == ["0"]
@@ -98,7 +98,7 @@ def test_queue_answers_when_the_message_is_put(asked: Asked) -> None:
 
 @pytest.mark.parametrize("payload", [None, INVALID], ids=["valid", "invalid"])
 def test_queue_answers_when_the_script_takes_the_message(asked: Asked, payload: Payload | None) -> None:
-    """A lossless publisher goes on with what is read, sample by sample, be it left out as invalid, or in batches."""
+    """A lossless publisher gets credit for each sample that is read, discarded as invalid, or read in a batch."""
     asked.put(raw(0), raw(1, payload=payload))
     asked.ask(1, read=True)
     asked.put(raw(2), raw(3))
@@ -111,7 +111,7 @@ def test_queue_answers_when_the_script_takes_the_message(asked: Asked, payload: 
 
 
 def test_queue_answers_unknown_publishers_while_nothing_is_left_to_receive(asked: Asked) -> None:
-    """While somebody receives, the publisher's message may be in between: then it is answered after that."""
+    """While another thread receives, the message may be on its way: the request is acknowledged after that."""
     assert asked.ask(7, name="while receiving") == []
     assert asked.put(raw(0, publisher="b")) == ["while receiving"]
     asked.drained = True
@@ -119,7 +119,7 @@ def test_queue_answers_unknown_publishers_while_nothing_is_left_to_receive(asked
 
 
 def test_unknown_publisher_is_not_answered_while_its_messages_may_still_come(asked: Asked) -> None:
-    """After a break of the link a publisher that is not known has sent something that heartbeats bring soon."""
+    """After the link was broken, an unknown publisher may have sent messages, which its heartbeats will reveal."""
     asked.drained = True
     asked.queue.on_link()
     asked.ask(1)
@@ -131,7 +131,7 @@ def test_unknown_publisher_is_not_answered_while_its_messages_may_still_come(ask
 
 
 def test_request_waits_for_a_gap(asked: Asked) -> None:
-    """A sample that is held back has not arrived for its reader; one that is given up is not waited for."""
+    """A sample held back behind a gap has not arrived; a sample that is given up is not waited for."""
     asked.put(raw(0), raw(2))
     assert asked.ask(2) == []
     asked.queue.give_up()
@@ -139,7 +139,7 @@ def test_request_waits_for_a_gap(asked: Asked) -> None:
 
 
 def test_dropped_message_keeps_no_publisher_waiting(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A publisher that asks whether its message was read is answered when it was dropped, too."""
+    """A request with `read` is acknowledged if its message was dropped."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 10)
     asked.put(raw(0), raw(1))
     assert asked.ask(1, read=True) == []
@@ -147,7 +147,7 @@ def test_dropped_message_keeps_no_publisher_waiting(asked: Asked, monkeypatch: p
 
 
 def test_end_of_the_queue_answers_all(asked: Asked) -> None:
-    """Nobody reads any more, and no publisher waits for it: not with what it asked, nor with what it asks now."""
+    """A closed queue acknowledges all open and all later requests, so that no publisher waits for it."""
     asked.put(raw(0))
     asked.ask(0, read=True, name="read")
     asked.ask(9, name="arrived")

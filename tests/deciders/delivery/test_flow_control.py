@@ -1,4 +1,4 @@
-"""Flow control of a lossless publisher: its credit, the trickle beyond it, and readers that have gone."""
+"""Flow control of a lossless publisher: its credit, the trickle beyond it, and readers that leave."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ def control(world: World, monkeypatch: pytest.MonkeyPatch) -> FlowControl:
 
 
 def test_limits_fit_into_each_other() -> None:
-    """Messages sent without an acknowledgement are still kept for recovery, and fit into the queue of each reader."""
+    """Unacknowledged messages fit into the history cache for recovery, and into the queue of each reader."""
     assert WINDOW < LIMIT < CACHE < RING_CAPACITY < CAPACITY
     assert LIMIT + WINDOW == CACHE
 
 
 @pytest.mark.parametrize("routers", [["r1"], []])
 def test_without_readers_it_never_waits(world: World, monkeypatch: pytest.MonkeyPatch, routers: list[str]) -> None:
-    """Nobody has to be waited for where nobody answers; a router itself needs no other one for that."""
+    """Without readers there is no wait; a router does not need another router for that."""
     world.routers = routers
     world.publish(world.flow_control(monkeypatch, needs_router=bool(routers)), 10_000)
     assert world.now == pytest.approx(1.0)
 
 
 def test_reader_that_keeps_up_is_not_waited_for(world: World, control: FlowControl) -> None:
-    """It is asked every 250 messages, by the number of the last one, one question at a time."""
+    """A request is sent every 250 messages, with the number of the last message, one at a time."""
     world.readers.append(Reader("fast"))
     world.publish(control, 10_000)
     assert world.now == pytest.approx(1.0)
@@ -55,9 +55,9 @@ def test_reader_that_keeps_up_is_not_waited_for(world: World, control: FlowContr
 
 
 def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, control: FlowControl) -> None:
-    """2,000 messages at once, then 10 a second for others, until no more are kept; then nothing at all.
+    """It sends 2,000 messages at once, then 10 per second until the history cache is full, then nothing.
 
-    It is connected and therefore never given up; it is asked again after 0.5, 1, 2, 4 and 8 s, and then every 10 s.
+    A connected reader is never given up: requests are repeated after 0.5, 1, 2, 4 and 8 s, then every 10 s.
     """
     world.readers.append(Reader("stuck", rate=0.0))
     with pytest.raises(Stuck):
@@ -70,7 +70,7 @@ def test_reader_that_reads_nothing_gets_a_window_and_a_trickle(world: World, con
 
 
 def test_window_is_shared_while_it_is_used() -> None:
-    """Each publisher has its part, and what others do not use; one that has sent nothing for a second uses nothing."""
+    """Publishers share the window and use what others do not; one without messages for a second does not count."""
     shared = SharedWindow()
     assert shared.part("a", 0, now=0.0) == WINDOW
     assert shared.part("a", 1900, now=0.1) == WINDOW
@@ -84,10 +84,10 @@ def test_window_is_shared_while_it_is_used() -> None:
 
 
 @pytest.mark.parametrize(("at", "rate", "pause"), [(0.0, 10_000.0, 0.6), (2.0, 10_000.0, 0.6), (0.0, 1000.0, 0.02)])
-def test_question_that_a_full_queue_dropped_is_asked_again(
+def test_request_dropped_by_a_full_queue_is_repeated(
     world: World, control: FlowControl, at: float, rate: float, pause: float
 ) -> None:
-    """After half a second, not when it is given up: nobody notices more than that, and a slow publisher nothing."""
+    """A dropped request is repeated after half a second."""
     world.readers.append(Reader("fast"))
     world.plan(at, lambda: setattr(world, "dropping", True))
     world.plan(at + 0.2, lambda: setattr(world, "dropping", False))
@@ -97,7 +97,7 @@ def test_question_that_a_full_queue_dropped_is_asked_again(
 
 
 def test_reader_that_goes_on_gets_everything(world: World, control: FlowControl) -> None:
-    """After eight minutes as well, and from then on nothing holds the publisher up."""
+    """A reader that resumes after eight minutes gets everything, and the publisher is no longer delayed."""
     reader = Reader("stuck", rate=0.0)
     world.readers.append(reader)
     world.plan(480.0, lambda: setattr(reader, "rate", 100_000.0))
@@ -110,7 +110,7 @@ def test_reader_that_goes_on_gets_everything(world: World, control: FlowControl)
 def test_slow_reader_sets_the_pace_and_is_never_without_messages(
     world: World, control: FlowControl, rate: float
 ) -> None:
-    """The publisher is a window ahead at most, and a trickle; the reader always has something to read."""
+    """The publisher is ahead by a window and a trickle at most, and the reader always has messages to read."""
     reader = Reader("slow", rate=rate)
     world.readers += [reader, Reader("fast")]
     world.publish(control, 10_000)
@@ -121,7 +121,7 @@ def test_slow_reader_sets_the_pace_and_is_never_without_messages(
 
 
 def test_healthy_reader_is_never_without_a_message_for_long(world: World, control: FlowControl) -> None:
-    """Beside one that reads a message a second it gets ten a second, for as long as publishers keep messages."""
+    """Beside a reader of one message per second it gets ten per second, while the history cache has room."""
     world.readers += [Reader("slow", rate=1.0), Reader("fast")]
     world.publish(control, WINDOW + 1000)
     assert world.now > 90.0
@@ -129,7 +129,7 @@ def test_healthy_reader_is_never_without_a_message_for_long(world: World, contro
 
 
 def test_reader_that_is_closed_is_not_waited_for(world: World, control: FlowControl) -> None:
-    """It answers what is asked at that moment, and the publisher goes on."""
+    """A closing reader acknowledges the open request, and the publisher continues."""
     reader = Reader("stuck", rate=0.0)
     world.readers += [reader, Reader("fast")]
     world.plan(1.0, lambda: setattr(reader, "closed", True))
@@ -138,7 +138,7 @@ def test_reader_that_is_closed_is_not_waited_for(world: World, control: FlowCont
 
 
 def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> float:
-    """Publish, and return how many messages a reader lacked `at` seconds later; it has read nearly all in the end."""
+    """Publish; return the number of messages a reader lacked `at` seconds later. It reads nearly all in the end."""
     lead: list[float] = []
     world.plan(at, lambda: lead.append(world.published - reader.read))
     count = world.published + 20_000
@@ -155,9 +155,9 @@ def lead_over(world: World, control: FlowControl, reader: Reader, at: float) -> 
 def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a table
     world: World, control: FlowControl, rate: float, interrupt: Interrupt, begin: float, end: float
 ) -> None:
-    """Its link was reset, the router restarted, or it was stopped, perhaps before it ever answered.
+    """A reader whose link was reset, whose router restarted, or that was suspended gets all messages.
 
-    Others get ten messages a second meanwhile, and everything soon after.
+    Others get ten messages per second meanwhile, and all messages soon after.
     """
     reader = Reader("back", rate=rate)
     world.readers += [reader, Reader("fast")]
@@ -179,7 +179,7 @@ def test_reader_that_comes_back_in_time_has_missed_nothing(  # noqa: PLR0917 - a
 def test_reader_that_does_not_come_back_is_given_up(
     world: World, control: FlowControl, interrupt: Interrupt, at: float, seconds: float
 ) -> None:
-    """5 s after it or the router is back, or 90 s after its lease ended; others get ten a second until then."""
+    """It is given up after 5 s with a router, or 90 s after its lease expired; others get ten per second until then."""
     reader = Reader("gone", rate=5_000.0)
     world.readers += [reader, Reader("fast")]
     interrupt(world, reader, at, until=math.inf)
@@ -191,7 +191,7 @@ def test_reader_that_does_not_come_back_is_given_up(
 @pytest.mark.parametrize("away", [0.5, 4.0, 7.0, 60.0])
 @pytest.mark.parametrize("answered", [True, False])
 def test_no_time_runs_while_there_is_no_router(world: World, control: FlowControl, away: float, answered: bool) -> None:
-    """A reader that comes back 3 s after the router has missed nothing, whether it has ever answered or not."""
+    """A reader that returns 3 s after the router has missed nothing, whether it ever replied or not."""
     reader = Reader("back")
     world.readers.append(reader)
     world.publish(control, 1000 if answered else 249)
@@ -208,7 +208,7 @@ def test_no_time_runs_while_there_is_no_router(world: World, control: FlowContro
 def test_reader_that_is_stopped_at_any_time_is_waited_for(
     world: World, control: FlowControl, rate: float, published: float, second: int
 ) -> None:
-    """However its lease meets questions that are answered late, or never, or that come more than a second apart."""
+    """The publisher waits, however the lease overlaps with requests, late replies, or none."""
     reader = Reader("stopped", rate=rate)
     world.readers += [reader, Reader("fast")]
     world.stop(reader, second, until=math.inf)
@@ -222,7 +222,7 @@ def test_reader_that_is_stopped_at_any_time_is_waited_for(
 def test_reader_that_is_stopped_as_it_answers_is_known(
     world: World, control: FlowControl, others: list[str], back: float
 ) -> None:
-    """Nobody else is waited for when it is back: the request that it held up had its answer."""
+    """The publisher waits for no unknown reader after it returns: it had replied to the request that it delayed."""
     reader = Reader("back", stops_in_answer=True)
     world.readers += [reader, *map(Reader, others)]
     world.plan(LEASE + back, lambda: setattr(reader, "stopped", None))
@@ -231,7 +231,7 @@ def test_reader_that_is_stopped_as_it_answers_is_known(
 
 
 def test_reader_that_ended_beside_a_stuck_one_is_given_up_after_5_seconds(world: World, control: FlowControl) -> None:
-    """It had answered the request that is still open: the stuck one may have been stopped, not this one."""
+    """It had replied to the open request, so the unknown suspended reader is another one."""
     stuck, ended = Reader("stuck", rate=0.0), Reader("ended")
     world.readers += [stuck, ended]
     world.plan(10.0, lambda: setattr(ended, "closed", True))
@@ -250,7 +250,7 @@ def test_closed_session_ends_the_wait(world: World, control: FlowControl) -> Non
 
 
 def test_flush_waits_until_readers_have_what_was_published(world: World, control: FlowControl) -> None:
-    """To have is enough: they need not have read it."""
+    """A flush waits until readers have received all messages, not until they have read them."""
     world.readers.append(Reader("slow", rate=0.0))
     assert control.wait(100, timeout=5.0)
     assert world.asked == [{"publisher": "p:1", "number": "99", "read": "0"}]
@@ -258,7 +258,7 @@ def test_flush_waits_until_readers_have_what_was_published(world: World, control
 
 
 def test_flush_gives_up_in_time(world: World, control: FlowControl) -> None:
-    """False where a reader that is connected does not answer, and True once it does."""
+    """It returns False if a connected reader does not reply, and True once it does."""
     reader = Reader("stopped", stopped=0.0)
     world.readers.append(reader)
     assert not control.wait(100, timeout=2.0)
@@ -267,8 +267,8 @@ def test_flush_gives_up_in_time(world: World, control: FlowControl) -> None:
     assert control.wait(100, timeout=15.0)
 
 
-def test_flush_asks_anew_each_time(world: World, control: FlowControl) -> None:
-    """A reader may have come since the last question; without a message there is nothing to wait for."""
+def test_each_flush_sends_a_new_request(world: World, control: FlowControl) -> None:
+    """Each flush sends a new request, as there may be new readers; without messages it returns at once."""
     assert control.wait(0, timeout=5.0)
     assert world.asked == []
     world.publish(control, 250)
@@ -280,7 +280,7 @@ def test_flush_asks_anew_each_time(world: World, control: FlowControl) -> None:
 
 
 def test_flush_waits_for_a_reader_that_may_come_back(world: World, control: FlowControl) -> None:
-    """For as long as one that publishes would, and not for one that answered that it is closed."""
+    """A flush waits as long as publishing would, but not for a reader that replied that it is closed."""
     ended, away = Reader("ended", stopped=0.0), Reader("away")
     world.readers += [ended, away]
     world.plan(0.1, lambda: setattr(ended, "closed", True))
@@ -293,6 +293,6 @@ def test_flush_waits_for_a_reader_that_may_come_back(world: World, control: Flow
 
 
 def test_number_of_the_last_message_wraps(world: World, control: FlowControl) -> None:
-    """After 2^32 messages the readers' count begins again, and so does the publisher's."""
+    """Message numbers wrap after 2^32, both at the reader and at the publisher."""
     assert control.wait(2**32 + 1, timeout=1.0)
     assert world.asked[-1]["number"] == "0"

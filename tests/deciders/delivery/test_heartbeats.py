@@ -1,4 +1,4 @@
-"""When heartbeats are sent: by the counts of the writers, at times that the test gives."""
+"""The schedule of heartbeats, from the counts of the writers, with a fake clock."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from nedbus.transport import Session
 
 @dataclass(eq=False)
 class FakeWriter:
-    """The part of a writer that heartbeats need."""
+    """The attributes of a writer that heartbeats use."""
 
     published: int = 0
     key: str = "key"
@@ -25,7 +25,7 @@ class FakeWriter:
 
 @dataclass(eq=False)
 class Stream:
-    """A session of one writer, and its clock: `sent` has the time and the payload of each heartbeat."""
+    """A session with one writer and a clock; `sent` has the time and payload of each heartbeat."""
 
     now: float = 100.0
     looks: int = 0
@@ -44,7 +44,7 @@ class Stream:
         return SimpleNamespace(put=lambda payload: self.sent.append((self.now, payload)))
 
     def wait(self, seconds: float) -> list[float]:
-        """Let time go by; return how long after its begin heartbeats were sent."""
+        """Advance the clock; return the times of heartbeats since then."""
         begin, before = self.now, len(self.sent)
         while self.next_look <= begin + seconds:
             self.now = max(self.now, self.next_look)
@@ -56,7 +56,7 @@ class Stream:
 
 @pytest.mark.parametrize("rate", [5, 7, 50, 400])
 def test_stream_that_goes_on_sends_none(rate: int) -> None:
-    """At 5 Hz or more the next message shows what was lost; nor does a stream that has never published."""
+    """A stream of 5 Hz or more needs no heartbeats, as its next message reveals losses; nor does an unused stream."""
     stream = Stream()
     assert stream.wait(10.0) == []
     for _ in range(20 * rate):
@@ -65,9 +65,9 @@ def test_stream_that_goes_on_sends_none(rate: int) -> None:
 
 
 def test_silent_stream_sends_ever_more_rarely() -> None:
-    """0.4 s after the last message, 0.5, 1, 2 and 4 s later, then each 4 s; an hour has 900, and few looks."""
+    """Heartbeats follow after 0.4 s, then after 0.5, 1 and 2 s, then each 4 s: 900 per hour, with few polls."""
     stream = Stream()
-    for _ in range(2):  # a message begins anew
+    for _ in range(2):  # a message restarts the schedule
         stream.writer.published += 1
         first, *others = stream.wait(60.0)
         assert 0.4 <= first <= 0.4 + 0.5  # the look that finds the message comes within 0.5 s
@@ -84,7 +84,7 @@ def test_silent_stream_sends_ever_more_rarely() -> None:
 
 
 def test_heartbeat_has_the_number_of_the_last_message() -> None:
-    """Zenoh counts from 0, and begins again after 2^32."""
+    """Zenoh's numbers start at 0, and wrap after 2^32."""
     stream = Stream()
     for published, payload in ((1, b"\0\0\0\0"), (0x0A0B0C0E, b"\x0d\x0c\x0b\x0a"), (2**32, b"\xff" * 4)):
         stream.writer.published = published
@@ -98,7 +98,7 @@ def test_heartbeat_has_the_number_of_the_last_message() -> None:
 
 
 def test_many_heartbeats_are_sent_in_turns() -> None:
-    """Publishers that fall silent at once do not hold up the other jobs of a session."""
+    """Publishers that fall silent at the same time do not delay the other jobs of a session."""
     stream = Stream()
     writers = [FakeWriter(published=1) for _ in range(1000)]
     for writer in writers:

@@ -1,4 +1,4 @@
-"""The filter of late samples, at times that the test gives, by clocks that agree in nothing."""
+"""The filter of late samples, with fake clocks that have nothing in common."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NOW = 1_790_000_000 * SECOND  # what a vehicle's clock shows
 
 
 def sample(sent: int | None, *, by: int = 7, address: Address = ONE) -> nedbus.Sample:
-    """Return a sample that a publisher stamped with this time, in ns."""
+    """Return a sample with this timestamp of its publisher [ns]."""
     stamp = None
     if sent is not None:
         moment = dt.datetime.fromtimestamp(sent // SECOND, dt.UTC)
@@ -28,32 +28,32 @@ def sample(sent: int | None, *, by: int = 7, address: Address = ONE) -> nedbus.S
 
 
 def admitted(late: LateFilter, *times: tuple[float, float]) -> list[bool]:
-    """Return what is admitted of samples with these times, sent and arrived, in seconds."""
+    """Return the admitted samples, each given by the times at which it was sent and received [s]."""
     return [late.admits(sample(NOW + round(sent * SECOND)), arrived=round(arrived * SECOND)) for sent, arrived in times]
 
 
 @pytest.mark.parametrize("ahead", [-86_400 * 365 * 20, -1.5, 0.0, 1.5, 86_400])
 def test_difference_of_two_clocks_does_not_matter(ahead: float) -> None:
-    """A vehicle whose clock is wrong by seconds or by years is as current as any."""
+    """Samples of a vehicle are current even if its clock is wrong by seconds or years."""
     late = LateFilter()
     assert all(admitted(late, *((ahead + each / 100, each / 100) for each in range(500))))
     assert late.report() is None
 
 
 def test_recovered_samples_are_held_back_and_counted() -> None:
-    """After 10 s without a link those of the outage come in a burst: of these only the last second is current."""
+    """After 10 s without a link a burst of recovered samples arrives; only those of the last second are current."""
     late = LateFilter()
     assert all(admitted(late, *((each / 100, each / 100) for each in range(200))))
     burst = admitted(late, *((2 + each / 100, 12 + each / 2000) for each in range(1000)))
     assert burst == sorted(burst), "once current, always current"
     assert 900 <= burst.count(False) <= 960
     assert all(admitted(late, *((13 + each / 100, 13 + each / 100) for each in range(200))))
-    assert late.report() == f"{ONE}: messages from before that were held back: {burst.count(False)}, up to 10.0 s late"
+    assert late.report() == f"{ONE}: {burst.count(False)} old messages held back, up to 10.0 s late"
     assert late.report() is None
 
 
 def test_slow_recovery_is_held_back_as_well() -> None:
-    """A thin link catches up slowly: still nothing old passes."""
+    """A slow link catches up slowly; old samples are still held back."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     slow = admitted(late, *((0.01 + each / 100, 10 + each / 150) for each in range(3_000)))
@@ -62,14 +62,14 @@ def test_slow_recovery_is_held_back_as_well() -> None:
 
 
 def test_last_value_from_before_is_held_back() -> None:
-    """A vehicle that is silent has a last message, of which nobody knows how old it is; its next one is current."""
+    """The age of the last message of a silent vehicle is unknown; its next message is current."""
     late = LateFilter([sample(NOW)])
     assert admitted(late, (0.0, 50.0), (3600.0, 3650.0)) == [False, True]
-    assert late.report() == f"{ONE}: messages from before that were held back: 1"
+    assert late.report() == f"{ONE}: 1 old message held back"
 
 
 def test_clock_that_is_set_back_by_another_implementation() -> None:
-    """Late for two minutes is no longer late: that is a clock."""
+    """A lateness that lasts two minutes is a clock difference."""
     late = LateFilter()
     admitted(late, *((each / 10, each / 10) for each in range(20)))
     steps = admitted(late, *((each / 10 - 3600, each / 10) for each in range(20, 2_000)))
@@ -78,7 +78,7 @@ def test_clock_that_is_set_back_by_another_implementation() -> None:
 
 
 def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:
-    """Zenoh never goes back: for an hour its timestamps stand, then they go on; all of it is current."""
+    """Zenoh's timestamps never go back: they stand still for an hour and then continue; all samples are current."""
     late = LateFilter()
     admitted(late, *((each / 100, each / 100) for each in range(200)))
     assert all(admitted(late, *((1.99, each / 100) for each in range(200, 2_000))))
@@ -87,7 +87,7 @@ def test_clock_that_is_set_back_stands_in_zenohs_timestamps() -> None:
 
 
 def test_clocks_that_drift_apart() -> None:
-    """The fastest sample counts for two minutes at most: 100 us in a second, a second in three hours, are not late."""
+    """The fastest sample counts for two minutes, so a drift of 100 us per second does not make samples late."""
     late = LateFilter()
     assert admitted(late, (0.0, 0.0), (60.1, 61.0), (61.0, 62.5)) == [True, True, False]
     late = LateFilter()
@@ -96,7 +96,7 @@ def test_clocks_that_drift_apart() -> None:
 
 
 def test_new_publisher_has_a_clock_of_its_own() -> None:
-    """A vehicle that restarted with the clock of 1970 is current at once; what is withdrawn leaves nothing behind."""
+    """A vehicle that restarts with a clock of 1970 is current at once; withdrawn publishers are forgotten."""
     late = LateFilter()
     admitted(late, (0.0, 0.0))
     assert late.admits(sample(SECOND, by=8), arrived=SECOND)
@@ -105,15 +105,15 @@ def test_new_publisher_has_a_clock_of_its_own() -> None:
 
 
 def test_sample_without_a_timestamp_is_current() -> None:
-    """Nothing tells its age."""
+    """Its age is unknown."""
     late = LateFilter()
     assert late.admits(sample(None), arrived=0)
     assert late.admits(sample(None), arrived=3600 * SECOND)
 
 
 def test_others_are_named_in_short() -> None:
-    """One line, however many vehicles there are."""
+    """There is one log line for any number of vehicles."""
     late = LateFilter([sample(NOW, address=Address(name, ONE.topic)) for name in "abc"])
     for name in "abc":
         assert not late.admits(sample(NOW, address=Address(name, ONE.topic)), arrived=0)
-    assert late.report() == "a/vehicle_local_position and 2 others: messages from before that were held back: 3"
+    assert late.report() == "a/vehicle_local_position and 2 others: 3 old messages held back"

@@ -1,4 +1,4 @@
-"""A reader with a maximum rate: which messages pass, and that what is left out is neither lost nor dropped."""
+"""A reader with a maximum rate: the messages that pass; the others count as neither lost nor dropped."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def make_queue(mode: Mode = "every", *, max_rate: float = 5) -> MaxRateQueue:
 
 
 class Clock:
-    """A reader's monotonic clock."""
+    """A fake monotonic clock."""
 
     now = 0
 
@@ -37,7 +37,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Let readers downsample by a clock of the test's."""
+    """Use a fake clock for downsampling."""
     clock = Clock()
     monkeypatch.setattr("nedbus.client.receiving.max_rate.time", clock)
     return clock
@@ -46,14 +46,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def at(
     sent: float, number: int | None, *, key: str = DOWNSAMPLED, timestamp: int | None = None, publisher: str = "a"
 ) -> RawSample:
-    """Return a sample that was sent at this second; its message's timestamp is that, in milliseconds."""
+    """Return a sample sent at this second; its message's timestamp is the same in milliseconds."""
     stamp = SimpleNamespace(get_time_as_ntp64=lambda: SimpleNamespace(as_nanos=lambda: round(sent * 1e9)))
     timestamp = round(sent * 1000) if timestamp is None else timestamp
     return raw(number, timestamp=timestamp, key=key, publisher=publisher, stamp=stamp)
 
 
 def test_downsampled_stream_passes() -> None:
-    """A stream that its publisher downsamples is not downsampled again, whatever the jitter of its timestamps."""
+    """A stream that its publisher downsamples is not downsampled again, whatever its timestamp jitter."""
     queue = make_queue()
     queue.put([at(sent, number) for number, sent in enumerate([1.0, 1.19, 1.41, 1.6, 1.79])])
     assert timestamps(queue) == [1000, 1190, 1410, 1600, 1790]
@@ -62,7 +62,7 @@ def test_downsampled_stream_passes() -> None:
 
 
 def test_gap_of_a_downsampled_stream_is_lost() -> None:
-    """Its sequence numbers are its own: what is absent of them is counted to the message behind it."""
+    """A downsampled stream has its own sequence numbers; gaps count as lost before the next message."""
     queue = make_queue()
     put(queue, [at(1.0, 0), at(1.2, 1), at(1.8, 4)])
     put(queue, [at(2.6, 8)])
@@ -72,7 +72,7 @@ def test_gap_of_a_downsampled_stream_is_lost() -> None:
 
 @pytest.mark.parametrize("mode", ["latest", "every"])
 def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
-    """Below the least step each second message is left out; a gap before it is reported with the next one."""
+    """Below the lowest rate every second message is left out; a gap before it is reported with the next one."""
     queue = make_queue(mode, max_rate=0.5)
     assert queue.rate == 1
     taken = []
@@ -90,7 +90,7 @@ def test_rest_is_left_out_here(mode: Mode, clock: Clock) -> None:
 
 
 def test_last_message_comes_once() -> None:
-    """It is the first if nothing else is; what it has overtaken, itself included, is left out then."""
+    """The last message passes first if nothing else arrives; once overtaken, it and older ones are left out."""
     queue = make_queue()
     queue.put_last([at(10.0, None, key=KEY)])
     queue.put([at(9.8, 7), at(10.0, 8), at(10.2, 9)])
@@ -100,7 +100,7 @@ def test_last_message_comes_once() -> None:
 
 
 def test_restart_with_an_earlier_clock_passes() -> None:
-    """A vehicle that restarts before its clock is set is heard at once."""
+    """A vehicle that restarts before its clock is set passes at once."""
     queue = make_queue()
     queue.put_last([at(1000.0, None, key=KEY)])
     queue.put([at(5.0, 0), at(5.2, 1)])
@@ -108,18 +108,18 @@ def test_restart_with_an_earlier_clock_passes() -> None:
 
 
 def passed(rate: float, times: list[float]) -> list[float]:
-    """Return which of these times pass, in seconds."""
+    """Return the times that pass [s]."""
     gate = RateGate(rate)
     return [now for now in times if gate.passes(round(1e9 * now))]
 
 
 def steady(rate: float, seconds: float) -> list[float]:
-    """Return the times of a steady stream."""
+    """Return the times of a steady stream [s]."""
     return [number / rate for number in range(round(rate * seconds))]
 
 
 def test_steady_stream_passes_evenly() -> None:
-    """Of 100 Hz to 5 Hz each 20th message passes, whatever its jitter, and without a drift in ten minutes."""
+    """From 100 Hz to 5 Hz every 20th message passes, at any jitter and without drift over ten minutes."""
     times = [number / 100 + 0.002 * math.sin(number) for number in range(60_000)]
     taken = passed(5, times)
     assert len(taken) == 3_000
@@ -129,28 +129,28 @@ def test_steady_stream_passes_evenly() -> None:
 @pytest.mark.parametrize("rate", [0.3, 1, 3, 7, 30, 33, 70, 99, 100])
 @pytest.mark.parametrize("source", [100.0, 103.7, 250.0])
 def test_mean_is_the_rate(rate: float, source: float) -> None:
-    """Where rates divide badly the mean is the one that was asked for, and not the next lower divisor."""
+    """If the rates do not divide evenly, the mean is the requested rate, not the next lower divisor."""
     seconds = 10_000 / source
     assert len(passed(rate, steady(source, seconds))) == pytest.approx(seconds * rate, abs=2)
 
 
 @pytest.mark.parametrize("rate", [2, 5, 10])
 def test_slower_stream_passes_whole(rate: float) -> None:
-    """A stream that is not faster than the rate loses nothing."""
+    """A stream slower than the rate passes completely."""
     times = steady(2, 100.0)
     assert passed(rate, times) == times
 
 
 @given(st.lists(st.floats(-0.09, 0.09), min_size=50, max_size=50))
 def test_jitter_costs_one_message(jitter: list[float]) -> None:
-    """Of a stream at the very rate that jitters by half a period at most one message is left out."""
+    """A stream at exactly the rate, with a jitter of half a period, loses at most one message."""
     times = [number / 5 + late for number, late in enumerate(jitter)]
     assert len(passed(5, times)) >= len(times) - 1
 
 
 @given(st.floats(0.1, 200.0), st.lists(st.floats(0.0, 3.0), min_size=1, max_size=200))
 def test_never_more_than_the_rate_and_two(rate: float, steps: list[float]) -> None:
-    """Whatever comes, in T seconds at most rate x (T + 2.5 ms) + 2 messages pass."""
+    """In T seconds at most rate x (T + 2.5 ms) + 2 messages pass, at any arrival times."""
     taken = passed(rate, list(accumulate(steps, initial=1000.0)))
     for first, last in combinations_with_replacement(range(len(taken)), 2):
         assert last - first + 1 <= rate * (taken[last] - taken[first] + 0.0025) * (1 + 1e-6) + 2
@@ -164,7 +164,7 @@ def test_clock_that_was_set_back_goes_on() -> None:
 
 
 def test_step_is_the_greatest_that_is_not_above() -> None:
-    """A wish is served by a step of the ladder; below the least of them by that one."""
+    """The publisher's rate is the highest one up to the requested rate, or the lowest of all."""
     assert [rate_step(rate) for rate in RATES] == list(RATES)
     wishes = {0.1: 1, 1.9: 1, 4.99: 2, 7: 5, 30: 20, 99: 50, 1e6: 100}
     assert {wish: rate_step(wish) for wish in wishes} == wishes
@@ -172,7 +172,7 @@ def test_step_is_the_greatest_that_is_not_above() -> None:
 
 @pytest.mark.parametrize("value", [0, -1, -0.0, math.nan, math.inf, "5", True, None])
 def test_invalid_rate_is_refused(value: object) -> None:
-    """A rate that is no finite number above 0 is a ConfigError, and a ValueError, that names the option."""
+    """A rate that is not a finite number above 0 is a ConfigError, and a ValueError, that names the option."""
     with pytest.raises(ConfigError, match="max_rate") as error:
         check_max_rate(value)
     assert isinstance(error.value, ValueError)

@@ -1,4 +1,4 @@
-"""The queue of samples that wait to be read: order and counts; with samples made by hand."""
+"""The queue of samples to be read: order and counts, with hand-made samples."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ STAMP = zenoh.Timestamp.parse_rfc3339("2026-11-21T00:00:00.000000000Z/33")
         ("latest", [raw(3), raw(4)], [2], Counts(received=1, lost=2, dropped=2)),
     ],
 )
-def test_loss_is_told_by_the_next_sample_that_is_read(
+def test_loss_is_reported_by_the_next_sample_that_is_read(
     mode: Mode, arriving: list[RawSample], told: list[int], counts: Counts
 ) -> None:
-    """Behind a gap; an invalid sample takes no loss with it, nor one that is superseded."""
+    """A loss is reported by the next valid sample behind the gap, also if another one is invalid or superseded."""
     pending_queue = make_queue(mode)
     put(pending_queue, [raw(0)])
     put(pending_queue, arriving)
@@ -50,8 +50,8 @@ def test_loss_is_told_by_the_next_sample_that_is_read(
     assert pending_queue.counts == counts
 
 
-def test_gap_within_a_settled_stream_is_told_by_the_sample_behind_it() -> None:
-    """Many samples of one stream are looked at together only while none is absent."""
+def test_gap_within_a_settled_stream_is_reported_by_the_sample_behind_it() -> None:
+    """Samples of one stream are admitted as a block only if none of them is missing."""
     pending_queue = make_queue("every")
     for start in range(0, 2000, 50):
         put(pending_queue, [raw(number) for number in range(start, start + 50)])
@@ -64,7 +64,7 @@ def test_gap_within_a_settled_stream_is_told_by_the_sample_behind_it() -> None:
 
 
 def test_latest_gives_the_newest_of_each_key(caplog: pytest.LogCaptureFixture) -> None:
-    """A newer sample of a key takes the place of the one that waits, which is counted as dropped, and is no warning."""
+    """A newer sample of a key replaces the queued one, which counts as dropped, without a warning."""
     pending_queue = make_queue("latest")
     put(pending_queue, [raw(0, key=OTHER_KEY, publisher="b"), *(raw(each, timestamp=each) for each in range(1, 1001))])
     assert pending_queue.counts == Counts(dropped=999)
@@ -74,9 +74,9 @@ def test_latest_gives_the_newest_of_each_key(caplog: pytest.LogCaptureFixture) -
 
 
 def test_invalid_samples_are_counted_and_logged_once_for_each_key(caplog: pytest.LogCaptureFixture) -> None:
-    """Whatever arrives, the good samples come through, and a flood of junk writes one line.
+    """Valid samples arrive among any invalid ones, and a flood of invalid ones logs one line.
 
-    What has not the size of our payloads is decoded before it may take the place of a valid sample.
+    A payload of another size than ours is decoded before it may replace a valid sample.
     """
     latest = make_queue("latest")
     put(latest, [raw(0, timestamp=5), junk(b"junk")])
@@ -91,7 +91,7 @@ def test_invalid_samples_are_counted_and_logged_once_for_each_key(caplog: pytest
 
 
 def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The state of 10,000 keys is kept, here of 10; messages on others come all the same."""
+    """The state of 10,000 keys is kept, here of 10; messages on other keys arrive all the same."""
     monkeypatch.setattr("nedbus.client.receiving.decoder.MAX_KEYS", 10)
     pending_queue = make_queue("every")
     tracemalloc.start()
@@ -104,7 +104,7 @@ def test_keys_that_a_peer_invents_fill_no_memory(monkeypatch: pytest.MonkeyPatch
 
 
 def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
-    """Ask for what is not known of these, and wait for the answer."""
+    """Look up the unknown layouts of these samples, and wait for the replies."""
     for payload in payloads:
         with suppress(nedbus.DecodeError):
             lookup.check(codec_of(DEFAULT), payload)
@@ -112,7 +112,7 @@ def learn(lookup: LayoutLookup, payloads: Sequence[bytes]) -> None:
 
 
 def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
-    """One question for all, not for every message, and not only once: their publishers may come later."""
+    """One lookup serves all messages, and is repeated at growing intervals, as publishers may start later."""
     now, asked, payloads = 0.0, list[float](), [msgpack.packb([layout, 1, 2]) for layout in range(9, 40)]
 
     def find(_: Collection[str]) -> Schemas:
@@ -127,7 +127,7 @@ def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
 
 
 def test_only_layouts_that_are_needed_are_remembered() -> None:
-    """An answer may explain thousands: what nobody sends does not keep a layout out that somebody does."""
+    """A reply may describe thousands of layouts: those not in use do not displace one that is."""
     known = {"VehicleLocalPosition": {number: {"timestamp": "uint64", "x": "float32"} for number in range(9, 2000)}}
     lookup = LayoutLookup(lambda _: known)
     for layout in range(1500, 1520):
@@ -136,7 +136,7 @@ def test_only_layouts_that_are_needed_are_remembered() -> None:
 
 
 def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
-    """A layout with a name of 100,000 characters is one short line."""
+    """A layout with a name of 100,000 characters is logged as one short line."""
     known = {"VehicleLocalPosition": {1500: {"timestamp": "uint64", 100_000 * "x": "float32"}}}
     learn(LayoutLookup(lambda _: known), [msgpack.packb([1500, 1, 2])])
     [line] = caplog.messages
@@ -145,7 +145,7 @@ def test_names_that_a_publisher_made_up_are_cut_in_the_log(caplog: pytest.LogCap
 
 
 def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
-    """A peer that never answers holds up nobody; the lookup is closed all the same."""
+    """The receiving thread does not wait for a peer that never replies, and neither does closing the lookup."""
     answering = threading.Event()
 
     def find(_: Collection[str]) -> Schemas:
@@ -162,9 +162,9 @@ def test_answer_is_not_waited_for_by_the_thread_that_receives() -> None:
 
 
 def test_what_arrives_while_a_question_is_open_is_asked_for_next() -> None:
-    """Whoever waits gets the answers to both: the second message is not rejected for having come a moment later.
+    """A reader waits for the replies to both lookups: the second message is not rejected for arriving a moment later.
 
-    What the first answer explains is not asked for again, though more of it came meanwhile.
+    Layouts described by the first reply are not looked up again, although more of their messages arrived.
     """
     known: Schemas = {name: {1: {"timestamp": "uint64", "x": "float32"}} for name in ("First", "Second")}
     answering, asked = threading.Event(), list[set[str]]()
@@ -185,7 +185,7 @@ def test_what_arrives_while_a_question_is_open_is_asked_for_next() -> None:
 
 
 def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout() -> None:
-    """Whoever received in another thread lets the reader look again, whether there is something or not."""
+    """A wait ends when another thread has received, with or without a sample for this reader."""
     pending_queue = make_queue("every")
     assert not pending_queue.wait(0.0)
     put(pending_queue, [raw(0)])
@@ -207,14 +207,14 @@ def test_wait_ends_with_data_when_it_is_woken_with_the_queue_or_with_its_timeout
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> PendingQueue:
-    """Return a queue of mode `every` for 10 samples, of which 4 are kept as they are."""
+    """Return a queue of mode `every` for 10 samples, 4 of which are kept without a copy."""
     monkeypatch.setattr(module, "CAPACITY", 10)
     monkeypatch.setattr(module, "_MAX_FRESH", 4)
     return make_queue("every")
 
 
 def test_oldest_are_dropped_counted_and_warned_of_once(small: PendingQueue, caplog: pytest.LogCaptureFixture) -> None:
-    """The reader goes on with what is newer, knows how many it missed, not as lost, and the log says so once."""
+    """The reader continues with newer samples; dropped ones are counted, not as lost, and logged once."""
     assert CAPACITY == 65_536
     for start in range(0, 40, 10):
         assert (small.counts, len(caplog.messages)) == (Counts(dropped=max(0, start - 10)), start > 10)
@@ -225,8 +225,8 @@ def test_oldest_are_dropped_counted_and_warned_of_once(small: PendingQueue, capl
     assert caplog.messages == ["queue: the reader is slower than the data: messages are dropped"]
 
 
-def test_losses_before_dropped_samples_are_told_by_a_later_one_of_that_key(small: PendingQueue) -> None:
-    """Nothing lost in transit goes untold because the sample behind the gap was dropped."""
+def test_losses_before_dropped_samples_are_reported_by_a_later_one_of_the_key(small: PendingQueue) -> None:
+    """A loss in transit is reported even if the sample behind the gap was dropped."""
     put(small, [raw(0), raw(3), raw(0, key=OTHER_KEY, publisher="b"), raw(2, key=OTHER_KEY, publisher="b"), raw(5)])
     put(small, [raw(number) for number in range(6, 15)])
     put(small, [raw(3, key=OTHER_KEY, publisher="b")])
@@ -237,7 +237,7 @@ def test_losses_before_dropped_samples_are_told_by_a_later_one_of_that_key(small
 
 
 def test_losses_before_a_dropped_sample_survive_invalid_ones(small: PendingQueue) -> None:
-    """They wait for the next sample of that key that a reader gets."""
+    """Losses are reported by the next valid sample of the key."""
     put(small, [raw(0), raw(3)])
     put(small, [raw(number, payload=INVALID) for number in range(4, 13)])
     put(small, [raw(13)])
@@ -247,9 +247,9 @@ def test_losses_before_a_dropped_sample_survive_invalid_ones(small: PendingQueue
 
 @pytest.mark.parametrize("in_batches", [False, True])
 def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: bool) -> None:
-    """Zenoh's sample holds the buffer in which it was received: what waits behind others is kept without it.
+    """A Zenoh sample keeps its receive buffer alive, so a sample deep in the queue is kept without it.
 
-    It keeps its place in the sequence, stamp and provenance.
+    It keeps its sequence number, timestamp and provenance.
     """
     encodings = [encoding_of(f"source{number}", frozenset({"timestamp"})) for number in range(9)]
     arriving = [raw(number, stamp=STAMP if number % 2 else None, encoding=encodings[number]) for number in range(9)]
@@ -270,9 +270,9 @@ def test_samples_that_wait_are_kept_compact(small: PendingQueue, in_batches: boo
 
 
 def test_ring_that_was_full_dropped_what_is_absent(caplog: pytest.LogCaptureFixture) -> None:
-    """Samples that Zenoh's ring pushed out, unread, were dropped here, and not lost in transit; the log says so once.
+    """Samples pushed out of Zenoh's ring count as dropped, not as lost in transit; this is logged once.
 
-    Only what comes out of a full ring is in doubt: a gap after that is a loss again.
+    Only samples taken from a full ring are affected: later gaps are losses again.
     """
     pending_queue = make_queue("every")
     put(pending_queue, [raw(0), raw(1)])
@@ -297,12 +297,12 @@ ATTITUDE = Payload(encode(VehicleAttitude(timestamp=7, q=(1.0, 0.0, 0.0, 0.0))))
 
 
 def undescribed(payload: bytes = VALID) -> RawSample:
-    """Return a sample of a message that has no file here, and that no publisher describes."""
+    """Return a sample of an undeclared message that no publisher describes."""
     return raw(None, key="nedbus/1/foo_bar", payload=Payload(payload), encoding="application/msgpack;px4_msgs/FooBar")
 
 
 def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Receiving and acknowledging learn of a key at the same moment: both know the same publishers."""
+    """A stream found by two threads at once, receiving and acknowledging, is tracked as one."""
     decoder, met = Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"), list[object]()
 
     def meet_meanwhile(*arguments: Any) -> Any:
@@ -316,7 +316,7 @@ def test_stream_that_two_threads_meet_is_one(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_what_a_batch_left_is_read_next() -> None:
-    """A batch has messages of one kind: the others still wait, for a batch, for a sample, and for acknowledgements."""
+    """A batch has messages of one type; the others stay queued for samples, batches and acknowledgements."""
     for take in (timestamps, lambda pending_queue: take_batch(pending_queue).messages["timestamp"].tolist()):
         pending_queue = make_queue("every")
         put(pending_queue, [raw(0), raw(None, key="nedbus/1/vehicle_attitude", payload=ATTITUDE)])
@@ -327,7 +327,7 @@ def test_what_a_batch_left_is_read_next() -> None:
 
 
 def test_batch_goes_past_what_is_invalid() -> None:
-    """A payload without a description is no reason to wait, and no message of another kind, whatever its bytes."""
+    """A payload without a description neither delays a batch nor begins one of another type, whatever its bytes."""
     for payload in (VALID, VALID[:-1]):
         pending_queue = make_queue("every")
         put(pending_queue, [undescribed(payload), raw(0)])
@@ -337,7 +337,7 @@ def test_batch_goes_past_what_is_invalid() -> None:
 
 
 def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever reads asks what a message is, and waits; what arrives meanwhile is queued at once."""
+    """While a batch waits for the description of a message, arriving samples are queued at once."""
     monkeypatch.setattr(layout_lookup, "_JOIN_TIMEOUT", DEADLINE)
     asked, answered = threading.Event(), threading.Event()
 
@@ -358,8 +358,8 @@ def test_arrivals_do_not_wait_for_a_batch_that_asks(monkeypatch: pytest.MonkeyPa
     reader.join(DEADLINE)
 
 
-def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
-    """In mode latest a batch has one message of each key, and all that was lost before it."""
+def test_batch_of_newest_reports_losses_before_superseded_samples() -> None:
+    """In mode latest a batch has one message per key, and reports all losses before it."""
     pending_queue = make_queue("latest")
     put(pending_queue, [raw(0), raw(3), raw(4)])
     batch = take_batch(pending_queue)
@@ -368,7 +368,7 @@ def test_batch_of_newest_tells_losses_before_what_was_superseded() -> None:
 
 
 def test_losses_come_with_the_batch_in_which_the_gap_is() -> None:
-    """A batch that is full leaves the rest, with its losses, to the next."""
+    """A full batch leaves the other messages, with their losses, to the next batch."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(number) for number in range(5000) if number not in {4500, 4501}])
     first, second = take_batch(pending_queue), take_batch(pending_queue)
@@ -376,8 +376,8 @@ def test_losses_come_with_the_batch_in_which_the_gap_is() -> None:
     assert (first.lost, second.lost) == (0, 2)
 
 
-def test_reader_that_changes_its_form_is_told_each_loss_once() -> None:
-    """Samples and batches of one subscription share what was lost."""
+def test_samples_and_batches_report_each_loss_once() -> None:
+    """Samples and batches of one subscription report each loss once."""
     pending_queue = make_queue("every")
     put(pending_queue, [raw(0), raw(5)])
     assert sum(sample.lost for sample in drain(pending_queue)) == 4

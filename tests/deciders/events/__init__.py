@@ -1,1 +1,1 @@
-"""Events of a flight, by the clock of the test."""
+"""Events of a flight, with a fake clock."""

@@ -1,4 +1,4 @@
-"""A vehicle that sends hand-made messages, and the account of what happens to it."""
+"""A vehicle with hand-made messages, and its account."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DISARMED, ARMED = 1, 2
 
 
 class Flight:
-    """A vehicle and its account; each message comes when the vehicle sends it, in seconds after its boot."""
+    """A vehicle and its account; messages arrive when they are sent, in seconds since boot."""
 
     def __init__(self) -> None:
         self.account = Account()
@@ -34,7 +34,7 @@ class Flight:
         self, topic: str = VLP, *, vehicle: str = "1", instance: int | None = None, missing: Iterable[str] = (),
         lost: int = 0, **fields: Any,
     ) -> list[Event]:  # fmt: skip
-        """Send a message, valid unless told otherwise, and return what is told."""
+        """Send a message with valid flags unless given otherwise; return the new events."""
         stamp = round((self.now - self.booted) * 1e6)
         values: object = {"timestamp": stamp, **fields}
         if topic == VLP:
@@ -45,7 +45,7 @@ class Flight:
         return self.take()
 
     def fly(self, seconds: float, rate: float = 10.0) -> list[Event]:
-        """Send positions for a while, and return what is told."""
+        """Send positions for a while; return the new events."""
         told = []
         for _ in range(round(seconds * rate)):
             self.wait(1 / rate)
@@ -62,8 +62,8 @@ class Flight:
         return self.send("battery_status", warning=warning, remaining=0.2, connected=True)
 
     def look(self, state: str | None = "ok", *, dropped: int = 0) -> list[Event]:
-        """Look at the vehicle's position, in this state by its stream, or None if that is not known."""
-        self.account.look(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
+        """Update the account with this state of the position stream, None if unknown; return the new events."""
+        self.account.update(self.now, None if state is None else {POSITION: state}, link=self.link, dropped=dropped)
         return self.take()
 
     def reject(self, reason: str = "x is NaN") -> list[Event]:
@@ -71,7 +71,7 @@ class Flight:
         return self.take()
 
     def take(self) -> list[Event]:
-        new, self._seen = self.account.take(self._seen)
+        new, self._seen = self.account.events_since(self._seen)
         return new
 
     @property

@@ -1,4 +1,4 @@
-"""Events where streams, clocks and data are not as they should be: each of these went wrong once."""
+"""Regression tests of events: streams, clocks and data that once led to wrong events."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Account, Event, Times, about, report_of, spans_of, state_at, tell
+from nedbus.events import Account, Event, Times, report_of, spans_of, state_at, stories_of, story_of
 from nedbus_msgs import Address
 from tests.flights.messages import VALID, VLP
 
@@ -15,7 +15,7 @@ GPS = {"fix_type": 3, "satellites_used": 12, "jamming_state": 0, "jamming_indica
 
 
 class Sent:
-    """An account of vehicle 1 that gets fields by name, as a service has them."""
+    """An account of vehicle 1 that gets fields by name, as in a service."""
 
     def __init__(self) -> None:
         self.account = Account()
@@ -35,7 +35,7 @@ class Sent:
     def stories(self, **options: Any) -> list[tuple[str, float | None]]:
         vehicle = self.account.vehicles["1"]
         conditions = [*vehicle.initial, *vehicle.conditions.values()]
-        return [(story.what, story.until) for story in tell(list(self.account.events), conditions, **options)]
+        return [(story.what, story.until) for story in stories_of(list(self.account.events), conditions, **options)]
 
 
 @pytest.fixture
@@ -56,18 +56,18 @@ def test_flags_that_a_source_does_not_have_are_no_state(sent: Sent) -> None:
 
 
 def test_silence_ends_with_the_vehicle_that_was_gone(sent: Sent) -> None:
-    """A vehicle that was silent, then gone, and is back, has no story without an end."""
+    """A vehicle that was silent, then gone, then back, has no story without an end."""
     sent(0.0)
-    sent.account.look(4.0, {MAIN: "stale"})
-    sent.account.look(8.0, {MAIN: "gone"})
+    sent.account.update(4.0, {MAIN: "stale"})
+    sent.account.update(8.0, {MAIN: "gone"})
     sent(20.0)
     assert sent.told == [("silent", "begin"), ("gone", "begin"), ("gone", "end")]
     assert state_at(spans_of(list(sent.account.events)), 24.0).severity == "info"
     assert all(until is not None for _, until in sent.stories())
 
 
-def test_stream_that_speaks_for_the_vehicle_no_more_ends_what_it_told(sent: Sent) -> None:
-    """A better position, and a better receiver: what the other told is over."""
+def test_conditions_of_a_superseded_stream_end(sent: Sent) -> None:
+    """When a better position or receiver arrives, the conditions of the former one end."""
     sent(0.0, "estimator_local_position", 0)
     sent(1.0, "estimator_local_position", 0, xy_valid=False)
     sent(1.0, "sensor_gps", 0, **GPS)
@@ -80,7 +80,7 @@ def test_stream_that_speaks_for_the_vehicle_no_more_ends_what_it_told(sent: Sent
 
 
 def test_battery_that_is_taken_out_warns_no_more(sent: Sent) -> None:
-    """The one that is put in next is not low before it says so."""
+    """The condition of a battery ends when it is removed; the next one is not low before it reports so."""
     sent(0.0, "battery_status", 0, warning=0, connected=True)
     sent(1.0, "battery_status", 0, warning=2, connected=True)
     assert sent.state(1.0) == "bad"
@@ -91,7 +91,7 @@ def test_battery_that_is_taken_out_warns_no_more(sent: Sent) -> None:
 
 
 def test_damaged_time_is_no_reboot(sent: Sent) -> None:
-    """One message far ahead of the others, as a damaged log has it, and the one behind it."""
+    """A single message far ahead of the others, as in a damaged log, makes neither it nor the next one a reboot."""
     for second in range(5):
         sent(float(second), xy_valid=second < 3)
     sent(5.0, timestamp=9 * 10**18, xy_valid=False)
@@ -104,18 +104,18 @@ def test_damaged_time_is_no_reboot(sent: Sent) -> None:
 
 
 def test_clock_that_is_set_back_hides_no_silence(sent: Sent) -> None:
-    """After a step of the host's clock what is silent is told, and what happened before it is not recent for ever."""
+    """After the host's clock was set back, silence is still reported, and earlier events do not stay recent."""
     sent(10_000.0)
-    sent.account.look(10_000.0, {MAIN: "ok"}, dropped=5)
+    sent.account.update(10_000.0, {MAIN: "ok"}, dropped=5)
     sent.account.reject(MAIN, "a rule", 10_000.0)
-    sent.account.look(4_000.0, {MAIN: "stale"}, dropped=5)
+    sent.account.update(4_000.0, {MAIN: "stale"}, dropped=5)
     for second in range(4_001, 4_020):
-        sent.account.look(float(second), {MAIN: "stale"}, dropped=5)
+        sent.account.update(float(second), {MAIN: "stale"}, dropped=5)
     assert {("silent", "begin"), ("rejected", "end"), ("overload", "end")} <= set(sent.told)
 
 
 def test_what_held_at_first_is_over_at_a_reboot(sent: Sent) -> None:
-    """A vehicle that was not valid, reboots and is valid, has nothing that goes on."""
+    """A vehicle that was not valid, reboots and is valid, has no active condition."""
     for second in range(3):
         sent(float(second), xy_valid=False)
     sent(10.0, timestamp=1_000_000)
@@ -124,7 +124,7 @@ def test_what_held_at_first_is_over_at_a_reboot(sent: Sent) -> None:
 
 
 def test_what_began_on_the_ground_counts_when_armed(sent: Sent) -> None:
-    """A link that was lost while disarmed is nothing to watch until the vehicle is armed."""
+    """A link lost while disarmed is reported as watch once the vehicle is armed."""
     status = {"arming_state": 1, "nav_state": 4, "failsafe": False}
     sent(0.0, "vehicle_status", **status, gcs_connection_lost=False)
     sent(1.0, "vehicle_status", **status, gcs_connection_lost=True)
@@ -134,7 +134,7 @@ def test_what_began_on_the_ground_counts_when_armed(sent: Sent) -> None:
 
 
 def test_jamming_at_first_is_a_state(sent: Sent) -> None:
-    """A service that starts while a receiver is jammed says so; a vehicle without GNSS is not to be watched for it."""
+    """A receiver jammed when the service starts is reported; a vehicle without GNSS is not."""
     sent(0.0, "vehicle_gps_position", **{**GPS, "jamming_state": 3})
     assert sent.state(0.0) == "watch"
     assert sent.told == []
@@ -144,7 +144,7 @@ def test_jamming_at_first_is_a_state(sent: Sent) -> None:
 
 
 def test_what_holds_from_first_to_last_is_the_state_at_any_time(sent: Sent) -> None:
-    """A recording of a vehicle that never was valid shows it as bad all along, as live it would be."""
+    """A vehicle that is never valid in a recording is bad at any time, as it would be live."""
     for second in range(5):
         sent(float(second), xy_valid=False)
     state = state_at(spans_of(list(sent.account.events), sent.account.vehicles["1"].initial), 3.0)
@@ -153,7 +153,7 @@ def test_what_holds_from_first_to_last_is_the_state_at_any_time(sent: Sent) -> N
 
 
 def test_condition_that_a_worse_one_replaces_ends_there(sent: Sent) -> None:
-    """A battery that was low at the first message, becomes critical and is changed, is low no longer."""
+    """A battery that was low at the first message, becomes critical and is replaced, is no longer low."""
     for second, warning in enumerate((1, 2, 0)):
         sent(float(second), "battery_status", 0, warning=warning, connected=True)
     spans = spans_of(list(sent.account.events), sent.account.vehicles["1"].initial)
@@ -165,23 +165,23 @@ def test_condition_that_a_worse_one_replaces_ends_there(sent: Sent) -> None:
 
 
 def test_story_is_about_the_event_that_was_asked_for(sent: Sent) -> None:
-    """Of two things within a minute each has its own story, and an end has that of its begin."""
+    """Two faults within a minute have a story each, and an end has the story of its begin."""
     sent(0.0)
     sent(1.0, timestamp=1_000_000)
     sent(1.1, timestamp=1_100_000, xy_reset_counter=1, delta_xy=(3.0, 4.0), x=3.0, y=4.0)
     sent(2.0, timestamp=2_000_000, xy_reset_counter=1, x=3.0, y=4.0, xy_valid=False)
     sent(3.0, timestamp=3_000_000, xy_reset_counter=1, x=3.0, y=4.0)
     events = list(sent.account.events)
-    stories = {(event.kind, event.change): about(event, events) for event in events}
+    stories = {(event.kind, event.change): story_of(event, events) for event in events}
     told = {key: story.what for key, story in stories.items() if story is not None}
     assert told["reset", "once"].startswith("reset of xy by 5.0 m")
     assert told["reboot", "once"].startswith("rebooted")
     assert told["xy_invalid", "end"] == told["xy_invalid", "begin"] == "xy not valid"
-    assert about(Event("1", "jump", "once", "watch", "", 9.0), events) is None
+    assert story_of(Event("1", "jump", "once", "watch", "", 9.0), events) is None
 
 
 def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
-    """A service answers about one vehicle though another has had hundreds of events since."""
+    """A report has the events of each vehicle, even after hundreds of events of another one."""
     account = Account()
     quiet, noisy = Address("quiet", VLP), Address("noisy", VLP)
     for second, valid in enumerate((True, False, True)):

@@ -1,4 +1,4 @@
-"""Accounts as services answer them, and faults as they follow: hand-made messages and answers, in no other process."""
+"""Reports of accounts, and the faults found in them, from hand-made messages and replies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from nedbus.events import ALL, FORGOTTEN, AccountReport, Event, Expectation, faults_of, from_json, report_of, tell
+from nedbus.events import ALL, FORGOTTEN, AccountReport, Event, Expectation, faults_of, from_json, report_of, stories_of
 
 from .flight import ARMED, Flight
 
@@ -23,7 +23,7 @@ def report(flight: Flight, *, service: str = "s", host: str = "h", within: float
 
 
 def flying(*, since: float = 1.0, **fields: Any) -> Flight:
-    """Return a vehicle that has sent valid positions, and then these."""
+    """Return a vehicle that has sent valid positions, then these messages."""
     flight = Flight()
     flight.send()
     flight.fly(1)
@@ -32,14 +32,14 @@ def flying(*, since: float = 1.0, **fields: Any) -> Flight:
 
 
 def through_json(given: AccountReport) -> AccountReport:
-    """Return the report as a reader gets it."""
+    """Return the report as a reader receives it."""
     read = from_json(json.loads(json.dumps(asdict(given))))
     assert read is not None
     return read
 
 
 def test_report_comes_back_as_it_was() -> None:
-    """Events with their evidence, states, and what holds: all of it goes through JSON."""
+    """Events with evidence, states and active conditions survive the way through JSON."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.gps()
@@ -57,16 +57,16 @@ def test_report_comes_back_as_it_was() -> None:
 
 
 def test_story_is_the_same_from_a_report() -> None:
-    """A reader tells what the service itself would, also of what held before all events."""
+    """A story from a report equals that of the service, also for conditions that held before all events."""
     flight = flying(xy_valid=False)
     for within in (1e9, 0.0):
         read = through_json(report(flight, within=within))
-        told = tell(read.events, read.vehicles["1"].held, topics=read.vehicles["1"].topics)
+        told = stories_of(read.events, read.vehicles["1"].held, topics=read.vehicles["1"].topics)
         assert [(each.what, each.since, each.until) for each in told] == [("xy not valid", flight.now, None)]
 
 
 def test_report_is_bounded() -> None:
-    """Of many events the last are answered, within a size that a reader accepts."""
+    """A report has the most recent events, within the size that readers accept."""
     flight = Flight()
     flight.gps()
     for number in range(1500):
@@ -81,7 +81,7 @@ def test_report_is_bounded() -> None:
 
 
 def test_report_of_many_vehicles_is_read() -> None:
-    """A service of a thousand vehicles, each bad and with all topics, answers what readers accept."""
+    """The report of a thousand bad vehicles, with all topics, is accepted by readers."""
     flight = Flight()
     topics = ["vehicle_gps_position", "vehicle_status", "battery_status", "estimator_status_flags", "failsafe_flags"]
     for number in range(1000):
@@ -102,12 +102,12 @@ def test_report_of_many_vehicles_is_read() -> None:
     ],
 )  # fmt: skip
 def test_hostile_answer_is_none(content: object) -> None:
-    """Anything that is no report is left out."""
+    """Replies that are not reports are ignored."""
     assert from_json(content) is None
 
 
 def test_deep_answer_is_none() -> None:
-    """Evidence of evidence of evidence does not break the reader."""
+    """Deeply nested evidence does not break the reader."""
     event: dict[str, Any] = {
         "vehicle": "1", "kind": "jump", "change": "once", "severity": "info", "text": "", "time": 0.0
     }  # fmt: skip
@@ -117,7 +117,7 @@ def test_deep_answer_is_none() -> None:
 
 
 def test_huge_answer_is_bounded() -> None:
-    """No peer makes a reader keep more events and vehicles than a service answers."""
+    """A peer cannot make a reader keep more events and vehicles than a service sends."""
     event = asdict(Event("1", "jump", "once", "info", "", 0.0))
     content: dict[str, object] = {"service": "s", "host": "h", "now": 1.0, "vehicles": {}}
     assert from_json(content | {"events": [event] * 301}) is None
@@ -136,16 +136,16 @@ json_values = st.recursive(
 
 @given(st.sampled_from(["events", "vehicles", "now", "service", "host"]), json_values)
 def test_any_answer_is_a_report_or_none(name: str, value: object) -> None:
-    """Whatever a peer puts into a field, nothing else is raised, and what is read can be told and judged."""
+    """Any reply is a report or None, never an error; stories and faults of the report can be computed."""
     content = json.loads(json.dumps(asdict(report(flying(xy_valid=False)))))
     read = from_json(content | {name: value})
     if read is not None:
         assert isinstance(faults_of([read], Expectation(vehicles=1, valid=("xy",), within=1.0)), list)
-        assert isinstance(tell(read.events), list)
+        assert isinstance(stories_of(read.events), list)
 
 
 def test_well_vehicle_has_no_fault() -> None:
-    """Nothing is wrong with one that is heard, as far as nobody expects more."""
+    """A vehicle that is heard has no fault without further criteria."""
     assert faults_of([report(flying())], NOTHING) == []
     expected = Expectation(("1",), 1, ("xy", "z", "vxy", "vz"), 60.0)
     assert faults_of([report(flying())], expected) == []
@@ -153,7 +153,7 @@ def test_well_vehicle_has_no_fault() -> None:
 
 
 def test_silent_vehicle_is_a_fault() -> None:
-    """It is one for an hour; then it was switched off, unless somebody asks for it."""
+    """A silent vehicle is a fault for an hour; then it counts as switched off unless it is expected."""
     flight = flying()
     flight.wait(10.0).look("stale")
     line = "vehicle 1: silent: no vehicle_local_position for 10.0 s, since 00:01:42.0 UTC (10.0 s)"
@@ -167,7 +167,7 @@ def test_silent_vehicle_is_a_fault() -> None:
 
 
 def test_vehicle_that_moved_is_heard() -> None:
-    """One service lost it, another hears it, in whichever order they answer."""
+    """A vehicle that one service lost and another one hears is heard, in either order of the replies."""
     lost, found = flying(), flying()
     lost.wait(10.0).look("gone")
     reports = [report(lost, service="a"), report(found, service="b")]
@@ -177,7 +177,7 @@ def test_vehicle_that_moved_is_heard() -> None:
 
 
 def test_expected_vehicles() -> None:
-    """Those that are missing are named, and how many are heard; a vehicle of a script counts when it is heard."""
+    """Missing vehicles are named, the others counted; a vehicle published by a script counts as heard."""
     one = report(flying())
     assert faults_of([one], Expectation(("1", "7"))) == ["vehicle 7 is missing: it has no publisher"]
     assert faults_of([one], Expectation(("1", "7")), heard=["7"]) == []
@@ -187,7 +187,7 @@ def test_expected_vehicles() -> None:
 
 
 def test_other_hosts_are_not_judged() -> None:
-    """Where nothing is expected of all hosts, those of this one are."""
+    """Without criteria for all hosts only the services of this host are checked."""
     silent = flying()
     silent.wait(10.0).look("stale")
     assert faults_of([report(silent, host="other")], NOTHING, only="this") == []
@@ -195,7 +195,7 @@ def test_other_hosts_are_not_judged() -> None:
 
 
 def test_flags_are_judged_since_they_fell() -> None:
-    """All flags of a vehicle are one line, with the time of the first; not that of something else that is wrong."""
+    """All invalid flags of a vehicle are one line, with the time of the first one, not of another condition."""
     flight = Flight()
     flight.send()
     flight.status(ARMED, failsafe=True)
@@ -209,14 +209,14 @@ def test_flags_are_judged_since_they_fell() -> None:
 
 
 def test_vehicle_without_a_position() -> None:
-    """Validity is asked for, and none of its messages tells it."""
+    """A vehicle without a position fails a check for validity."""
     flight = Flight()
     flight.status(ARMED)
-    assert faults_of([report(flight)], Expectation(valid=("xy",))) == ["vehicle 1: it sends no position"]
+    assert faults_of([report(flight)], Expectation(valid=("xy",))) == ["vehicle 1: publishes no position"]
 
 
 def test_what_happened_lately() -> None:
-    """Nothing bad or to be watched may have happened in that time; info may."""
+    """No event of severity bad or watch may have happened in the period; info may."""
     flight = flying(xy_valid=False)
     flight.wait(1.0).send()
     lines = faults_of([report(flight)], Expectation(within=60.0))
@@ -232,8 +232,8 @@ def test_what_happened_lately() -> None:
 
 
 def test_many_events_are_counted() -> None:
-    """The first twenty are shown, the others counted."""
+    """The first twenty events are listed, the others counted."""
     events = tuple(Event(ALL, "lost", "once", "watch", f"{number} lost", float(number)) for number in range(30))
     lines = faults_of([replace(report(flying()), now=30.0, events=events)], Expectation(within=60.0))
     assert len(lines) == 21
-    assert lines[-1] == "10 events more in the last 60 s"
+    assert lines[-1] == "10 more events in the last 60 s"

@@ -1,4 +1,4 @@
-"""Stories of a vehicle, and moments as a person writes them: hand-made messages, in no other process."""
+"""Stories of a vehicle, and parsing and formatting of times, with hand-made messages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.events import Event, Story, Times, tell
+from nedbus.events import Event, Story, Times, stories_of
 
 from .flight import ARMED, Flight
 
@@ -15,12 +15,12 @@ from .flight import ARMED, Flight
 def why(flight: Flight, *, at: float | None = None) -> list[Story]:
     """Return the stories of a vehicle; `at` is by the account's clock."""
     followed = flight.account.vehicles["1"]
-    events = sorted(flight.account.take(0)[0], key=lambda each: each.time)
-    return tell(events, followed.conditions.values(), topics=list(followed.topics), at=at)
+    events = sorted(flight.account.events_since(0)[0], key=lambda each: each.time)
+    return stories_of(events, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
 def lose_gps(flight: Flight) -> None:
-    """Lose the receiver, and a moment later the estimate."""
+    """Lose the receiver, and then the estimate."""
     flight.gps()
     flight.fly(1)
     flight.gps(fix_type=0, satellites_used=0)
@@ -38,7 +38,7 @@ def recover(flight: Flight) -> None:
 
 
 def test_story_that_goes_on() -> None:
-    """Flags that fall together are one story; what follows from it is part of it, and no story of its own."""
+    """Flags that become invalid together are one story; consequences are part of it, not stories of their own."""
     flight = Flight()
     lose_gps(flight)
     (story,) = why(flight)
@@ -50,7 +50,7 @@ def test_story_that_goes_on() -> None:
 
 
 def test_story_that_ended() -> None:
-    """It ends with the last flag, and says what came with its end."""
+    """A story ends with its last flag, and has the events at its end."""
     flight = Flight()
     lose_gps(flight)
     begin = flight.now - 1.0
@@ -64,7 +64,7 @@ def test_story_that_ended() -> None:
 
 
 def test_reboot_ends_a_story() -> None:
-    """Conditions from before it are over, though no message says so; the reboot itself is a story too."""
+    """A reboot ends earlier conditions without an event of their own; it is a story itself."""
     flight = Flight()
     flight.send()
     flight.wait(1.0).send(xy_valid=False)
@@ -77,7 +77,7 @@ def test_reboot_ends_a_story() -> None:
 
 
 def test_end_of_one_flag_is_not_that_of_another() -> None:
-    """A fault that held at the first message ends; the one that began since goes on."""
+    """The end of a fault that held at the first message does not end one that began later."""
     flight = Flight()
     flight.send()
     flags: dict[str, Any] = {"cs_baro_fault": True, "fs_bad_hdg": False}
@@ -87,8 +87,8 @@ def test_end_of_one_flag_is_not_that_of_another() -> None:
     assert [(each.what, each.until) for each in why(flight)] == [("EKF fault: heading", None)]
 
 
-def test_what_is_watched_is_told_where_nothing_is_bad() -> None:
-    """Beside something bad it is told only as far as it belongs to it, or when somebody asks about that moment."""
+def test_condition_to_watch_is_a_story_if_nothing_is_bad() -> None:
+    """A condition of severity watch is only a story without a bad one, or at a given time."""
     flight = Flight()
     flight.gps()
     flight.fly(1)
@@ -105,27 +105,27 @@ def test_what_is_watched_is_told_where_nothing_is_bad() -> None:
     assert [each.what for each in why(flight, at=flight.now + 50)] == ["xy not valid"]
 
 
-def test_condition_whose_begin_is_not_told() -> None:
-    """A condition that began before the events that are known goes on, since when it began; or from the first on."""
+def test_condition_whose_begin_is_not_reported() -> None:
+    """A condition without its begin among the events is active since its begin, or since the first message."""
     flight = Flight()
     flight.send(z_valid=False)
     flight.wait(2.0).send(z_valid=False, xy_valid=False)
     held = list(flight.account.vehicles["1"].conditions.values())
-    assert [(each.what, each.begin, each.until) for each in tell([], held)] == [
+    assert [(each.what, each.begin, each.until) for each in stories_of([], held)] == [
         ("z not valid", None, None), ("xy not valid", held[1].begin, None),
     ]  # fmt: skip
 
 
 def test_nothing_was_wrong() -> None:
-    """A vehicle that is armed, takes off and lands has no story, nor has one of which nothing is known."""
+    """A vehicle that is armed, takes off and lands has no story, and neither has an unknown vehicle."""
     flight = Flight()
     flight.send()
     flight.status(ARMED)
     flight.send("vehicle_land_detected", landed=True)
     flight.wait(1.0).send("vehicle_land_detected", landed=False)
     assert why(flight) == []
-    assert tell([]) == []
-    assert tell([], at=5.0) == []
+    assert stories_of([]) == []
+    assert stories_of([], at=5.0) == []
 
 
 def event_at(time: float, *, boot: float | None = None) -> Event:
@@ -143,7 +143,7 @@ EVENING = datetime(2026, 11, 22, 23, 59, 50, tzinfo=UTC).timestamp()
     ],
 )  # fmt: skip
 def test_moment_is_found(text: str, step: float) -> None:
-    """A time of day is the nearest one, also beyond midnight; a number is seconds since the vehicle's boot."""
+    """A time of day is the closest one, also across midnight; a number is seconds since boot."""
     live, told = Times(is_live=True), event_at(EVENING, boot=100.0)
     assert live.find(text, told) - told.time == pytest.approx(step, abs=1e-3)
     of_file, told = Times(offsets={"1": EVENING - 100.0}), event_at(40.0, boot=100.0)
@@ -154,28 +154,28 @@ def test_moment_is_found(text: str, step: float) -> None:
     "text", ["", "noon", "24:00", "12:60", "12:30:60", "12:30:61.5", "1:2", "12.30.00", "nan", "inf", "1:00:00:00"]
 )
 def test_garbage_is_no_moment(text: str) -> None:
-    """A text that is no time is a ValueError, which does not repeat Python's own reason."""
-    with pytest.raises(ValueError, match="no time"):
+    """A text that is not a time is a ValueError, without the text of Python's own error."""
+    with pytest.raises(ValueError, match="not a time"):
         Times(is_live=True).find(text, event_at(EVENING, boot=100.0))
 
 
 def test_clock_that_is_not_known() -> None:
-    """A log without UTC has seconds since boot; live, a vehicle of which nothing is known but a rejection has UTC."""
+    """A log without UTC has seconds since boot; live, a vehicle known only by a rejection has UTC."""
     times, told = Times(), event_at(40.0, boot=100.0)
     assert (times.clock(told), times.text(told), times.utc(told)) == ("boot", "100.000", None)
     assert times.find("99", told) == 39.0
-    with pytest.raises(ValueError, match="no message of this vehicle tells UTC"):
+    with pytest.raises(ValueError, match="no message of this vehicle gives UTC"):
         times.find("12:00", told)
-    with pytest.raises(ValueError, match="no message of this vehicle tells when it booted"):
+    with pytest.raises(ValueError, match="no message of this vehicle gives the time since boot"):
         Times(is_live=True).find("99", event_at(EVENING))
 
 
 def test_simulator_has_unix_time() -> None:
-    """Time since boot that is Unix time tells UTC by itself."""
+    """A time since boot that is a Unix time gives UTC by itself."""
     told = event_at(1.0, boot=EVENING)
     assert (Times().clock(told), Times().text(told)) == ("vehicle", "23:59:50.0")
 
 
 def test_time_of_day_is_rounded_once() -> None:
-    """59.96 s is the next minute, never 60.0."""
+    """59.96 s is shown as the next minute, never as 60.0."""
     assert Times(is_live=True).text(event_at(EVENING + 9.96)) == "00:00:00.0"

@@ -1,4 +1,4 @@
-"""Events of vehicles, as an account tells them from messages: hand-made ones, in no other process."""
+"""Events of an account, from hand-made messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .flight import ARMED, DISARMED, GOOD_GPS, POSITION, Flight
 
 @pytest.fixture
 def flight() -> Flight:
-    """Return a vehicle that has sent its position once."""
+    """Return a vehicle that has sent one position."""
     flight = Flight()
     assert flight.send() == []
     return flight
@@ -30,7 +30,7 @@ def brief(events: Iterable[Event]) -> list[tuple[str, str, str]]:
 
 
 def test_first_message_is_no_event() -> None:
-    """Conditions of its first message hold since before: they are its state, without an event, until they end."""
+    """Conditions of the first message are states without an event, until they end."""
     flight = Flight()
     assert flight.send(xy_valid=False, dead_reckoning=True) == []
     assert (flight.severity, flight.kinds) == ("bad", ["xy_invalid", "dead_reckoning"])
@@ -43,7 +43,7 @@ def test_first_message_is_no_event() -> None:
 
 @pytest.mark.parametrize("kind", ["xy", "z", "v_xy", "v_z"])
 def test_validity_begins_and_ends(flight: Flight, kind: str) -> None:
-    """The flags of a position are bad from the message that clears them to the one that sets them."""
+    """A flag of the position is bad from the message that clears it to the message that sets it."""
     begun = flight.wait(0.1).send(**dict[str, Any]({f"{kind}_valid": False}))
     assert brief(begun) == [(f"{kind}_invalid", "begin", "bad")]
     ended = flight.wait(2.5).send()
@@ -54,8 +54,8 @@ def test_validity_begins_and_ends(flight: Flight, kind: str) -> None:
     assert ended[0].boot == pytest.approx(flight.now - flight.booted)
 
 
-def test_reboot_is_told_once(flight: Flight) -> None:
-    """Several streams go back, soon or late; the state begins anew, and what held before is over without an end."""
+def test_reboot_is_reported_once(flight: Flight) -> None:
+    """Several streams go back, soon or late; the state is reset, and earlier conditions end without an event."""
     flight.status(ARMED, failsafe=True)
     flight.gps(satellites_used=12)
     flight.wait(0.1).send(xy_valid=False)
@@ -64,7 +64,7 @@ def test_reboot_is_told_once(flight: Flight) -> None:
     flight.booted = flight.now
     told = flight.wait(1.0).send()
     assert brief(told) == [("reboot", "once", "bad")]
-    assert told[0].text == "rebooted: 1.0 s since boot, 10.1 s before"
+    assert told[0].text == "rebooted: time since boot 1.0 s, was 10.1 s"
     assert flight.kinds == ["reboot"]
     assert flight.wait(1.0).gps() == []  # neither a second reboot, nor the end of what that receiver had
     flight.fly(20)
@@ -73,7 +73,7 @@ def test_reboot_is_told_once(flight: Flight) -> None:
 
 
 def test_stream_that_returns_long_after_a_reboot(flight: Flight) -> None:
-    """Each stream goes back when it comes again, whichever is the first: there was one reboot, and its state stays."""
+    """Streams that go back later belong to the same reboot, in any order, and the state is kept."""
     streams: list[Callable[[], list[Event]]] = [flight.send, flight.gps, lambda: flight.status(ARMED)]
     for first in range(3):
         flight.wait(1000.0)
@@ -90,7 +90,7 @@ def test_stream_that_returns_long_after_a_reboot(flight: Flight) -> None:
 
 
 def test_late_message_from_before_a_reboot_is_no_reboot(flight: Flight) -> None:
-    """Streams are not in order among each other: what was sent before, and comes after, tells nothing."""
+    """Streams are not ordered among each other: an old message that arrives late is no reboot."""
     flight.gps()
     flight.booted, before = flight.now, flight.booted
     assert brief(flight.wait(0.1).send()) == [("reboot", "once", "bad")]
@@ -101,14 +101,14 @@ def test_late_message_from_before_a_reboot_is_no_reboot(flight: Flight) -> None:
 
 
 def test_disorder_is_no_reboot(flight: Flight) -> None:
-    """Time that goes back by a second or less is a message out of order."""
+    """A time that goes back by up to a second is a reordered message."""
     flight.wait(5.0).send()
     flight.booted += 1.0
     assert flight.send() == []
 
 
-def test_silence_is_told_with_looks(flight: Flight) -> None:
-    """A vehicle is silent from its last position on, gone when its publisher is; it is back with the next position."""
+def test_silence_is_reported_by_updates(flight: Flight) -> None:
+    """A vehicle is silent since its last position, gone with its publisher, and back with the next position."""
     flight.fly(1)
     last = flight.now
     assert flight.wait(2.0).look() == []
@@ -126,14 +126,14 @@ def test_silence_is_told_with_looks(flight: Flight) -> None:
 
 
 def test_silence_of_unknown_streams(flight: Flight) -> None:
-    """Where no state is known, three seconds without a position are silence, and other topics do not break it."""
+    """Without stream states, a vehicle is silent after three seconds without a position; other topics do not count."""
     assert flight.wait(2.9).look(None) == []
     flight.gps()
     assert brief(flight.wait(0.2).look(None)) == [("silent", "begin", "bad")]
 
 
-def test_loss_is_told_once(flight: Flight) -> None:
-    """Losses in a row are one event, with their count, at the time of the first one."""
+def test_loss_is_reported_once(flight: Flight) -> None:
+    """A burst of losses is one event, with their number, at the time of the first one."""
     flight.wait(1.0).send(lost=2)
     first = flight.now
     flight.wait(1.0).gps()
@@ -146,8 +146,8 @@ def test_loss_is_told_once(flight: Flight) -> None:
     assert flight.wait(6.0).look() == []
 
 
-def test_loss_that_goes_on_is_told(flight: Flight) -> None:
-    """Loss without a pause is told each twenty seconds, so that the vehicle is to be watched all the time."""
+def test_continuous_loss_is_reported(flight: Flight) -> None:
+    """Continuous losses are reported every twenty seconds, so that the state stays watch."""
     told = []
     for second in range(100):
         flight.wait(1.0).send(lost=1)
@@ -157,7 +157,7 @@ def test_loss_that_goes_on_is_told(flight: Flight) -> None:
 
 
 def test_rejection_begins_and_ends(flight: Flight) -> None:
-    """The first rejected message begins it, with the reason; five seconds without one end it, with the count."""
+    """The first rejected message begins the condition, with its reason; five seconds without one end it."""
     begun = flight.reject("x is NaN")
     assert brief(begun) == [("rejected", "begin", "watch")]
     assert begun[0].text == "vehicle_local_position rejected: x is NaN"
@@ -166,13 +166,13 @@ def test_rejection_begins_and_ends(flight: Flight) -> None:
     assert flight.severity == "watch"
     ended = flight.wait(6.0).look()
     assert [(event.kind, event.text, event.time) for event in ended] == [
-        ("rejected", "nothing rejected any more: 2 were after 1.0 s", last)
+        ("rejected", "rejections stopped (2 messages) after 1.0 s", last)
     ]
     assert flight.severity == "info"
 
 
 def test_link_down_excuses_vehicles(flight: Flight) -> None:
-    """Without a link nobody is silent, and the time without one does not count; the link is an event of all."""
+    """Without a link no vehicle is silent, and that time does not count; the link is an event of all vehicles."""
     flight.fly(1)
     flight.link = "no link to tcp/host:7447"
     begun = flight.look()
@@ -187,8 +187,8 @@ def test_link_down_excuses_vehicles(flight: Flight) -> None:
     assert flight.severity == "info"
 
 
-def test_message_before_the_look_that_finds_the_link(flight: Flight) -> None:
-    """The first message is there before anybody has looked at the link again: no silence either."""
+def test_message_before_the_update_that_finds_the_link(flight: Flight) -> None:
+    """A message that arrives before the link is polled again does not make the vehicle silent."""
     flight.fly(1)
     flight.link = "no link"
     flight.look()
@@ -198,7 +198,7 @@ def test_message_before_the_look_that_finds_the_link(flight: Flight) -> None:
 
 
 def test_vehicle_that_does_not_return_with_the_link(flight: Flight) -> None:
-    """It is silent three seconds after the link is back, and the link is the evidence."""
+    """A vehicle is silent three seconds after the link is back, with the link as evidence."""
     flight.fly(1)
     flight.link = "no link"
     flight.look()
@@ -211,20 +211,20 @@ def test_vehicle_that_does_not_return_with_the_link(flight: Flight) -> None:
 
 
 def test_link_that_flaps(flight: Flight) -> None:
-    """Of more than four changes in ten seconds the last is told, as of any condition, and the state is always true."""
+    """Of more than four changes of the link in ten seconds the last is reported; the state is always current."""
     told = []
     for index in range(9):
         flight.link = "no link" if index % 2 == 0 else ""
         told += flight.wait(0.5).look("unknown")
     assert brief(told) == [("link_down", "begin", "bad"), ("link_down", "end", "info")] * 2
     told = flight.wait(6.0).look("unknown")
-    assert [event.text for event in told] == ["no link, the last of 5 changes that are not told"]
+    assert [event.text for event in told] == ["no link, the last of 5 suppressed changes"]
     flight.link = ""
     assert brief(flight.wait(10.0).look("unknown")) == [("link_down", "end", "info")]
 
 
 def test_overload(flight: Flight) -> None:
-    """A reader that drops messages says so once, and after five seconds without a drop how many they were."""
+    """Dropped messages are reported once, with their number after five seconds without a drop."""
     assert flight.look(dropped=0) == []
     begun = flight.look(dropped=10)
     assert [(event.vehicle, event.kind, event.change) for event in begun] == [(ALL, "overload", "begin")]
@@ -239,7 +239,7 @@ def test_overload(flight: Flight) -> None:
 
 
 def test_overload_is_evidence_of_loss(flight: Flight) -> None:
-    """A condition of all vehicles explains the events of one, however long ago it began."""
+    """A condition of all vehicles is evidence for one of them, however long ago it began."""
     for dropped in range(1, 31):
         flight.fly(1)
         flight.look(dropped=dropped)
@@ -252,7 +252,7 @@ def test_overload_is_evidence_of_loss(flight: Flight) -> None:
 
 
 def test_battery_warnings(flight: Flight) -> None:
-    """Low is to be watched, critical is bad; the last one holds until the warning is 0."""
+    """Low is watch, critical is bad; the last warning holds until it is 0."""
     assert flight.wait(1.0).battery(0) == []
     assert brief(flight.wait(1.0).battery(1)) == [("battery", "begin", "watch")]
     critical = flight.wait(1.0).battery(2)
@@ -265,7 +265,7 @@ def test_battery_warnings(flight: Flight) -> None:
 
 
 def test_receiver(flight: Flight) -> None:
-    """Fix, satellites, jamming by indicator and by state, spoofing: between two thresholds nothing changes."""
+    """Fix, satellites, jamming by indicator or state, and spoofing have hysteresis."""
     assert flight.gps() == []
     assert brief(flight.gps(fix_type=4)) == [("gps_fix", "once", "info")]
     assert brief(flight.gps(fix_type=2)) == [("gps_fix_lost", "begin", "watch")]
@@ -288,14 +288,14 @@ def test_receiver(flight: Flight) -> None:
 
 
 def test_receiver_that_never_had_a_fix(flight: Flight) -> None:
-    """It is a state without an event, that nobody needs to watch; the first fix is one."""
+    """Without a fix from the start there is an info state without an event; the first fix is an event."""
     assert flight.gps(fix_type=0, satellites_used=0) == []
     assert flight.severity == "info"
     assert brief(flight.gps()) == [("gps_fix_lost", "end", "info"), ("few_satellites", "end", "info")]
 
 
 def test_estimator_flags(flight: Flight) -> None:
-    """Flags that change alike with one message are one event, which names them; each ends by itself."""
+    """Flags that change in the same way in one message are one event that names them; each one ends by itself."""
     names = ["reject_hor_pos", "reject_hor_vel", "fs_bad_hdg", "cs_baro_fault", "cs_gnss_pos", "cs_baro_hgt"]
 
     def send(**changed: Any) -> list[Event]:
@@ -320,7 +320,7 @@ def test_estimator_flags(flight: Flight) -> None:
 
 
 def test_on_the_ground(flight: Flight) -> None:
-    """Evidence about a vehicle that is switched on is no reason to watch it while it is disarmed."""
+    """Faults of sensors and links are info while the vehicle is disarmed."""
     flight.status(DISARMED, gcs_connection_lost=False)
     assert brief(flight.wait(0.1).status(DISARMED, gcs_connection_lost=True)) == [("gcs_lost", "begin", "info")]
     assert brief(flight.wait(0.1).status(ARMED, gcs_connection_lost=True)) == [("armed", "once", "info")]
@@ -332,7 +332,7 @@ def test_on_the_ground(flight: Flight) -> None:
 
 
 def test_missing_flag_is_no_event() -> None:
-    """A field that the source does not provide is neither valid nor invalid, whatever value stands for it."""
+    """A field that the source does not provide is neither valid nor invalid, whatever its value."""
     flight = Flight()
     missing = ("z_valid", "v_z_valid", "heading_good_for_control", "dist_bottom_valid", "dead_reckoning")
     flight.send(missing=missing, z_valid=False, v_z_valid=False, dead_reckoning=True)
@@ -348,7 +348,7 @@ def test_missing_flag_is_no_event() -> None:
         ("vehicle_local_position_groundtruth", None), ("estimator_local_position", 1), ("estimator_local_position", 0),
     ],
 )  # fmt: skip
-def test_other_estimates_do_not_speak_for_the_vehicle(flight: Flight, topic: str, instance: int | None) -> None:
+def test_other_estimates_are_not_used(flight: Flight, topic: str, instance: int | None) -> None:
     """A second EKF and the ground truth make no events, and change no state."""
     fields = message(1, **VALID).model_dump() | {"xy_valid": False, "dead_reckoning": True, "x": 500.0}
     for step in range(5):
@@ -359,8 +359,8 @@ def test_other_estimates_do_not_speak_for_the_vehicle(flight: Flight, topic: str
     assert flight.account.vehicles["1"].main == POSITION
 
 
-def test_other_estimate_speaks_where_there_is_none() -> None:
-    """Without vehicle_local_position the first EKF speaks, until the vehicle's own position comes."""
+def test_other_estimate_is_used_if_it_is_the_only_one() -> None:
+    """Without vehicle_local_position the first EKF is used, until the vehicle's own position arrives."""
     flight = Flight()
     fields = message(1, **VALID).model_dump() | {"xy_valid": False}
     flight.send("estimator_local_position", instance=1, **fields)
@@ -372,8 +372,8 @@ def test_other_estimate_speaks_where_there_is_none() -> None:
     assert flight.send("estimator_local_position", instance=0, **fields) == []
 
 
-def test_second_receiver_and_battery_do_not_speak(flight: Flight) -> None:
-    """Instance 0 of a sensor speaks, and vehicle_gps_position, the choice of all, before any receiver."""
+def test_second_receiver_and_battery_are_not_used(flight: Flight) -> None:
+    """Of several sensors instance 0 is used, and vehicle_gps_position is preferred to any single receiver."""
     flight.send("sensor_gps", instance=0, **GOOD_GPS)
     assert flight.send("sensor_gps", instance=1, **GOOD_GPS | {"fix_type": 0}) == []
     assert flight.send("battery_status", instance=1, warning=3, remaining=0.0, connected=True) == []
@@ -384,7 +384,7 @@ def test_second_receiver_and_battery_do_not_speak(flight: Flight) -> None:
 
 
 def test_origin_that_only_has_a_new_time(flight: Flight) -> None:
-    """Some sources set ref_timestamp with each message: an origin is set once, and moves by a centimetre or more."""
+    """An origin is set once, and moves by a centimetre or more; a new ref_timestamp alone is ignored."""
     origin: dict[str, Any] = {
         "xy_global": True,
         "z_global": True,
@@ -403,7 +403,7 @@ def test_origin_that_only_has_a_new_time(flight: Flight) -> None:
 
 
 def test_jump_is_what_velocity_does_not_explain(flight: Flight) -> None:
-    """A position that slides away over several messages is one jump, told when it ends; flying is none."""
+    """A position that moves over several messages is one jump, reported when it ends; flying is none."""
     for step in range(1, 20):
         assert flight.wait(0.1).send(x=2.0 * step, vx=20.0) == []
     flight = Flight()
@@ -419,7 +419,7 @@ def test_jump_is_what_velocity_does_not_explain(flight: Flight) -> None:
 
 
 def test_jump_that_is_a_reset(flight: Flight) -> None:
-    """A reset that the estimator reports is a reset, with its size, and no jump."""
+    """A reset reported by the estimator is a reset with its size, and not a jump."""
     told = flight.wait(0.1).send(
         x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0), delta_z=-4.0
     )
@@ -429,8 +429,8 @@ def test_jump_that_is_a_reset(flight: Flight) -> None:
     assert flight.wait(0.1).send(x=30.0, z=-4.0, xy_reset_counter=1, z_reset_counter=1, delta_xy=(30.0, 0.0)) == []
 
 
-def test_flapping_is_told_when_it_ends(flight: Flight) -> None:
-    """Of more than four changes in ten seconds the last is told, five seconds after it, with their count."""
+def test_flapping_is_reported_when_it_ends(flight: Flight) -> None:
+    """Of more than four changes in ten seconds the last is reported after five seconds, with their number."""
     told, times = [], []
     for index in range(21):
         told += flight.wait(0.2).send(xy_valid=index % 2 == 1)
@@ -442,19 +442,19 @@ def test_flapping_is_told_when_it_ends(flight: Flight) -> None:
         told += flight.wait(0.1).send(xy_valid=False)
         told += flight.look()
     assert [event.time for event in told[4:]] == [times[-1]]
-    assert told[-1].text == "xy not valid, the last of 17 changes that are not told"
+    assert told[-1].text == "xy not valid, the last of 17 suppressed changes"
     assert told[-1].change == "begin"
 
 
 def test_flapping_of_one_is_not_of_another(flight: Flight) -> None:
-    """Each kind is counted by itself."""
+    """Each kind of condition is counted separately."""
     for index in range(20):
         flight.wait(0.1).send(xy_valid=index % 2 == 1)
     assert brief(flight.wait(0.1).send(z_valid=False)) == [("z_invalid", "begin", "bad")]
 
 
 def test_evidence_is_from_the_window(flight: Flight) -> None:
-    """Events within ten seconds before count; later ones, or ones of other kinds, do not."""
+    """Events up to ten seconds before are evidence; later ones, or ones of unrelated kinds, are not."""
     flight.gps()
     flight.gps(jamming_indicator=100)
     flight.gps()
@@ -474,7 +474,7 @@ def test_evidence_is_from_the_window(flight: Flight) -> None:
 
 
 def test_evidence_that_goes_on(flight: Flight) -> None:
-    """A condition that began long ago, and holds, counts at any time."""
+    """An active condition is evidence, however long ago it began."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.fly(10 * WINDOW)
@@ -483,14 +483,14 @@ def test_evidence_that_goes_on(flight: Flight) -> None:
 
 
 def test_evidence_of_others_does_not_count(flight: Flight) -> None:
-    """Each vehicle has its own."""
+    """Events of other vehicles are no evidence."""
     flight.send("vehicle_gps_position", vehicle="2", **GOOD_GPS)
     flight.send("vehicle_gps_position", vehicle="2", **GOOD_GPS | {"fix_type": 0})
     assert flight.wait(0.1).send(xy_valid=False)[0].evidence == ()
 
 
 def test_evidence_has_none_of_its_own(flight: Flight) -> None:
-    """Each event is told with what precedes it, one step back: chains do not grow."""
+    """Evidence has no evidence of its own, so chains do not grow."""
     flight.gps()
     flight.gps(fix_type=0)
     flight.wait(0.1).send(dead_reckoning=True)
@@ -500,7 +500,7 @@ def test_evidence_has_none_of_its_own(flight: Flight) -> None:
 
 
 def test_state_is_worst_first(flight: Flight) -> None:
-    """Bad comes before what is to be watched; what happened once is a reason to watch for a minute."""
+    """Bad is shown before watch; a single event of severity watch counts for a minute."""
     flight.wait(0.1).send(xy_reset_counter=1, delta_xy=(5.0, 0.0), x=5.0)
     assert (flight.severity, flight.kinds) == ("watch", ["reset"])
     flight.gps()
@@ -519,7 +519,7 @@ def test_state_is_worst_first(flight: Flight) -> None:
 
 
 def test_memory_is_bounded() -> None:
-    """An account keeps the last events, a thousand vehicles, and a thousand streams of each."""
+    """An account keeps the most recent events, a thousand vehicles, and a thousand streams per vehicle."""
     flight = Flight()
     for number in range(1100):
         flight.send(vehicle=f"v{number}")
@@ -531,13 +531,13 @@ def test_memory_is_bounded() -> None:
     assert len(known.topics) <= 1000
     for number in range(KEPT + 100):
         flight.status(DISARMED, vehicle="v2", nav_state=number % 2)
-    new, told = flight.account.take(0)
+    new, told = flight.account.events_since(0)
     assert (len(new), told) == (KEPT, KEPT + 99)
-    assert flight.account.take(told - 1) == ([new[-1]], told)
+    assert flight.account.events_since(told - 1) == ([new[-1]], told)
 
 
 def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
-    """Each rejection may have a reason of its own: nothing is remembered of those that are over."""
+    """Reasons of ended rejections are not kept, as each one may be different."""
     for number in range(200):
         flight.wait(20.0).reject(f"x is {number}")
         flight.wait(6.0).look()
@@ -545,7 +545,7 @@ def test_reasons_do_not_fill_the_memory(flight: Flight) -> None:
 
 
 def test_every_kind_is_known() -> None:
-    """Each explaining kind is itself a kind of event."""
+    """Each kind that may explain another one is a kind of event itself."""
     for kind, evidence in KINDS.items():
         assert set(evidence) <= set(KINDS), kind
 
@@ -583,15 +583,15 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 @given(STEPS)
 def test_events_are_consistent(steps: list[tuple[str, Any]]) -> None:
-    """Whatever comes: an end follows a begin, or ends what held at the first message, at most once since the boot.
+    """An end follows a begin or an initial condition, at most once since the boot, whatever arrives.
 
-    Nothing ends before it began, and evidence precedes what it explains.
+    Nothing ends before it began, and evidence precedes the event.
     """
     flight = Flight()
     for name, value in steps:
         ACTIONS[name][0](flight.wait(0.05), value)
     flight.link = ""
-    for _ in range(3):  # what flaps, and what was lost, is told in the end
+    for _ in range(3):  # reports flapping and losses that have ended
         flight.wait(20.0).look()
     begun: dict[tuple[str, str], Event] = {}
     initial: set[tuple[str, str]] = set()  # those that ended without a begin, which they can do once

@@ -234,7 +234,7 @@ def test_last_value_does_not_reach_ros_2(
     wait_for(bus.latest, what="the last value")
     subscriber = raw.declare_subscriber(KEY, zenoh.handlers.FifoChannel(1000))
     run_bridge()
-    wait_for(lambda: "->" in caplog.text and "that were held back: 1" in caplog.text, what="both")
+    wait_for(lambda: "->" in caplog.text and "1 old message held back" in caplog.text, what="both")
     wait_for_reader(raw, f"nedbus/1/{VLP}")
     for timestamp in range(2, 402):
         publisher.publish(message(timestamp))
@@ -262,7 +262,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
     put(1, first)
     assert subscriber.handler.recv().payload
     token.undeclare()
-    wait_for(lambda: "is no longer published" in caplog.text, what="the vehicle to go")
+    wait_for(lambda: "is no longer on the bus" in caplog.text, what="the vehicle to go")
     token = raw.liveliness().declare_token(address.alive_key())
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 2, what="the vehicle to be back")
     late = first + dt.timedelta(milliseconds=1)
@@ -270,7 +270,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
     put(2, late)
     put(3, raw.new_timestamp().get_time())
     assert decode_cdr(subscriber.handler.recv().payload.to_bytes(), layout="1.16")["timestamp"] == 3
-    wait_for(lambda: "that were held back: 1, up to" in caplog.text, what="the report")
+    wait_for(lambda: "1 old message held back, up to" in caplog.text, what="the report")
     token.undeclare()
 
 
@@ -305,7 +305,9 @@ def test_recovered_messages_do_not_reach_ros_2(run_nedbus: Start, tmp_path: Path
             first = len(published)
             wait_for(lambda: len(published) > first + 300, what="the outage")
             router, back = open_router(listen=(endpoint,)), time.monotonic()
-            wait_for(lambda: " s late: ROS 2 would use them as the current estimate" in bridge.err, what="the recovery")
+            wait_for(
+                lambda: " s late: ROS 2 would take them for the current estimate" in bridge.err, what="the recovery"
+            )
             last = len(published)
             wait_for(lambda: has_received(last), what="what is current")
         flight.result()
@@ -343,7 +345,7 @@ def test_topic_of_another_node_is_left_to_it(
     key = TopicKey(0, f"fmu/out/{VLP}", dds_type(ROS2_TYPE), type_hash("1.14"))
     token = raw.liveliness().declare_token(publisher_token(key, "cafe", "px4_0001", 7))
     bus.publisher(VLP, vehicle="1")
-    left, published = f"node px4_0001 publishes /fmu/out/{VLP} already: left to that node", f"-> /fmu/out/{VLP}, "
+    left, published = f"left to node px4_0001, which already publishes /fmu/out/{VLP}", f"-> /fmu/out/{VLP}, "
     run_bridge(layout="1.14")
     wait_for(lambda: left in caplog.text, what="the warning")
     assert published not in caplog.text
@@ -381,7 +383,7 @@ def test_loop_is_rejected(
 
         def is_rejected() -> bool:
             publisher.publish(message(next(timestamps)))
-            return "would loop" in caplog.text
+            return "ignored to avoid a loop" in caplog.text
 
         listener.turn_until(is_rejected, what="the rejection")
         assert (listener.messages, listener.rejections) == ([], [])
@@ -418,7 +420,7 @@ def test_router_that_hides_ros_2_is_named(monkeypatch: pytest.MonkeyPatch, tmp_p
         nedbus.connect(endpoint) as bus,
         plain_session(endpoint) as session,
         plain_session(endpoint) as observer,
-        pytest.raises(NedbusError, match="this router hides what nedbus announces to ROS 2"),
+        pytest.raises(NedbusError, match="access control denies the keys of ROS 2"),
     ):
         Ros2Bridge(bus, session, observer=observer).run(threading.Event())
 
@@ -426,8 +428,8 @@ def test_router_that_hides_ros_2_is_named(monkeypatch: pytest.MonkeyPatch, tmp_p
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "text"),
     [
-        (["--to", "tcp/127.0.0.1:1"], 1, "nothing answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
-        (["--layout", "1.12"], 2, "no layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0"),
+        (["--to", "tcp/127.0.0.1:1"], 1, "no router answers at tcp/127.0.0.1:1: start the router of ROS 2 there"),
+        (["--layout", "1.12"], 2, "unknown layout '1.12': choose from 1.13, 1.14, 1.15, 1.16, 1.17, 1.18, main, V0"),
         (["--namespace", "1:7up"], 2, "namespace '7up' is not valid"),
         (["--namespace", "7up"], 2, "VEHICLE:NAMESPACE"),
     ],

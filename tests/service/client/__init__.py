@@ -1,1 +1,1 @@
-"""Buses and their messages over a real router."""
+"""Tests of the bus and its messages through a real router."""

@@ -1,4 +1,4 @@
-"""Real logs, all that is in them: arrays, replays and recordings equal what pyulog reads."""
+"""All topics of real logs: arrays, replays and recordings equal those read by pyulog."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ DROPPED: Final = {  # fields of older layouts that PX4 took out again, and the m
     "vehicle_gps_position": {"selected"},
 }
 FLIGHTS: Final = [next(LOGS.parent.glob(f"*/{name}.ulg"), LOGS / f"{name}.ulg") for name in STREAMS]
-UTC: Final = {  # source, and the date of the boot as it tells it
+UTC: Final = {  # source of UTC, and the date of the boot
     "twelve_messages": ("timesync_status", "2026-11-22T23:08:32"),
     "cuav_1.16_gps_interference": ("timesync_status", "2026-01-13T05:53:53"),
     "cubeorange_1.12_small": ("vehicle_gps_position", "2021-04-21T06:30:38"),
@@ -72,7 +72,7 @@ each_flight = pytest.mark.parametrize("flight", FLIGHTS, ids=lambda path: path.s
 
 
 def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
-    """Return what pyulog reads, by the names that streams have here."""
+    """Return the streams read by pyulog, by their names in nedbus."""
     log = ULog(str(flight))
     several = {data.name for data in log.data_list if data.multi_id}
     found: dict[str, Mapping[str, npt.NDArray[Any]]] = {}
@@ -83,7 +83,7 @@ def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
 
 
 def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArray, flight: str) -> int:
-    """Assert that messages have the values of a log in all fields; return how many values were compared."""
+    """Assert that messages have the values of a log in all fields; return the number of compared values."""
     topic, compared = stream.partition("/")[0], 0
     for column, values in raw.items():
         *outer, last = re.sub(r"\[(\d+)\](?=.*\.)", r"_\1", column).split(".")
@@ -109,7 +109,7 @@ def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArra
 
 @each_flight
 def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
-    """Every topic of every log is read, each value to the bit; what is left out is known, with its reason."""
+    """Every topic of every log is read, bit for bit; the parts left out are known, with their reason."""
     raw, arrays = raw_streams(flight), nedbus.read(flight, ["*"])
     assert arrays.keys() == raw.keys()
     left_out = {topic: count for (log, topic, _), count in REJECTED.items() if log == flight.stem}
@@ -124,7 +124,7 @@ def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
 @pytest.mark.slow
 @each_flight
 def test_every_message_of_a_replay_is_its_value(flight: Path) -> None:
-    """A source delivers every topic of a log, and its messages are those of the arrays; nothing else is rejected."""
+    """A replay delivers every topic of a log, equal to the arrays; nothing else is rejected."""
     run = open_replay(f"ulog:{flight}?topics=*")
     assert (len(run.addresses), run.total) == STREAMS[flight.stem]
     assert run.damage is None
@@ -150,7 +150,7 @@ def test_every_message_of_a_replay_is_its_value(flight: Path) -> None:
 def test_every_message_of_a_log_reaches_another_process(
     flight: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus
 ) -> None:
-    """All topics of a log go log -> daemon -> router -> reader: what arrives are the arrays, and nothing is missing."""
+    """All topics of a log arrive at a reader through daemon and router, equal to the arrays and complete."""
     arrays = {stream: array for stream, array in nedbus.read(flight, ["*"]).items() if len(array)}
     rejected = sum(count for (log, _, _), count in REJECTED.items() if log == flight.stem)
     messages: dict[str, list[Any]] = {}
@@ -171,7 +171,7 @@ def test_every_message_of_a_log_reaches_another_process(
 @pytest.mark.slow
 @each_flight
 def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
-    """A recording has every message of a log, with what is missing, also of topics that only the log describes."""
+    """A recording has every message and all missing fields of a log, also of topics described by the log alone."""
     path = tmp_path / "flight.mcap"
     convert_replay(f"ulog:{flight}?topics=*", path)
     before, after = nedbus.read(flight, ["*"]), nedbus.read(path, ["*"])
@@ -188,7 +188,7 @@ def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
 
 @each_flight
 def test_utc_is_what_a_log_tells(flight: Path) -> None:
-    """A GNSS receiver tells it, or a companion's clock; of a log where none does it is absent."""
+    """UTC comes from a GNSS receiver or a companion's clock; without either it is absent."""
     found = nedbus.utc_of(flight)
     told = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
     assert told == UTC.get(flight.stem)
@@ -197,7 +197,7 @@ def test_utc_is_what_a_log_tells(flight: Path) -> None:
 
 @each_flight
 def test_log_is_one_table(flight: Path) -> None:
-    """All topics of a log stand in one table, at the times of one of them: each value is that of the last message."""
+    """All topics of a log in one table have their latest value at the times of one of them."""
     raw = raw_streams(flight)
     table = nedbus.align(flight, topics=["*"], utc=True)
     assert len(table) == len(raw["vehicle_local_position"]["timestamp"])
@@ -222,9 +222,9 @@ def test_log_is_one_table(flight: Path) -> None:
 
 
 def test_plot_of_another_topic_says_why_not(tmp_path: Path) -> None:
-    """Only positions have a track; the error says how to look at others."""
+    """Only positions have a track; the error names the way to plot other topics."""
     plot = run_command("plot", str(FLIGHTS[0]), "-t", "vehicle_attitude", "-o", str(tmp_path / "a.png"))
     assert plot.exit_code == 2
-    assert "vehicle_attitude has no track to draw" in plot.err
+    assert "vehicle_attitude has no track" in plot.err
     drawn = run_command("plot", str(LOGS.parent / "px4" / "twelve_messages.ulg"), "-t", "*", "-o", f"{tmp_path}/a.png")
     assert drawn.exit_code == 0, drawn.err

@@ -1,4 +1,4 @@
-"""Messages that have no file here: from a log over a service to readers that learn from its publisher what they are."""
+"""Messages without a file in nedbus: from a log through a service to readers that query their definition."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COUNT = 500
 def test_message_of_a_log_is_read_without_a_file(
     tmp_path: Path, run_nedbus: Start, endpoint: str, bus: nedbus.Bus, form: str
 ) -> None:
-    """Nothing of it is lost while the reader asks what it is, in any form; the values are those of the log."""
+    """No message is lost during the lookup, in any form; the values are those of the log."""
     log = write_wheels(tmp_path / "rover.ulg", COUNT)
     with bus.subscribe("wheel_encoders", mode="every") as subscription:
         run_nedbus("serve", "-c", endpoint, "--source", f"ulog:{log}?topics=*&speed=max&wait=1")
@@ -62,10 +62,10 @@ def test_message_of_a_log_is_read_without_a_file(
         {"fields": []},
     ],
 )
-def test_hostile_description_harms_nobody(
+def test_hostile_description_harms_no_other_stream(
     client: nedbus.Bus, bus: nedbus.Bus, raw: Session, answer: bytes | dict[str, object]
 ) -> None:
-    """A peer that says nonsense of a message of its own: that message is invalid, and others are read."""
+    """If a peer sends a wrong description, its own message is invalid, and others are read."""
     payload = answer if isinstance(answer, bytes) else json.dumps({"layouts": [{"wire": 0, **answer}]}).encode()
     schema = "nedbus/@schema/Evil"
     with answering(raw, schema, reply_with({schema: payload})), client.subscribe("*", mode="every") as subscription:
@@ -86,7 +86,7 @@ def test_hostile_description_harms_nobody(
 def test_message_of_unknown_encoding_says_so(
     client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Without a message in its encoding nobody can be asked what it is."""
+    """Without a known encoding a message cannot be looked up, and the error says so."""
     with client.subscribe("wheel_encoders") as subscription:
         wait_for_reader(raw, "nedbus/7/wheel_encoders")
         raw.put("nedbus/7/wheel_encoders", b"\x91\x00", encoding="text/plain")
@@ -97,4 +97,4 @@ def test_message_of_unknown_encoding_says_so(
             return subscription.counts.invalid == 1
 
         wait_for(is_counted, what="it to be counted")
-    assert "it does not name its message: its encoding is 'text/plain'" in caplog.text
+    assert "unknown message type: the encoding 'text/plain' names none" in caplog.text

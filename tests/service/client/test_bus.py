@@ -1,4 +1,4 @@
-"""Publish, subscribe, ask: the same rules for the sync and the async client, over a real router."""
+"""Publish, subscribe and query: the same behaviour of the blocking and the asyncio client, through a real router."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SCHEMA = "nedbus/@schema/VehicleLocalPosition"
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mode) -> None:
-    """A published message arrives typed, equal to the bit, with its address and times."""
+    """A published message arrives with its type, bit for bit, with its address and times."""
     publisher = bus.publisher("estimator_local_position", vehicle=7, instance=1)
     sent = message(5, x=0.1, ref_lat=47.397742123456789, vxy_max=math.inf, delta_xy=(1.0, math.nan))
     subscription = client.subscribe("*", mode=mode)
@@ -52,8 +52,8 @@ def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, mode: Mo
     assert sample.latency is not None
 
 
-def test_single_message_reaches_whoever_subscribes_next(bus: nedbus.Bus, endpoint: str) -> None:
-    """The router knows a publisher before it can publish: else one of 300 was never seen, beside three busy loops."""
+def test_single_message_reaches_the_next_subscriber(bus: nedbus.Bus, endpoint: str) -> None:
+    """A publisher is known to the router before its first message, which a new reader else misses once in 300 times."""
     with nedbus.connect(endpoint) as other:
         for vehicle in range(100):
             publish(bus.publisher(VLP, vehicle=vehicle), 1)
@@ -61,10 +61,10 @@ def test_single_message_reaches_whoever_subscribes_next(bus: nedbus.Bus, endpoin
 
 
 def test_subscription_is_a_choice(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Topic, vehicle, by name or by MAVLink's number, and instance choose what arrives; by default it is the estimate.
+    """A subscription is selected by topic, vehicle name or MAVLink number, and instance; the default is the estimate.
 
-    That is mixed neither with the truth nor with single EKFs. A subscription starts with the last value of each key,
-    even if nothing is published any more.
+    The estimate is mixed neither with the ground truth nor with single EKFs. A subscription starts with the last value
+    of each key, even if nothing is published any more.
     """
     for vehicle in ("1", "2"):
         for topic in reversed(tuple(DEFAULT.topics.values())):
@@ -86,7 +86,7 @@ def test_subscription_is_a_choice(client: nedbus.Bus, bus: nedbus.Bus) -> None:
 
 
 def test_latest_is_empty_where_nothing_is(client: nedbus.Bus) -> None:
-    """No publisher, no answer, no error."""
+    """Without a publisher the result is empty, without an error."""
     assert client.latest("*") == []
     assert client.vehicles() == {}
     assert client.services() == []
@@ -97,9 +97,9 @@ def has_vehicles(bus: nedbus.Bus, count: int) -> bool:
 
 
 def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Liveliness shows what is published now, and forgets what is closed.
+    """Published vehicles appear by their liveliness tokens, and closed ones disappear.
 
-    Asking for all tokens costs everybody on the router: whoever asks again and again only follows them.
+    A query for all tokens costs all clients of the router, so only the first call sends one.
     """
     asked: list[str] = []
 
@@ -122,10 +122,10 @@ def test_vehicles_come_and_go(client: nedbus.Bus, endpoint: str, monkeypatch: py
     )
 
 
-def test_more_vehicles_come_than_are_kept_until_somebody_asks(
+def test_more_vehicles_appear_between_calls_than_are_kept(
     endpoint: str, bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Then all are asked for once more: none is missing, and none that has gone is still there."""
+    """After an overflow all tokens are queried again: the list is complete and has no vehicles that left."""
     monkeypatch.setattr(alive_tokens, "_MAX_CHANGES", 4)
     gone = raw.liveliness().declare_token(f"nedbus/gone/@alive/{VLP}")
     wait_for(lambda: list(bus.vehicles()) == ["gone"], what="the first one")
@@ -139,10 +139,10 @@ def test_more_vehicles_come_than_are_kept_until_somebody_asks(
 INCOMPLETE = "not all liveliness tokens are known"
 
 
-def test_more_vehicles_than_are_kept_are_said(
+def test_too_many_vehicles_are_logged(
     endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Once, while it is so: two of three are no whole list."""
+    """Too many vehicles are logged once while it lasts; two of three are an incomplete list."""
     monkeypatch.setattr(alive_tokens, "MAX_ANSWERS", 2)
     for number in range(3):
         bus.publisher(VLP, vehicle=str(number))
@@ -152,10 +152,10 @@ def test_more_vehicles_than_are_kept_are_said(
     assert caplog.text.count(INCOMPLETE) == 1
 
 
-def test_router_that_is_too_slow_to_list_vehicles_is_said(
+def test_router_that_is_too_slow_to_list_vehicles_is_logged(
     endpoint: str, bus: nedbus.Bus, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The list that it gave is incomplete, and becomes complete by itself."""
+    """The list of a slow router is incomplete, and completes by itself."""
     publishers = [bus.publisher(VLP, vehicle=str(number)) for number in range(3)]
     with closing(Link(endpoint)) as link, nedbus.connect(link.endpoint) as other:
         link.flows.clear()
@@ -166,7 +166,7 @@ def test_router_that_is_too_slow_to_list_vehicles_is_said(
 
 
 def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
-    """More answers than a channel of Zenoh's holds (256) do not block, whoever asks: their own bus, or another."""
+    """More replies than a Zenoh channel holds (256) do not block, neither within their own bus nor in another."""
     with nedbus.connect(endpoint) as one, nedbus.connect(endpoint) as other:
         for number in range(300):
             publish(one.publisher(VLP, vehicle=str(number)), 1)
@@ -176,12 +176,12 @@ def test_hundreds_of_publishers_answer_their_own_bus(endpoint: str) -> None:
 
 
 def answers(raw: Session, key: str) -> int:
-    """Count the answers to a plain get."""
+    """Count the replies to a plain get."""
     return sum(reply.ok is not None for reply in raw.get(key))
 
 
 def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str, raw: Session) -> None:
-    """A plain get is answered by whoever publishes the key, also when another publishes the same vehicle."""
+    """All publishers of a key reply to a plain get, also if two processes publish the same vehicle."""
     with nedbus.connect(endpoint) as other:
         for each, topic in ((bus, VLP), (other, "external_ins_local_position")):
             publish(each.publisher(topic, vehicle="1"), 1)
@@ -190,7 +190,7 @@ def test_two_processes_of_one_vehicle_both_answer(bus: nedbus.Bus, endpoint: str
 
 
 def test_error_in_an_answer_is_only_its_own(bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread that answers queries survives a bug in one answer."""
+    """The query thread survives an exception in one reply."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     wait_for(partial(answers, raw, publisher.key), what="an answer")
@@ -201,7 +201,7 @@ def test_error_in_an_answer_is_only_its_own(bus: nedbus.Bus, raw: Session, monke
 
 
 def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus, raw: Session) -> None:
-    """A storage that kept a message with a later time, of the vehicle's last run, does not hide the live one."""
+    """A stored message with a later time, from an earlier run of the vehicle, does not replace the live one."""
     later = zenoh.Timestamp(dt.datetime.now(dt.UTC) + dt.timedelta(hours=1), b"\x07")
     stored = {f"nedbus/{vehicle}/{VLP}": encode(message(99)) for vehicle in "12"}
     publish(bus.publisher(VLP, vehicle="1"), 1)
@@ -214,7 +214,7 @@ def test_live_answer_wins_over_a_stored_one(client: nedbus.Bus, bus: nedbus.Bus,
 
 
 def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) -> None:
-    """A layout that its publisher explains is read by `latest` as by `subscribe`."""
+    """`latest` reads a layout described by its publisher, like `subscribe`."""
     types = {"timestamp": "uint64", "brand_new": "bool", "x": "float32"}
     layout = {"wire": 9, "fields": [{"name": name, "type": kind} for name, kind in types.items()]}
     explained = reply_with({SCHEMA: json.dumps({"layouts": [layout]}).encode()})
@@ -224,23 +224,23 @@ def test_last_value_in_a_newer_layout_is_read(client: nedbus.Bus, raw: Session) 
 
 
 def services_of(answers: Mapping[str, bytes]) -> Callable[[zenoh.Query], None]:
-    """Answer each question for services with all of these, by the name of a service."""
+    """Reply to each query for services with all of these contents, by name of the service."""
     return reply_with({f"nedbus/@service/{name}/status": payload for name, payload in answers.items()})
 
 
 def test_hostile_answers_reach_no_script(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
-    """A status that is no JSON, or nested without end, is left out, with one line for all of them."""
+    """A status that is not JSON, or nested endlessly, is ignored, with one log line for all of them."""
     junk = {"evil": b"[" * 100_000, **{f"{'x' * 30_000}{number}": b"junk" for number in range(20)}}
     with answering(raw, "nedbus/@service/*/status", services_of(junk)):
         assert client.services() == []
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert [text.endswith(": an answer that is not JSON") and len(text) < 1000 for text in warned] == [True]
+    assert [text.endswith(": ignored a reply that is not JSON") and len(text) < 1000 for text in warned] == [True]
 
 
 def test_status_that_grows_when_it_is_read_fills_no_memory(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """JSON may take up 30 times its length: of 480 kB, what is beyond 4 MiB is left out, and that is logged."""
+    """JSON may take 30 times its length in memory: of 480 kB, everything beyond 4 MiB is ignored and logged."""
     monkeypatch.setattr("nedbus.client.discovery._MAX_MEMORY", 2**22, raising=False)
     large = b'{"a": [' + 8_000 * b"{}," + b"0]}"
     many = {**{f"evil{number}": large for number in range(20)}, "honest": b'{"host": "honest"}'}
@@ -248,11 +248,11 @@ def test_status_that_grows_when_it_is_read_fills_no_memory(
         services = bus.services(timeout=DEADLINE)
     assert len(services) == 3
     assert "honest" in [each.service for each in services]
-    assert "18 answers are left out: they are too large" in caplog.messages
+    assert "ignored 18 replies that are too large" in caplog.messages
 
 
 def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) -> None:
-    """Of a status the id is that of its key, unknown fields are ignored, and invalid values and rows are left out."""
+    """The id of a status is that of its key, unknown fields are ignored, and invalid values and rows are dropped."""
     sources = [5, {"source": "sim:", "state": "new", "published": [], "addresses": ["1/x", 5], "streams": [{}], "z": 1}]
     told = {"service": "lie", "host": "here", "now": 10**400, "version": [1], "sources": sources, "shape": {"of": "it"}}
     with answering(raw, "nedbus/@service/*/status", services_of({"a": json.dumps(told).encode(), "b": b"[5]"})):
@@ -265,17 +265,17 @@ def test_status_of_a_hostile_or_newer_service(client: nedbus.Bus, raw: Session) 
 def test_answers_that_are_too_many_are_left_out(
     bus: nedbus.Bus, raw: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The bytes that are kept of one question are bounded, and the log says how many answers were left out."""
+    """The bytes kept of one query are bounded, and the number of ignored replies is logged."""
     monkeypatch.setattr("nedbus.transport.queries.MAX_ANSWER_BYTES", 10_500)
     status = b'{"a": "' + 950 * b"x" + b'"}'
     many = {f"evil{number:02}": status for number in range(50)}
     with answering(raw, "nedbus/@service/*/status", services_of(many)):
         assert len(bus.services(timeout=DEADLINE)) == 10
-    assert "nedbus/@service/*/status: 40 answers too many are left out" in caplog.messages
+    assert "nedbus/@service/*/status: 40 answers left out, beyond the limits of a query" in caplog.messages
 
 
 def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """Fields by name are validated; what is no message is refused before it is sent."""
+    """Fields by name are validated; anything that is not a message is refused before it is sent."""
     publisher = client.publisher(VLP, vehicle="1")
     publisher.publish({"timestamp": 4, "x": 1.0})
     wait_for(lambda: [sample.message.x for sample in bus.latest(VLP)] == [1.0], what="the message")
@@ -287,15 +287,15 @@ def test_publish_takes_messages_and_fields(client: nedbus.Bus, bus: nedbus.Bus) 
 
 
 def test_two_publishers_of_one_address_are_refused(client: nedbus.Bus) -> None:
-    """Two sources of one key would mix two flights into one."""
+    """A second publisher of an address is refused, as it would mix two flights."""
     publisher = client.publisher(VLP, vehicle="1")
-    with pytest.raises(nedbus.AddressInUseError, match="1/vehicle_local_position is published by this process already"):
+    with pytest.raises(nedbus.AddressInUseError, match="this process already publishes 1/vehicle_local_position"):
         client.publisher(VLP, vehicle="1")
     publish(publisher, 1)
 
 
 def test_two_threads_get_one_publisher_of_an_address(bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other one is refused, though there is none yet when it asks."""
+    """Of two threads that open a publisher for the same address at once, one is refused."""
     both = threading.Barrier(2)
 
     def meet(*arguments: object, **options: object) -> nedbus.Publisher:
@@ -310,21 +310,21 @@ def test_two_threads_get_one_publisher_of_an_address(bus: nedbus.Bus, monkeypatc
 
 
 def test_wrong_names_are_refused_before_anything_is_sent(client: nedbus.Bus) -> None:
-    """A typo in a topic, a vehicle or the mode is an AddressError at once, not a silent subscription."""
+    """A wrong topic, vehicle or mode is an AddressError at once, not a subscription without data."""
     with pytest.raises(nedbus.AddressError, match="vehicle_local_positon"):
         client.subscribe("vehicle_local_positon")
     with pytest.raises(nedbus.AddressError, match="mode 'newest' is not valid: expected one of latest, every"):
         client.subscribe("*", mode=cast("Mode", "newest"))
     with pytest.raises(nedbus.AddressError, match="vehicle"):
         client.latest(vehicle="a/b")
-    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*vehicles need a call each"):
+    with pytest.raises(nedbus.AddressError, match=r"vehicle \['1', '2'\] .* one name, .*a call for each of several"):
         client.subscribe(vehicle=["1", "2"])  # type: ignore[call-overload] # that is the mistake
     with pytest.raises(nedbus.AddressError, match="instance"):
         client.publisher("estimator_local_position", vehicle="1")
 
 
 def test_prefix_separates(endpoint: str) -> None:
-    """Two fleets on one router do not see each other."""
+    """Fleets with different prefixes on one router do not see each other."""
     with nedbus.connect(endpoint, prefix="fleet/a") as one, nedbus.connect(endpoint, prefix="fleet/b") as two:
         publish(one.publisher(VLP, vehicle="1"), 1)
         assert [sample.vehicle for sample in one.latest("*")] == ["1"]
@@ -334,7 +334,7 @@ def test_prefix_separates(endpoint: str) -> None:
 
 
 def test_receive_times_out_with_words(client: nedbus.Bus) -> None:
-    """NoDataError is a TimeoutError, and says what did not come and what to do."""
+    """NoDataError is a TimeoutError; its text has the key that did not arrive, and advice."""
     subscription = client.subscribe(VLP, vehicle="9")
     with pytest.raises(TimeoutError, match=rf"nedbus/9/{VLP} within 0\.05 s.*nedbus list") as info:
         subscription.receive(0.05)
@@ -343,7 +343,7 @@ def test_receive_times_out_with_words(client: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("timeout", [0.0, -1.0, float("inf")])
 def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
-    """None of these is an error of another library."""
+    """No timeout value leads to an error of another library."""
     publish(bus.publisher(VLP, vehicle="1"), 1)
     bus.latest("*", timeout=timeout)
     bus.vehicles(timeout=timeout)
@@ -360,7 +360,7 @@ def test_any_timeout_is_taken(bus: nedbus.Bus, timeout: float) -> None:
 
 
 def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
-    """A reader that always finds a sample still gives way to the loop."""
+    """A reader that always finds a sample still yields to the event loop."""
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def scenario() -> int:
@@ -388,7 +388,7 @@ def test_async_reader_lets_others_run(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
-    """A receive that times out has taken nothing."""
+    """A receive that times out does not lose a sample."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
 
@@ -407,7 +407,7 @@ def test_async_timeouts_lose_nothing(endpoint: str, bus: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> None:
-    """Each message goes to one of them, and neither fails, in either mode."""
+    """Each message goes to one of two threads, without an error, in either mode."""
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(mode=mode)
     wait_for_subscriber(publisher)
@@ -432,7 +432,7 @@ def test_two_threads_may_read_one_subscription(bus: nedbus.Bus, mode: Mode) -> N
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda sample: pickle.loads(pickle.dumps(sample))])
 def test_sample_can_be_copied_pickled_and_hashed(bus: nedbus.Bus, copied: Callable[[object], nedbus.Sample]) -> None:
-    """A script may queue samples for another process, or keep them in a set; the time when it was sent stays exact."""
+    """Samples can be queued for another process and kept in sets; the time of sending stays exact."""
     bus.publisher(VLP, vehicle="1", source="test").publish(message(1, x=math.nan))
     sample = bus.subscribe().receive(DEADLINE)
     again = copied(sample)

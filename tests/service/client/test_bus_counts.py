@@ -1,4 +1,4 @@
-"""Counts of a reader over a real router, which goes on: floods, junk, unknown layouts, rejected messages."""
+"""Counts of a reader through a real router, under floods, junk, unknown layouts and rejected messages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ADDRESS = Address("7", "estimator_local_position", 1)  # of what is rejected
 
 @pytest.fixture
 def publisher(bus: nedbus.Bus) -> nedbus.Publisher:
-    """Return a publisher of a first message: whoever has got that is known to listen."""
+    """Return a publisher of a first message; readers that have received it are known to be subscribed."""
     publisher = bus.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     return publisher
@@ -45,7 +45,7 @@ def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_every_sample_arrives_in_order(client: nedbus.Bus, publisher: nedbus.Publisher) -> None:
-    """Mode "every" gives each sample once, in order, with counts to prove it."""
+    """Mode "every" gives each sample once, in order, and its counts prove it."""
     subscription = client.subscribe(VLP, mode="every")
     first = subscription.receive(DEADLINE)
     publish(publisher, *range(2, 1002))
@@ -55,14 +55,14 @@ def test_every_sample_arrives_in_order(client: nedbus.Bus, publisher: nedbus.Pub
 
 
 def test_latest_keeps_what_is_quiet(client: nedbus.Bus, publisher: nedbus.Publisher, bus: nedbus.Bus) -> None:
-    """A busy vehicle does not push a quiet one out while the reader pauses, and everything is counted, exactly."""
+    """A busy vehicle does not displace a quiet one while the reader pauses, and all messages are counted exactly."""
     subscription = client.subscribe(VLP)
     assert take(subscription, 1) == [1]
     publish(bus.publisher(VLP, vehicle="quiet"), 1)
     publish(publisher, *range(2, 3001))
 
     def is_counted() -> bool:
-        """Return whether all but the newest are counted; if not, send one more, which tells of those that are lost."""
+        """Return True if all but the newest message are counted; else send another one, which reveals its losses."""
         counts = subscription.counts
         if counts.dropped + counts.lost < publisher.published - 2:
             publish(publisher, 3000)
@@ -77,10 +77,10 @@ def test_latest_keeps_what_is_quiet(client: nedbus.Bus, publisher: nedbus.Publis
 
 
 @pytest.mark.parametrize("mode", BOTH)
-def test_unread_subscription_holds_up_nobody(
+def test_unread_subscription_delays_no_other(
     client: nedbus.Bus, endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, mode: Mode
 ) -> None:
-    """While it is full, others of its bus and of another get all, and its bus still asks; it does not hold close."""
+    """A full subscription delays no other of any bus, no query, and not its own close."""
     monkeypatch.setattr("nedbus.client.receiving.receiver.RING_CAPACITY", 256)
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 1000)
     stuck = client.subscribe(VLP, mode=mode)
@@ -100,7 +100,7 @@ def test_unread_subscription_holds_up_nobody(
 
 
 def test_absent_is_counted_exactly(endpoint: str, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a flood that neither buffers nor the queue of a reader hold, each message is received, lost or dropped."""
+    """Each message of a flood that exceeds buffers and queue is counted as received, lost or dropped."""
     monkeypatch.setattr("nedbus.client.receiving.pending_queue.CAPACITY", 1000)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         first = subscription.receive(DEADLINE)
@@ -122,7 +122,7 @@ def test_absent_is_counted_exactly(endpoint: str, publisher: nedbus.Publisher, m
 
 
 def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.Bus, endpoint: str) -> None:
-    """Their sequences are followed apart, also of one that comes when the other has gone."""
+    """Publishers of one key have independent sequences, also if one starts after the other has gone."""
     subscription = client.subscribe(VLP, mode="every")
     one = bus.publisher(VLP, vehicle="1")
     with nedbus.connect(endpoint) as other:
@@ -141,7 +141,7 @@ def test_two_publishers_of_one_key_lose_nothing(client: nedbus.Bus, bus: nedbus.
 
 
 def test_two_threads_get_a_message_each(bus: nedbus.Bus) -> None:
-    """Whoever receives for both wakes the other, who may be the only one that goes on reading."""
+    """A thread that receives for both wakes up the other one, which may be the only one to read on."""
     publisher, subscription = bus.publisher(VLP, vehicle="1"), bus.subscribe(mode="every")
     wait_for_subscriber(publisher)
     with ThreadPoolExecutor(2) as pool, subscription:
@@ -154,7 +154,7 @@ def test_two_threads_get_a_message_each(bus: nedbus.Bus) -> None:
 def test_invalid_payload_never_ends_an_iteration(
     client: nedbus.Bus, raw: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Garbage, foreign keys, deletes and wildcard puts are counted and named once; good samples come through."""
+    """Garbage, foreign keys, deletes and wildcard puts are counted and logged once; valid samples arrive."""
     subscription = client.subscribe("*", mode="every")
     assert take(subscription, 1) == [1]
     good = encode(message(2, x=1.0))
@@ -180,7 +180,7 @@ def test_invalid_payload_never_ends_an_iteration(
 def test_long_keys_cost_a_reader_nothing(
     bus: nedbus.Bus, raw: Session, publisher: nedbus.Publisher, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """150 invalid keys of 60 kB are counted; the reader keeps none of them, and logs 100 short lines at most."""
+    """150 invalid keys of 60 kB are counted but not kept, with 100 short log lines at most."""
     subscription = bus.subscribe("*", mode="every")
     assert take(subscription, 1) == [1]
     tracemalloc.start()
@@ -199,7 +199,7 @@ def test_long_keys_cost_a_reader_nothing(
 
 
 def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, caplog: pytest.LogCaptureFixture) -> None:
-    """An unknown layout is looked up once, while its messages are invalid; unknown fields are said once."""
+    """An unknown layout is looked up once; its messages are invalid until then, and unknown fields are logged once."""
     fields = [{"name": name, "type": "any"} for name in ("timestamp", "brand_new", "x")]
     reply = reply_with({SCHEMA: json.dumps({"layouts": [{"name": "9.9", "wire": 9, "fields": fields}]}).encode()})
     asked: list[object] = []
@@ -222,8 +222,8 @@ def test_newer_layout_is_read_by_its_schema(client: nedbus.Bus, raw: Session, ca
 @pytest.mark.parametrize(
     "answer", [b"no json", b"[]", b'{"layouts": 3}', b'{"layouts": [{"wire": 9, "fields": [1, 2]}]}']
 )
-def test_layout_that_nobody_explains_is_invalid(bus: nedbus.Bus, raw: Session, answer: bytes) -> None:
-    """A hostile or broken answer about a layout is as good as none: the payload is counted as invalid."""
+def test_layout_without_a_description_is_invalid(bus: nedbus.Bus, raw: Session, answer: bytes) -> None:
+    """After a hostile or broken description of a layout its messages are counted as invalid."""
     with answering(raw, SCHEMA, reply_with({SCHEMA: answer})):
         subscription = bus.subscribe(VLP, mode="every")
         wait_for_reader(raw, KEY)
@@ -235,7 +235,7 @@ def test_layout_that_nobody_explains_is_invalid(bus: nedbus.Bus, raw: Session, a
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, raw: Session, mode: Mode) -> None:
-    """It sends unknown layouts, and holds the question for them: others are read meanwhile, and it is asked once."""
+    """A peer that sends unknown layouts and never replies delays no other stream, and is queried once."""
     held = raw.declare_queryable(SCHEMA, zenoh.handlers.RingChannel(100))
     publisher = bus.publisher(VLP, vehicle="1")
     subscription = bus.subscribe(VLP, mode=mode)
@@ -255,7 +255,7 @@ def test_peer_that_never_answers_silences_no_reader(bus: nedbus.Bus, raw: Sessio
 def test_unexpected_error_in_the_pump_is_counted(
     bus: nedbus.Bus, publisher: nedbus.Publisher, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A bug that one sample triggers is logged and counted; the sample is asked for again, and the reader goes on."""
+    """An exception caused by a sample is logged and counted, the sample is requested again, and the reader goes on."""
     subscription = bus.subscribe(mode="every")
     assert take(subscription, 1) == [1]
     with monkeypatch.context() as patched:
@@ -264,11 +264,11 @@ def test_unexpected_error_in_the_pump_is_counted(
         wait_for(lambda: subscription.counts.invalid == 1, what="the sample to be counted")
     publish(publisher, 3)
     assert take(subscription, 2) == [2, 3]
-    assert any("left out after an unexpected error" in text for text in caplog.messages)
+    assert any("unexpected error, " in text and "discarded" in text for text in caplog.messages)
 
 
 def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None:
-    """A report of a service is read with its address; anything else is left out, whatever its sender."""
+    """A report of a service is read with its address; anything else is ignored."""
     rejections = bus.rejections()
     wait_for_reader(raw, ADDRESS.rejected_key())
     for key, payload in (
@@ -296,7 +296,7 @@ def test_reports_arrive_with_their_reason(bus: nedbus.Bus, raw: Session) -> None
 
 
 def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
-    """A closed bus says so, and closing twice is nothing."""
+    """A closed bus raises ClosedError, and closing is idempotent."""
     bus = nedbus.connect(endpoint)
     rejections = bus.rejections()
     bus.close()
@@ -308,7 +308,7 @@ def test_nothing_is_taken_after_the_end(endpoint: str) -> None:
 
 
 def test_calls_of_one_sample(publisher: nedbus.Publisher, endpoint: str) -> None:
-    """A reader that waits for each sample takes it with at most 22 calls of Python functions, in five classes of the client."""
+    """A reader that waits for each sample receives it with at most 22 Python calls, in five classes of the client."""
     called: list[list[str]] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:

@@ -1,4 +1,4 @@
-"""Beginning and end of a bus: absent routers, closing, cancelling, forks and garbage, of either client."""
+"""Opening and closing of a bus: absent routers, cancelling, forks and garbage collection, with either client."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _STEPS: Final = 100  # more than there are in a read that waits
 
 
 def test_nothing_listening_is_a_clear_error() -> None:
-    """The error is a ConnectionError, and says where, for how long, and what to do."""
+    """The error is a ConnectionError with the endpoint, the time waited, and advice."""
     where = free_endpoint()
     assert issubclass(nedbus.ConnectError, ConnectionError)
     with pytest.raises(nedbus.ConnectError, match=rf"nothing answers at {where} .*nedbus serve.*NEDBUS_CONNECT"):
@@ -42,7 +42,7 @@ def test_nothing_listening_is_a_clear_error() -> None:
 
 @pytest.mark.parametrize("is_async", [False, True])
 def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> None:
-    """`timeout=None` waits for a router, for as long as it takes."""
+    """`timeout=None` waits for a router without a limit."""
     where = free_endpoint()
 
     async def connect_async() -> bool:
@@ -66,9 +66,9 @@ def test_connecting_without_a_timeout_waits_for_a_router(*, is_async: bool) -> N
 def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
     endpoint: str, bus: nedbus.Bus, read: Callable[[nedbus.Subscription[Any]], nedbus.Sample[Any]]
 ) -> None:
-    """A read that is interrupted, wherever it is, keeps neither the next one nor the close from ending.
+    """A read interrupted at any point blocks neither the next read nor the close.
 
-    CPython looks for signals where a function of Python begins, and where one of C has returned.
+    CPython handles signals where a Python function begins, and where a C function has returned.
     """
     publisher, interrupted = bus.publisher(VLP, vehicle="1"), list[int]()
 
@@ -104,7 +104,7 @@ def test_ctrl_c_amid_any_step_of_a_read_keeps_no_lock(
 
 
 def test_wait_that_is_cancelled_leaves_nothing() -> None:
-    """A program that gives up, and goes on without a router, hears no more of the thread that tried."""
+    """After a cancelled connect the connecting thread ends without a trace."""
     said: list[object] = []
 
     async def scenario() -> None:
@@ -120,7 +120,7 @@ def test_wait_that_is_cancelled_leaves_nothing() -> None:
 
 
 def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several endpoints are several chances; NEDBUS_CONNECT is for scripts that should not name a router."""
+    """The first of several endpoints that answers is used; NEDBUS_CONNECT is used by scripts without an endpoint."""
     with nedbus.connect([free_endpoint(), endpoint]) as bus:
         assert bus.connected
     monkeypatch.setenv("NEDBUS_CONNECT", endpoint)
@@ -129,7 +129,7 @@ def test_router_is_one_of_several_or_named_in_the_environment(endpoint: str, mon
 
 
 def test_timeout_includes_the_opening() -> None:
-    """A receive with a timeout does not wait longer for the router, which is away, than for a message."""
+    """A receive with a timeout does not wait longer for an absent router than for a message."""
     where = free_endpoint()
     router = open_router(listen=(where,))
 
@@ -144,7 +144,7 @@ def test_timeout_includes_the_opening() -> None:
 
 
 def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
-    """Receives that are cancelled while the subscription opens leave one subscriber, and no message comes twice."""
+    """Receives cancelled while the subscription opens leave one subscriber, without duplicates."""
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def scenario() -> None:
@@ -165,7 +165,7 @@ def test_cancelled_opening_opens_once(endpoint: str, bus: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("mode", BOTH)
 def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, mode: Mode) -> None:
-    """Iteration ends without an error, also that of a thread that waits; receive says it; closing twice is fine."""
+    """A close ends an iteration without an error, also in another thread; receive raises; close is idempotent."""
     with nedbus.connect(endpoint) as bus:
         waiting = bus.subscribe(VLP, mode=mode)
         reader = threading.Thread(target=list, args=(waiting,), daemon=True)
@@ -182,7 +182,7 @@ def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, m
 
 
 def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """A publisher that was closed is not listed, answers no more, refuses to publish, and makes room for another."""
+    """A closed publisher is not listed, does not reply, refuses to publish, and frees its address."""
     publisher = client.publisher(VLP, vehicle="1")
     publish(publisher, 1)
     wait_for(bus.latest, what="the message")
@@ -197,7 +197,7 @@ def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
 
 
 def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
-    """Everything that is asked of a closed bus raises ClosedError, and its subscriptions end."""
+    """Every call on a closed bus raises ClosedError, and its subscriptions end."""
     subscription = client.subscribe(VLP)
     publisher = client.publisher(VLP, vehicle="1")
     client.close()
@@ -211,7 +211,7 @@ def test_closed_bus_ends_everything(client: nedbus.Bus) -> None:
 
 
 def test_forgotten_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
-    """A bus lives as long as something of it, be it a publisher alone; then it is closed, before the process ends."""
+    """A bus stays open while any of its objects exists, even only a publisher, and closes before the process exits."""
     forgotten = nedbus.connect(endpoint)
     gone = weakref.ref(forgotten)
     publisher, subscription = forgotten.publisher(VLP, vehicle="1"), forgotten.subscribe(mode="every")
@@ -228,7 +228,7 @@ def test_forgotten_bus_is_closed(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_collecting_garbage_never_closes() -> None:
-    """Garbage is collected in any thread, with any lock held: the closing, which waits, is done by another."""
+    """Garbage is collected in any thread with any lock held, so the closer thread does the closing, which may block."""
     lock = threading.Lock()
     closed: list[threading.Thread] = []
 
@@ -246,8 +246,8 @@ def test_collecting_garbage_never_closes() -> None:
     assert closed != [threading.current_thread()]
 
 
-def test_question_that_nobody_answers_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
-    """A queryable that keeps its queries does not hold a script that asks: Ctrl-C ends the wait."""
+def test_query_without_a_reply_ends_with_ctrl_c(start: Start, endpoint: str, raw: Session) -> None:
+    """A Ctrl-C ends the wait for a queryable that never replies."""
     kept: list[zenoh.Query] = []
     code = 'import nedbus; bus = nedbus.connect(); print("ready", flush=True); bus.latest(timeout=600)'
     with answering(raw, "nedbus/**", kept.append):
@@ -257,8 +257,8 @@ def test_question_that_nobody_answers_ends_with_ctrl_c(start: Start, endpoint: s
         assert process.wait() == -signal.SIGINT, process.err
 
 
-def test_forked_process_is_told_at_once(start: Start, endpoint: str) -> None:
-    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child still ends."""
+def test_forked_process_gets_an_error_at_once(start: Start, endpoint: str) -> None:
+    """Zenoh does not survive a fork: in the child everything raises ForkError, and the child can exit."""
     code = """
 import os, sys
 import nedbus

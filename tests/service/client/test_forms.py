@@ -1,4 +1,4 @@
-"""Rows and batches over a real router: what arrives, from where, and what is counted."""
+"""Rows and batches through a real router: their contents, addresses and counts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COUNT = 900  # fewer than half a window: here one thread publishes and reads
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription]:
-    """Subscribe to all; named before `bus` it ends after that, which would wait 5 s for a reader that has gone."""
+    """Subscribe to everything; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
@@ -41,7 +41,7 @@ def take_batches(batches: Iterator[Batch], count: int) -> list[Batch]:
 
 
 def test_rows_are_the_messages(subscription: nedbus.Subscription, bus: nedbus.Bus) -> None:
-    """Sent as rows, read as rows: named tuples with the same values, in order, none lost."""
+    """Rows are named tuples with the published values, in order and complete."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
     sent = [message(number, x=number / 3, xy_valid=True, y=0.0) for number in range(1, COUNT)]
@@ -56,7 +56,7 @@ def test_rows_are_the_messages(subscription: nedbus.Subscription, bus: nedbus.Bu
 
 
 def test_batches_hold_everything(subscription: nedbus.Subscription, bus: nedbus.Bus) -> None:
-    """Sent as an array, read as arrays: the same values, with address, sequence and time of each."""
+    """Arrays have the published values, with address, sequence number and time of each message."""
     messages = to_array([message(number, x=number / 3) for number in range(1, COUNT)])
     for vehicle in ("1", "2"):
         publisher = bus.publisher(VLP, vehicle=vehicle, lossless=True)
@@ -78,7 +78,7 @@ def test_batches_hold_everything(subscription: nedbus.Subscription, bus: nedbus.
 
 @pytest.mark.parametrize("whole_bus", [False, True])
 def test_closing_waits_for_readers(subscription: nedbus.Subscription, bus: nedbus.Bus, whole_bus: bool) -> None:
-    """A lossless publisher is closed, alone or with its bus, once a reader that pauses has everything."""
+    """A lossless publisher closes, alone or with its bus, once a reader that pauses has received everything."""
     count = 3 * WINDOW
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
@@ -99,7 +99,7 @@ def test_closing_waits_for_readers(subscription: nedbus.Subscription, bus: nedbu
 
 @pytest.mark.parametrize("fails", [True, False])
 def test_exception_does_not_wait_for_readers(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, fails: bool) -> None:
-    """A script that fails ends at once, from either client, whoever has not read yet; any other waits for readers."""
+    """After an exception a script ends at once, with either client; otherwise it waits for readers."""
     flushed: list[nedbus.Publisher] = []
 
     def flush(publisher: nedbus.Publisher, *_: float) -> bool:
@@ -113,7 +113,7 @@ def test_exception_does_not_wait_for_readers(client: nedbus.Bus, monkeypatch: py
 
 
 def test_nothing_is_lost_while_the_router_is_away() -> None:
-    """A lossless publisher sends no more than it keeps, and goes on when its reader is back at the router."""
+    """A lossless publisher sends no more than its history cache, and continues when its reader is back."""
     endpoint, count = free_endpoint(), CACHE + 1000
     router = open_router(listen=(endpoint,))
     with nedbus.connect(endpoint) as other, nedbus.connect(endpoint) as bus:
@@ -136,7 +136,7 @@ def test_nothing_is_lost_while_the_router_is_away() -> None:
 
 @pytest.mark.parametrize("filler", [0, 50], ids=["few", "many"])
 def test_unusual_payloads_are_decoded_one_by_one(bus: nedbus.Bus, raw: Session, filler: int) -> None:
-    """Among others: another encoder's, an older layout's, invalid ones and wrong keys, with the same end as singly."""
+    """Payloads of other encoders, older layouts, invalid ones and wrong keys give the same result as one by one."""
     good = message(7, x=1.5, hagl_max_z=3.0, hagl_max_xy=3.0)
     values = [list(value) if isinstance(value, tuple) else value for value in good.__dict__.values()]
     old = [list(value) if isinstance(value, tuple) else value for value in downgrade(good, "V0").values()]
@@ -163,7 +163,7 @@ def test_unusual_payloads_are_decoded_one_by_one(bus: nedbus.Bus, raw: Session, 
 
 
 def test_latest_in_batches(bus: nedbus.Bus) -> None:
-    """In mode "latest" a batch has the newest of each key."""
+    """In mode "latest" a batch has the newest message of each key."""
     subscription = bus.subscribe(VLP)
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in "ab"]
     for number in range(1, 200):
@@ -180,7 +180,7 @@ def test_latest_in_batches(bus: nedbus.Bus) -> None:
 
 @pytest.mark.parametrize("way", ["publish", "publish_row", "publish_many"])
 def test_invalid_message_is_an_error_of_ours(client: nedbus.Bus, way: str) -> None:
-    """Every way to publish, blocking or awaited, raises NedbusError for an invalid message, and sends nothing."""
+    """Every publish method, blocking or asyncio, raises NedbusError for an invalid message, and sends nothing."""
     publisher = client.publisher(VLP, vehicle="1")
     fields = {**message(1).model_dump(), "eph": -1.0}
     given: dict[str, object] = {
@@ -196,7 +196,7 @@ def test_invalid_message_is_an_error_of_ours(client: nedbus.Bus, way: str) -> No
 
 
 def test_array_that_is_refused_sends_nothing(bus: nedbus.Bus) -> None:
-    """Another dtype is an error, an empty array is none, and a publisher that is closed publishes none."""
+    """Another dtype is an error, an empty array is not, and a closed publisher publishes nothing."""
     publisher = bus.publisher(VLP, vehicle="1")
     with pytest.raises(TypeError, match="astype"):
         publisher.publish_many(np.zeros(3, [("x", "f4")]))
@@ -208,7 +208,7 @@ def test_array_that_is_refused_sends_nothing(bus: nedbus.Bus) -> None:
 
 
 def test_async_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
-    """The twin has the same two ways, for `async for`."""
+    """AsyncSubscription has the same two forms, for `async for`."""
     publisher = bus.publisher(VLP, vehicle="1")
 
     async def read() -> tuple[list[int], int]:
@@ -232,8 +232,8 @@ def test_async_rows_and_batches(endpoint: str, bus: nedbus.Bus) -> None:
     assert asyncio.run(read()) == (list(range(1, 101)), 200)
 
 
-def test_batch_is_waited_for_so_long(client: nedbus.Bus, bus: nedbus.Bus) -> None:
-    """A batch can be waited for with a timeout, from either client; where each comes from is known of all."""
+def test_batch_is_awaited_with_a_timeout(client: nedbus.Bus, bus: nedbus.Bus) -> None:
+    """A batch can be awaited with a timeout, with either client, and has the provenance of each message."""
     bus.publisher(VLP, vehicle="1", source="test").publish({"timestamp": 7, "x": 1.0})
     subscription = client.subscribe(VLP, mode="every")
     batch = subscription.receive_batch(DEADLINE)
@@ -245,7 +245,7 @@ def test_batch_is_waited_for_so_long(client: nedbus.Bus, bus: nedbus.Bus) -> Non
 
 
 def test_sample_tells_where_it_comes_from(bus: nedbus.Bus) -> None:
-    """Source and missing fields follow each message, also into the last value, and cost a publisher nothing to say."""
+    """Source and missing fields follow each message, also in the last value, at no cost to the publisher."""
     publisher = bus.publisher(VLP, vehicle="1", source="mine")
     whole = message(1).model_dump()
     publisher.publish(whole)

@@ -21,7 +21,7 @@ Fields = Mapping[str, object]
 def follow(
     *times: float, boot: float = 0.0, every: float = 0.01, latency: float | None = None, fields: Fields = VALID
 ) -> StreamHealth:
-    """Return a stream that came at these times [s], of PX4's times from `boot` on."""
+    """Return a stream with these arrival times [s], and PX4's times from `boot` on."""
     stream = StreamHealth(VLP)
     for index, came in enumerate(times):
         seconds = boot + index * every
@@ -30,7 +30,7 @@ def follow(
 
 
 def follow_clock(*clock: float) -> Health:
-    """Return the health of a stream by PX4's own time of its messages [s]."""
+    """Return the health of a stream whose messages have these PX4 times [s]."""
     stream = StreamHealth(VLP)
     for seconds in clock:
         stream.add(message(round(seconds * 1e6)), received=0)
@@ -38,7 +38,7 @@ def follow_clock(*clock: float) -> Health:
 
 
 def test_rate_and_jitter_are_of_the_last_second() -> None:
-    """50 Hz with steps of 15 and 25 ms; what was before the last full second does not count."""
+    """50 Hz with steps of 15 and 25 ms; messages before the last full second do not count."""
     times = [0.0]
     for index in range(200):
         times.append(times[-1] + (0.1 if index < 10 else 0.015 if index % 2 else 0.025))
@@ -51,12 +51,12 @@ def test_rate_and_jitter_are_of_the_last_second() -> None:
 
 
 def test_first_second_may_be_read_by_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Messages are added while the jitter of the first second is computed: nothing fails."""
+    """Messages may be added while another thread computes the jitter of the first second."""
     stream = follow(0.0, 0.01, 0.02)
     mean = vars(_Window)["mean"].fget
 
     class Late(float):
-        """A mean in whose use another message arrives."""
+        """A mean during whose computation another message arrives."""
 
         def __rsub__(self, other: float) -> float:
             stream.add(message(30_000), received=SECOND // 50)
@@ -67,7 +67,7 @@ def test_first_second_may_be_read_by_another_thread(monkeypatch: pytest.MonkeyPa
 
 
 def test_silence_has_no_rate() -> None:
-    """A stream that stopped has an age, and no rate; before the first message there is nothing to measure."""
+    """A stream that stopped has an age but no rate; before the first message there are no values."""
     health = follow(1.0, 1.01, 1.02).snapshot(10 * SECOND)
     assert health.rate is None
     assert health.age == pytest.approx(8.98)
@@ -87,9 +87,9 @@ def test_silence_has_no_rate() -> None:
     ],
 )
 def test_what_comes_on_change_has_no_usual_rate(topic: str, silence: float, state: str) -> None:
-    """Many messages in the first seconds, then one a second, then none: only silence below its least rate is a fault.
+    """A stream that sends on change has no usual rate: only silence below its minimum rate is a fault.
 
-    Nor has it gaps, and what is no position has neither flags nor resets.
+    It has no gaps, and a message other than a position has neither flags nor resets.
     """
     stream = StreamHealth(topic)
     times = [index / 50 for index in range(500)] + [10.0 + index for index in range(3)]
@@ -102,7 +102,7 @@ def test_what_comes_on_change_has_no_usual_rate(topic: str, silence: float, stat
 
 
 def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
-    """A step of more than three usual ones is a gap, whenever it arrives, and does not become the usual one."""
+    """A step of more than three usual ones is a gap, whenever it arrives, and does not become the usual step."""
     clock = [index * 0.1 for index in range(20)]
     clock += [clock[-1] + 1.0 + index * 0.1 for index in range(5)]
     clock += [clock[-1] + 0.2, clock[-1] + 2.0]
@@ -123,9 +123,9 @@ def test_gaps_disorder_and_reboots_are_of_px4s_own_time() -> None:
     ids=["rises", "wraps at 255", "began before", "reboots"],
 )
 def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, reboots: int) -> None:
-    """A counter that rises has counted resets, across 255 too; what it counted before the first message is unknown.
+    """The difference of a reset counter is counted, also across 255; resets before the first message are unknown.
 
-    A reboot sets the counters to 0, which is no reset; what comes after it counts.
+    A reboot clears the counters without a reset; later resets count.
     """
     stream = StreamHealth(VLP)
     for seconds, counter in counters:
@@ -137,7 +137,7 @@ def test_resets_are_counted(counters: list[tuple[float, int]], resets: int, rebo
 
 
 def test_flags_are_shares() -> None:
-    """The share of the last second, and of all time."""
+    """Flags have their share of the last second, and of all time."""
     stream = StreamHealth(VLP)
     for index in range(400):
         late = index >= 200
@@ -149,7 +149,7 @@ def test_flags_are_shares() -> None:
 
 
 def test_latency_and_loss() -> None:
-    """The median and the worst latency of the second, and all losses."""
+    """Latency has the median and maximum of the second; losses are the total."""
     stream = StreamHealth(VLP)
     for index, latency in enumerate((0.1, 0.2, 0.9)):
         stream.add(message(index), received=index, latency=latency, lost=index)
@@ -158,7 +158,7 @@ def test_latency_and_loss() -> None:
 
 
 def test_usual_rate_shows_a_stream_that_became_slow() -> None:
-    """After a minute at 100 Hz, 5 Hz is far below the usual rate; a burst of what was recovered changes it little."""
+    """After a minute at 100 Hz, 5 Hz is far below the usual rate; a burst of recovered messages hardly changes it."""
     times = [index * 0.01 for index in range(6000)]
     times += [60.0 + index * 0.0001 for index in range(6000)]
     times += [62.0 + index * 0.01 for index in range(200)]
@@ -170,7 +170,7 @@ def test_usual_rate_shows_a_stream_that_became_slow() -> None:
 
 
 def test_slow_stream_is_stale_later() -> None:
-    """3 s without a message are stale, but not of a stream that comes every 5 s."""
+    """A stream is stale after 3 s without a message, but not if it has one every 5 s."""
     assert follow(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
     assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
 
@@ -180,7 +180,7 @@ def sample(vehicle: str, timestamp: int = 0) -> Sample:
 
 
 def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rate and age are of the monotonic clock: an hour back on the wall clock changes nothing."""
+    """Rate and age use the monotonic clock: setting the wall clock back changes nothing."""
     monitor, now, address = Monitor(), 100 * SECOND, Address("1", VLP)
     monkeypatch.setattr("time.monotonic_ns", lambda: now)
     monkeypatch.setattr("time.time_ns", lambda: 0)
@@ -198,7 +198,7 @@ def test_wall_clock_may_be_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_monitor_is_bounded() -> None:
-    """A flood of keys leaves the 4096 streams that came last, and never takes the place of one that still sends."""
+    """In a flood of keys the 4096 most recent streams are kept, and never displace one that is still sending."""
     monitor, real = Monitor(), sample("real")
     monitor.add(real)
     flood = [dataclasses.replace(real, address=Address(f"flood-{number}", VLP)) for number in range(5000)]
@@ -213,7 +213,7 @@ def test_monitor_is_bounded() -> None:
 
 
 def test_states_have_reasons() -> None:
-    """The worst state wins, and each but "ok" has its reason; the clock is the test's."""
+    """The worst state wins, and each one but "ok" has its reason, with a fake clock."""
     second = [index / 100 for index in range(300)]
     fresh, late = (follow(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
     stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
@@ -235,7 +235,7 @@ def test_states_have_reasons() -> None:
 
 
 def test_description_has_state_flags_and_events() -> None:
-    """Notes of the table: state, flags, then gaps, disorder and reboots; "ok" when there is nothing to say."""
+    """A description has state and flags, then gaps, disorder and reboots; "ok" if there are none."""
     health = follow(0.0, 0.01, 0.02).snapshot(SECOND // 10)
     assert describe_stream(health, stream_state(health)) == "ok"
     doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)

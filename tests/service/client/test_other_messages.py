@@ -1,4 +1,4 @@
-"""Messages other than the first, over a real router: one with arrays, and one of flags that has instances."""
+"""Messages other than the position, through a real router: one with arrays, and one of flags with instances."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def definition_of(address: Address) -> Definition[Any]:
 
 
 def make(address: Address, number: int) -> Message:
-    """Return a message with this timestamp, and values that follow from it; not all fields are given."""
+    """Return a message with this timestamp and values derived from it; some fields are not provided."""
     half = number / 20
     fields: dict[str, object] = {
         "q": (math.cos(half), 0.0, 0.0, math.sin(half)),
@@ -62,14 +62,14 @@ def publisher_of(bus: nedbus.Bus, address: Address, **options: Any) -> nedbus.Pu
 
 @pytest.fixture
 def subscription(endpoint: str) -> Iterator[nedbus.Subscription[Any]]:
-    """Subscribe to all; named before `bus` it ends after that, which would wait 5 s for a reader that has gone."""
+    """Subscribe to everything; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
     with nedbus.connect(endpoint) as other, other.subscribe("*", mode="every") as subscription:
         yield subscription
 
 
 @BOTH
 def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, address: Address) -> None:
-    """From either client it is its model, equal to the bit, with what was not given; latest has the last one."""
+    """With either client a message arrives as its model, bit for bit, with its missing fields; latest has the last."""
     publisher, sent = publisher_of(bus, address, source="ins"), make(address, 5)
     publisher.publish(make(address, 4))
     subscription = client.subscribe(address.topic, mode="every")
@@ -88,12 +88,12 @@ def test_message_arrives_as_it_was(client: nedbus.Bus, bus: nedbus.Bus, address:
 
 @BOTH
 def test_invalid_message_names_its_field(bus: nedbus.Bus, address: Address) -> None:
-    """Another length, another type, another message: nothing of it is published."""
+    """A wrong length, type or message is an error, and nothing is published."""
     publisher = publisher_of(bus, address)
     wrong = {"q": (1.0, 0.0, 0.0)} if address == ATTITUDE else {"cs_in_air": 1}
     with pytest.raises(nedbus.InvalidMessageError, match=next(iter(wrong))):
         publisher.publish({"timestamp": 1, **wrong})
-    with pytest.raises(TypeError, match=f"carries {definition_of(address).name}, not VehicleLocalPosition"):
+    with pytest.raises(TypeError, match=f"carries {definition_of(address).name}: .*, not VehicleLocalPosition"):
         publisher.publish(message(1))
     assert publisher.published == 0
 
@@ -102,7 +102,7 @@ def test_invalid_message_names_its_field(bus: nedbus.Bus, address: Address) -> N
 def test_rows_and_batches_hold_everything(
     subscription: nedbus.Subscription[Any], bus: nedbus.Bus, address: Address
 ) -> None:
-    """Sent as rows and as an array, read as rows and as arrays: the same bytes, in order, none lost."""
+    """Messages sent as rows and as an array are read as rows and as arrays: the same bytes, in order, complete."""
     publisher, sent = publisher_of(bus, address, lossless=True), array_of(address, range(1, 301))
     wait_for_subscriber(publisher)
     for number in range(1, 301):
@@ -121,7 +121,7 @@ def test_rows_and_batches_hold_everything(
 
 
 def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: nedbus.Bus) -> None:
-    """Messages that arrive mixed are read as arrays of one dtype each, of all addresses of that message."""
+    """Messages of mixed types are read as arrays of one dtype each, with all addresses of that type."""
     addresses = [ATTITUDE, FLAGS, Address("7", VLP), Address("8", "vehicle_attitude")]
     publishers = {address: publisher_of(bus, address) for address in addresses}
     for publisher in publishers.values():
@@ -141,8 +141,8 @@ def test_a_batch_is_of_one_message(subscription: nedbus.Subscription[Any], bus: 
 
 
 @BOTH
-def test_max_rate_thins_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
-    """Of 1 s at 100 Hz there arrive ten, evenly, as they were."""
+def test_max_rate_downsamples_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, address: Address) -> None:
+    """Of 1 s at 100 Hz, ten messages arrive, evenly spaced and unchanged."""
     publisher = publisher_of(bus, address)
     publisher.publish(make(address, 0))
     subscription = client.subscribe(address.topic, mode="every", max_rate=10)
@@ -158,7 +158,7 @@ def test_max_rate_thins_it(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, ad
 
 @BOTH
 def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: Address) -> None:
-    """A reader of mode `every` gets what did not come from the publisher's cache, in order."""
+    """A reader of mode `every` gets missing messages from the publisher's history cache, in order."""
     publisher, queue = publisher_of(bus, address), LossyQueue()
     queue.missing = {1, 2, 3, 6}
     with closing(Housekeeping()) as housekeeping, closing(open_client([endpoint], timeout=DEADLINE)) as session:
@@ -173,7 +173,7 @@ def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: A
 
 
 def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
-    """Arrays are numbers with nine digits, columns of CSV, and lists of JSON with NaN as text."""
+    """Commands show arrays as numbers of nine digits, columns of CSV, and lists of JSON with NaN as text."""
     with publisher_of(bus, ATTITUDE) as publisher:
         publisher.publish(make(ATTITUDE, 2))
         wait_for(lambda: bus.latest(ATTITUDE.topic), what="the message")
@@ -193,7 +193,7 @@ def test_commands_show_it(endpoint: str, bus: nedbus.Bus) -> None:
 
 
 def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: nedbus.Bus) -> None:
-    """Any published message can be described, whatever defined it; another name is an error with the known ones."""
+    """Any published message can be described, whatever defines it; an unknown name is an error with the known ones."""
     definition = define(
         "WheelEncoders", [("timestamp", field_type("uint64")), ("wheel_speed", field_type("float32[2]"))]
     )
@@ -206,11 +206,11 @@ def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: 
     for wrong in ("wheel_encoders_b", "WheelEncoders", "*"):
         ended = run_command("schema", wrong, "-c", endpoint)
         assert (ended.exit_code, ended.out) == (2, "")
-        assert "nor is it a topic that is published: VehicleLocalPosition, " in ended.err
+        assert "and no such topic is published: known messages are VehicleLocalPosition, " in ended.err
 
 
 def test_line_says_what_was_lost_before_what_has_no_room() -> None:
-    """A terminal cuts the end of a long line: what is known of the sample stands before its fields."""
+    """A terminal cuts long lines at the end, so the status of a sample comes before its fields."""
     sample = nedbus.Sample(make(FLAGS, 2), FLAGS, received=1, lost=3)
     assert to_line(sample).split(" s  ")[1] == "[3 lost]  control_status_changes 4294967293  cs_in_air  fs_bad_hdg"
 

@@ -30,7 +30,7 @@ def check(*arguments: object, command: tuple[str, ...] = ("check",)) -> list[str
 def passes(*arguments: object) -> bool:
     """Return whether a check finds nothing."""
     checked = run_command(*map(str, arguments))
-    return (checked.exit_code, checked.out, checked.err) == (0, "nothing is wrong\n", "")
+    return (checked.exit_code, checked.out, checked.err) == (0, "no mistakes found\n", "")
 
 
 @pytest.mark.parametrize(
@@ -89,10 +89,10 @@ def test_all_mistakes_are_said_at_once(tmp_path: Path) -> None:
         (3, 1, "vehicle 'a b' is not valid"),
         (4, 1, "'127.0.0.1:99999' is not an address"),
         (5, 1, "'here' is not an endpoint"),
-        (5, 1, "tcp/nowhere.invalid:1: this host finds no address of nowhere.invalid"),
-        (5, 1, f"{closed}: nothing listens there: the host refuses the connection"),
+        (5, 1, "tcp/nowhere.invalid:1: cannot resolve host name nowhere.invalid"),
+        (5, 1, f"{closed}: connection refused: no program listens on this port"),
         (6, 1, "'tcp/127.0.0.1:99999' has port 99999"),
-        (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is no address of this host"),
+        (6, 1, "tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host"),
         (7, 1, "until_done: "),
         (8, 1, "gone.crt cannot be read"),
         (9, 12, "source 'foo:': there is no kind 'foo'"),
@@ -116,7 +116,7 @@ def test_file_that_cannot_be_read_hides_nothing(tmp_path: Path) -> None:
         lines = check(file, *flags, command=("serve", "--check", "--config"))
         assert [reason in lines[0], len(lines)] == [True, 3], lines
         assert lines[1].startswith("tls_key: gone.key cannot be read")
-        assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is no address of this host")
+        assert lines[2].startswith("listen: tcp/192.0.2.1:1: 192.0.2.1 is not an address of this host")
 
 
 def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
@@ -128,14 +128,14 @@ def test_two_sources_of_one_vehicle(tmp_path: Path) -> None:
         f' "sim:?vehicle=wing", "sim:?vehicle=8", "px4-zenoh:"]\n'
     )
     reasons = [line.partition(": ")[2] for line in check(file)]
-    advice = "give one of the two another vehicle"
+    advice = "give one of them another vehicle"
     sims = [
-        f"source 'sim:?seed=2': it publishes 1/vehicle_local_position, as source 'sim:' does: {advice}",
-        f"source 'sim:': it publishes 1/vehicle_local_position, as source 'sim:' does: {advice}",
-        f"source 'sim:?vehicle=wing': it publishes wing/vehicle_local_position, as source '{named}' does: {advice}",
+        f"source 'sim:?seed=2': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
+        f"source 'sim:': publishes 1/vehicle_local_position, like source 'sim:': {advice}",
+        f"source 'sim:?vehicle=wing': publishes wing/vehicle_local_position, like source '{named}': {advice}",
     ]
-    first = f"as source 'ulog:{log}?vehicle=7' does: {advice}"
-    logs = f"source 'ulog:{log}?vehicle=7&speed=2': it publishes 7/vehicle_local_position, {first}"
+    first = f"like source 'ulog:{log}?vehicle=7': {advice}"
+    logs = f"source 'ulog:{log}?vehicle=7&speed=2': publishes 7/vehicle_local_position, {first}"
     assert reasons == [sims[0], logs, *sims[1:]]
     assert [line.partition(": ")[2] for line in check("--offline", file)] == sims
 
@@ -171,9 +171,9 @@ def test_tables_have_their_places(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("endpoint", "reasons"),
     [
-        ("tcp/a..b:7447", ["a..b is no address of this host", "this host finds no address of a..b"]),
+        ("tcp/a..b:7447", ["a..b is not an address of this host", "cannot resolve host name a..b"]),
         ("tcp/127.0.0.1:99999", ["has port 99999: ports are 0 to 65535"] * 2),
-        ("tcp/[::1", ["is no address of this host", "this host finds no address of"]),
+        ("tcp/[::1", ["is not an address of this host", "cannot resolve host name"]),
         ("udp/gcs:mavlink", ["is not an endpoint: write PROTOCOL/HOST:PORT"] * 2),
     ],
 )
@@ -234,6 +234,6 @@ def test_certificates_without_the_package_that_reads_them(start: Start, tmp_path
     settings.write_text(f'source = "sim:"\ntls_ca = "{tmp_path}/pki/ca.crt"\n')
     program = "import sys; sys.modules['cryptography'] = None; from nedbus.cli import main; main()"
     checked = start("-c", program, "check", str(settings))
-    assert (checked.wait(), checked.out) == (0, "nothing is wrong\n"), checked.err
-    reason = "when the certificate expires is not checked: cryptography: not installed"
+    assert (checked.wait(), checked.out) == (0, "no mistakes found\n"), checked.err
+    reason = "the expiry of the certificate is not checked: cryptography: not installed"
     assert f"{tmp_path}/pki/ca.crt: {reason}" in checked.err

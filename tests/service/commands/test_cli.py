@@ -160,7 +160,7 @@ def test_no_data_yet_is_reported(endpoint: str, bus: nedbus.Bus, monkeypatch: py
     monkeypatch.setattr(follow, "SILENCE_TIMEOUT", 0.1)
     echo = run_command("echo", "-c", endpoint, "-n", "1")
     assert echo.exit_code == 0
-    assert echo.err.count("yet, waiting") == 1
+    assert echo.err.count("yet, still waiting") == 1
     assert echo.out.startswith("7/vehicle_local_position ")
 
 
@@ -211,10 +211,10 @@ def test_wait_waits_for_a_router(run_nedbus: Start) -> None:
         (["echo", "vehicle_attitude", "--field", "q[1]"], "there is no field 'q[1]': did you mean q?"),
         (["echo", "VehicleAttitude"], "expected one of vehicle_attitude, vehicle_attitude_groundtruth"),
         (["get", "--topic", "sensor_gps/0"], "expected sensor_gps, and 0 as its instance"),
-        (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude, of which it looks like a mis"),
+        (["serve", "-s", "sim:?topics=vehicle_attitud"], "expected vehicle_attitude (looks like a mis"),
         (["serve", "-s", "mavlink:udpin:0.0.0.0:14540?topics=wheel_encoders"], "MAVLink has none of these topics"),
         (["schema", "vehicle_attitud"], "did you mean vehicle_attitude or VehicleAttitude?"),
-        (["echo", "vehicle_attitude", "-t", VLP], "--topic: the topic is given as 'vehicle_attitude' already"),
+        (["echo", "vehicle_attitude", "-t", VLP], "--topic: the argument already names the topic 'vehicle_attitude'"),
         (["echo", "--csv", "--json"], "--csv: cannot be combined with --json"),
         (["echo", "--once", "-n", "3"], "--count: cannot be combined with --once"),
         (["get", "--field", "xx"], "--field: there is no field 'xx'"),
@@ -263,4 +263,4 @@ def test_full_disk_is_one_line(endpoint: str, bus: nedbus.Bus, zygote: Zygote) -
     with Path("/dev/full").open("wb") as full, Path("err").open("wb") as err:
         ended = fork_command(zygote, "get", "-c", endpoint, out=full.fileno(), err=err.fileno())
     assert ended.wait(DEADLINE) == 1
-    assert Path("err").read_text() == "nedbus: cannot write: no space left on device\n"
+    assert Path("err").read_text() == "nedbus: cannot write to stdout: no space left on device\n"

@@ -17,7 +17,7 @@ def test_hint_needs_no_flag_that_it_lacks() -> None:
     assert " list  published" in what_to_type([DEFAULT_ENDPOINT])
     assert " hz -c tcp/b:1 " in what_to_type(["tls/a:1", "tcp/b:1"])
     for endpoint in ("tls/a:1", "quic/a:1"):
-        hint = f"Readers at {endpoint} need a certificate of their own: docs/security.md"
+        hint = f"Readers at {endpoint} need their own certificate, see docs/security.md"
         assert what_to_type([endpoint]) == hint
 
 

@@ -190,7 +190,7 @@ def test_paused_echo_does_not_hold_up_a_replay(
 
 def test_echo_every_skips_nothing(run_nedbus: Start, endpoint: str) -> None:
     """--every prints each message of a replay, in order, however fast it comes; its help warns that a replay waits."""
-    assert "a replay at speed=max then waits" in run_command("echo", "--help", COLUMNS="300").out
+    assert "a replay at speed=max waits" in run_command("echo", "--help", COLUMNS="300").out
     run_nedbus("serve", "--connect", endpoint, "-s", "sim:?duration=10&speed=max&wait=1")
     lines = echo(endpoint, "--json", "--every", "-n", "1000").out.splitlines()
     timestamps = [json.loads(line)["message"]["timestamp"] for line in lines]

@@ -74,7 +74,7 @@ def test_finished_replay_is_not_healthy(endpoint: str, health: Judge, monkeypatc
         passed[0] = 100.0
         shown = health()
         assert shown.exit_code == 1
-        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: at most 3 s\n", shown.err)
+        assert re.search(r"the newest message is 1\d\d.\d s old, from vehicle 1: the limit is 3 s\n", shown.err)
         assert health("--max-age", "3600").exit_code == 0
 
 
@@ -183,9 +183,9 @@ def test_silent_vehicle_is_a_fault(endpoint: str, health: Judge) -> None:
     ("arguments", "text"),
     [
         (("--expect", "1,a b"), "nedbus: vehicle 'a b' is not valid"),
-        (("--expect", ""), "nedbus: --expect: names nothing"),
-        (("--valid", " , "), "nedbus: --valid: names nothing"),
-        (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected some of xy, z, vxy, vz\n"),
+        (("--expect", ""), "nedbus: --expect: the list is empty"),
+        (("--valid", " , "), "nedbus: --valid: the list is empty"),
+        (("--valid", "xy,heading"), "nedbus: --valid: 'heading': expected a list of xy, z, vxy, vz\n"),
     ],
 )
 def test_wrong_expectation_is_explained(health: Judge, arguments: tuple[str, ...], text: str) -> None:
@@ -215,4 +215,4 @@ def test_service_that_keeps_no_account_is_a_fault(endpoint: str, raw: Session, h
         for option in ("--valid", "xy"), ("--within", "60"):
             shown = health("--services", "1", *option)
             assert shown.exit_code == 1
-            assert "service old does not say what happens to its vehicles: update nedbus there" in shown.err
+            assert "service old keeps no history of its vehicles: update nedbus there" in shown.err

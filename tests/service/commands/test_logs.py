@@ -232,7 +232,7 @@ def test_flood_of_any_length_is_bounded() -> None:
     assert limited.flood(1000) == BURST
     limited.now += 60 / PER_MINUTE
     assert limited.flood(1000) == 2
-    left_out = f"{1000 - BURST} more lines like this one were left out: {BURST} is stale"
+    left_out = f"suppressed {1000 - BURST} more lines like this one: {BURST} is stale"
     assert limited.lines[-2:] == [left_out, "0 is stale"]
     limited.now += 3600
     assert limited.flood(1000) == 1 + BURST
@@ -242,7 +242,7 @@ def test_flood_of_any_length_is_bounded() -> None:
         limited.now += 1
     assert len(limited.lines) <= BURST + 2 * 10 * PER_MINUTE
     limited.limit.flush()
-    told = [int(line.split()[0]) for line in limited.lines if "left out" in line]
+    told = [int(line.split()[1]) for line in limited.lines if line.startswith("suppressed")]
     assert sum(told) + len(limited.lines) - len(told) == 6000
 
 
@@ -265,11 +265,11 @@ def test_what_a_flood_left_out_is_told_by_the_next_line() -> None:
     assert limited.flood(1, "%s", event="done") == 1
     limited.now += 60
     assert limited.flood(1, "%s", event="done") == 2
-    assert limited.lines[-2].startswith("5 more lines")
+    assert limited.lines[-2].startswith("suppressed 5 more lines")
     limited.limit.flush()
     limited.flood(BURST + 5, "%s is back", event="back")
     limited.limit.flush()
-    assert limited.lines[-1].startswith("5 more lines")
+    assert limited.lines[-1].startswith("suppressed 5 more lines")
 
 
 def test_lines_of_other_packages_are_limited() -> None:

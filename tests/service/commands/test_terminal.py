@@ -286,7 +286,7 @@ def test_link_that_breaks_is_reported(run_nedbus: Start, command: str) -> None:
     follower = run_nedbus(command, "-c", where, "--json")
     wait_for(lambda: follower.out, what="data")
     router.close()
-    wait_for(lambda: f"the link to {where} is broken: waiting for it" in follower.err, what="the break")
+    wait_for(lambda: f"the link to {where} is lost: still trying" in follower.err, what="the break")
     if command == "hz":
         wait_for(lambda: '"state": "disconnected", "reason": "no link"' in follower.out, what="the state")
     with closing(open_router(listen=(where,))):
@@ -383,7 +383,7 @@ CLOSING = {
     "exec >&-": "os.close(1); sys.stdout = None",  # as Python itself finds a stream that is closed
     "exec 2>&-": "os.close(2); sys.stderr = None",
 }
-CLOSED = "nedbus: cannot write: standard output is closed\n"
+CLOSED = "nedbus: cannot write to stdout: standard output is closed\n"
 
 
 @pytest.mark.parametrize("shell", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["forked", "shell"])
@@ -465,11 +465,11 @@ def test_hangup_ends_no_router(run_nedbus: Start) -> None:
     router = run_nedbus("router", "-l", where)
     wait_for(lambda: f"router on {where}" in router.err, what="the router")
     router.signal(signal.SIGHUP)
-    wait_for(lambda: "SIGHUP is ignored" in router.err, what="the hang-up")
+    wait_for(lambda: "SIGHUP ignored" in router.err, what="the hang-up")
     router.signal(signal.SIGTERM)
     assert router.wait() == 0
     last = router.err.splitlines()[-1]
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    ending: SIGTERM", last)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    stopping on SIGTERM", last)
 
 
 @pytest.mark.process
@@ -511,5 +511,5 @@ def test_make_run(tmp_path: Path) -> None:
     finally:
         with suppress(ProcessLookupError):
             os.killpg(first.pid, signal.SIGKILL)
-    assert "ending: SIGINT" in log.read_text()
+    assert "stopping on SIGINT" in log.read_text()
     assert "***" not in log.read_text()

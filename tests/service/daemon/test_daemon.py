@@ -278,15 +278,15 @@ def test_service_as_a_client_waits_for_its_router_and_comes_back(run_nedbus: Sta
 
 def test_service_says_what_made_it_a_client(run_nedbus: Start, endpoint: str, tmp_path: Path) -> None:
     """NEDBUS_CONNECT is set for scripts: a service that follows it says so, and how to be a router all the same."""
-    hint = "it starts no router of its own without --listen"
+    hint = "use --listen to run a router instead"
     file, here = tmp_path / "some.toml", free_endpoint()
     file.write_text(f'connect = "{endpoint}"')
     variable = {"NEDBUS_CONNECT": endpoint}
     services = {
         said: run_nedbus("serve", "-s", "ulog:/gone.ulg", *flags, **environment)
         for flags, environment, said in (
-            ((), variable, f"client of {endpoint}, as set by NEDBUS_CONNECT: {hint}"),
-            (("--config", str(file)), {}, f"client of {endpoint}, as set by {file}: {hint}"),
+            ((), variable, f"client of {endpoint}, set by NEDBUS_CONNECT; {hint}"),
+            (("--config", str(file)), {}, f"client of {endpoint}, set by {file}; {hint}"),
             (("--connect", endpoint), {}, f"client of {endpoint}\n"),
             (("--listen", here), variable, f"router on {here}, joining {endpoint}"),
         )
@@ -328,7 +328,7 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ("", "source: nothing to publish: give --source sim:, ulog:FILE, px4-zenoh: or mavlink:LINK, or several"),
+        ("", "source: no source is given: use --source with sim:, ulog:FILE, px4-zenoh: or mavlink:LINK"),
         ("-s foo:x", "source 'foo:x': there is no kind 'foo': choose from sim, ulog"),
         ("-s a/b.ulg", "write ulog:a/b.ulg"),
         ("-s ulg:a/b.ulg", "there is no kind 'ulg': write ulog:a/b.ulg"),
@@ -343,8 +343,8 @@ def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:
         ("-s sim:?duration=1e308", "duration=1e308 is invalid: expected seconds"),
         ("-s sim:?vehicle=a/b", "vehicle=a/b is invalid: expected 1 to 64 of A-Z"),
         ("-s sim:?speed", "'speed' is not OPTION=VALUE"),
-        ("-s ulog:a?b.ulg", "'b.ulg' is not OPTION=VALUE&OPTION=VALUE, and a path with ? in it has %3F instead"),
-        ("-s ulog:pipe", "pipe is not a regular file: save it as one, then give that"),
+        ("-s ulog:a?b.ulg", "'b.ulg' is not OPTION=VALUE&OPTION=VALUE; in a path, write ? as %3F"),
+        ("-s ulog:pipe", "pipe is not a regular file: save it as one first"),
         ("-s sim: --until-done", "until_done: no source ever ends"),
         ("-s sim: --listen 7447", "listen: '7447' is not an endpoint: write PROTOCOL/HOST:PORT"),
         ("-s sim: --config no.toml", "no.toml: there is no such file"),
@@ -447,4 +447,4 @@ def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: s
     assert healthy.exit_code == 0, healthy.err
     assert healthy.out.startswith("1 service, 1 source, ")
     second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: "is published by another process too" in second.err, what="the warning")
+    wait_for(lambda: "is also published by another process" in second.err, what="the warning")

@@ -45,9 +45,9 @@ def others() -> Iterator[tuple[Pages, Pages]]:
 
 def test_unknown_path_is_not_found(server: Pages, caplog: pytest.LogCaptureFixture) -> None:
     """404 says which pages there are, as / does; a page that fails is 500, goes to the log, and ends nothing."""
-    assert server.ask("/other") == (404, "there is /page, /fails, /waits\n")
+    assert server.ask("/other") == (404, "available pages: /page, /fails, /waits\n")
     assert server.ask("/")[0] == 200
-    assert server.ask("/fails") == (500, "an unexpected error: the log has it\n")
+    assert server.ask("/fails") == (500, "unexpected error, see the log\n")
     assert "a page that fails" in caplog.text
     assert server.ask("/page") == (200, "a page\n")
 
@@ -91,7 +91,7 @@ def test_foreign_names_get_nothing(others: tuple[Pages, Pages], host: str, statu
     for path in PATHS:
         assert local.ask(path, Host=host)[0] == status, path
         assert public.ask(path, Host=host)[0] == (elsewhere if path == "/status" else 200), path
-    refused = "/status is answered under an address or a name of this host only\n"
+    refused = "/status is only served under an IP address or a name of this host\n"
     assert local.ask("/status", Host=host)[1] == ("content\n" if status == 200 else refused)
 
 

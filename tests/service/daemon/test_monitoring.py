@@ -25,7 +25,7 @@ from nedbus.daemon import Daemon, SourceMeasures
 from nedbus.daemon.worker import State
 from nedbus.events import Account, AccountReport, VehicleReport
 from nedbus.monitoring import Exporter, HttpServer, Page, metrics, service_pages
-from nedbus.monitoring.metrics import MAX_STREAMS, Stream, metrics_page, stream_metrics
+from nedbus.monitoring.metrics import MAX_STREAMS, MeasuredStream, metrics_page, stream_metrics
 from nedbus.monitoring.pages import vehicles_page
 from nedbus.settings import load_settings
 from nedbus.transport import Session
@@ -210,7 +210,7 @@ def test_flag_that_goes_to_and_fro_is_a_condition(every: int) -> None:
         account.add(address, message(20_000 * (number + 1), **{**VALID, "xy_valid": is_valid}), 0.02 * number)
         if number > 5 * every:
             assert account.state("7", 0.02 * number).text.startswith("xy not valid")
-    account.look(10.0, {address: "ok"})
+    account.update(10.0, {address: "ok"})
     assert account.state("7", 10.0).severity == ("info" if is_valid else "bad")
 
 
@@ -269,7 +269,7 @@ def test_without_a_router_is_not_ready(serve: Serve, run_nedbus: Start, pages: P
     """Before its router is there, after it has gone, and while it is there: 503, 503 and 200; an exporter too."""
     where, exported = free_endpoint(), Pages(free_port())
     serve("sim:", connect=where)
-    assert pages.ask("/readyz") == (503, f"the service starts: {where}\n")
+    assert pages.ask("/readyz") == (503, f"the service is starting: {where}\n")
     assert pages.values("nedbus_sessions", role="client") == [0]
     router = run_nedbus("router", "-l", where)
     run_nedbus("export", "--wait", "-c", where, "--http", exported.where)
@@ -319,15 +319,17 @@ def test_address_that_others_reach_is_warned_of(caplog: pytest.LogCaptureFixture
     """On loopback nobody else can read the pages; elsewhere the log says that others can."""
     for where, count in ((f"[::1]:{free_port()}", 0), (f"0.0.0.0:{free_port()}", 1)):
         with serve_pages(where, {}):
-            assert caplog.text.count(f"any client that reaches {where} can read them") == count
+            assert caplog.text.count(f"no password protects {where}") == count
 
 
-def streams(count: int, topic: str = VLP) -> list[Stream]:
+def streams(count: int, topic: str = VLP) -> list[MeasuredStream]:
     """Return streams of two sources in turn, of three messages each."""
     health = StreamHealth(topic)
     for each in range(3):
         health.add(message(each), received=each, lost=each)
-    return [Stream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3)) for number in range(count)]
+    return [
+        MeasuredStream((f"v{number}", topic, f"source {number % 2}"), health.snapshot(3)) for number in range(count)
+    ]
 
 
 def test_number_of_streams_is_bounded() -> None:
@@ -372,7 +374,7 @@ def test_stuck_source_is_not_healthy(endpoint: str, monkeypatch: pytest.MonkeyPa
     pages = service_pages(Daemon(load_settings(source=("sim:",), connect=(endpoint,)), version="0"))
     assert pages["/healthz"]() == Page.text("ok")
     monkeypatch.setattr(Daemon, "busy", 20.0)
-    assert pages["/healthz"]() == Page.text("a source has been at one message for 20 s", status=503)
+    assert pages["/healthz"]() == Page.text("a source has been blocked on one message for 20 s", status=503)
 
 
 def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
@@ -381,7 +383,7 @@ def test_reader_that_fails_ends_the_exporter(bus: nedbus.Bus) -> None:
     def fail(_: object) -> None:
         raise ArithmeticError
 
-    exporter = Exporter(bus, nedbus.Selection(), version="0", watch=fail)
+    exporter = Exporter(bus, nedbus.Selection(), version="0", on_sample=fail)
     bus.publisher(VLP, vehicle="1").publish(message(1))
     with pytest.raises(ArithmeticError):
         exporter.run(threading.Event())

@@ -29,8 +29,8 @@ def write(file: Path, vehicles: Iterable[object], *, more: str = "") -> None:
 def reload(service: Process, answers: int) -> str:
     """Send SIGHUP, wait until the service has said so often what came of it, and return its last words."""
     service.popen.send_signal(signal.SIGHUP)
-    wait_for(lambda: service.err.count("the settings ") == answers, what="the answer")
-    return [line for line in service.err.splitlines() if "the settings " in line][-1]
+    wait_for(lambda: service.err.count("reloaded") == answers, what="the answer")
+    return [line for line in service.err.splitlines() if "reloaded" in line][-1]
 
 
 def test_ten_reloads_under_load_lose_nothing(run_nedbus: Start, tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_broken_settings_change_nothing(run_nedbus: Start, tmp_path: Path) -> No
         write(file, ["1", "2", "a b"])
         assert f"{file}, line 11, column 1: source 'sim:?vehicle=a+b': " in reload(service, 1)
         write(file, ["2"], more='prefix = "other"\n')
-        reason = "prefix cannot change while the service runs: restart it"
+        reason = "prefix cannot be changed by a reload: restart the service"
         assert f"{file}, line 1, column 1: {reason}" in reload(service, 2)
         file.write_text("[[source")
         assert f"{file}, line 1, column 9: " in reload(service, 3)
@@ -104,7 +104,7 @@ def test_address_can_move_from_one_source_to_another(run_nedbus: Start, tmp_path
             assert "1 started, 1 stopped, 0 unchanged" in reload(service, number)
             with bus.subscribe(VLP, vehicle=vehicle) as subscription:
                 subscription.receive(DEADLINE)
-    assert "published by this process already" not in service.err
+    assert "this process already publishes" not in service.err
 
 
 def test_sources_of_flags_stay(run_nedbus: Start) -> None:
@@ -117,6 +117,8 @@ def test_sources_of_flags_stay(run_nedbus: Start) -> None:
 def test_reload_before_the_start_is_taken_at_the_start(tmp_path: Path) -> None:
     """A service that still waits for its router starts with what was read last."""
     daemon = Daemon(load_settings(connect=(free_endpoint(),), source=("sim:",)), version="test")
-    assert daemon.reload(load_settings(connect=daemon.endpoints, source=("sim:?vehicle=2",))) == "nothing runs yet"
-    with pytest.raises(ConfigError, match=r"connect cannot change while the service runs: restart it"):
+    assert (
+        daemon.reload(load_settings(connect=daemon.endpoints, source=("sim:?vehicle=2",))) == "no source is running yet"
+    )
+    with pytest.raises(ConfigError, match=r"connect cannot be changed by a reload: restart the service"):
         daemon.reload(load_settings(connect=(free_endpoint(),), source=("sim:",)))

@@ -131,7 +131,7 @@ def test_status_of_silent_source(systemd: Systemd) -> None:
 
 def has_counts(datagram: Datagram, *, is_wrong: bool) -> bool:
     """Return whether this is a status with what is published, and with what is wrong, or without."""
-    return "messages/s" in datagram["STATUS"] and ("is rejected" in datagram["STATUS"]) == is_wrong
+    return "messages/s" in datagram["STATUS"] and ("configuration rejected" in datagram["STATUS"]) == is_wrong
 
 
 def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> None:
@@ -152,9 +152,9 @@ def test_reload_is_answered(start: Start, systemd: Systemd, tmp_path: Path) -> N
         reloading = systemd.receive_until(lambda datagram: datagram.get("RELOADING") == "1")[-1]
         assert int(reloading["MONOTONIC_USEC"]) >= asked
         ready = systemd.receive_until(is_ready)[-1]["STATUS"]
-        assert ("is rejected" in ready) == is_wrong
+        assert ("configuration rejected" in ready) == is_wrong
         systemd.receive_until(partial(has_counts, is_wrong=is_wrong))
-    assert process.err.count("the settings are rejected, and nothing changes: ") == 1
+    assert process.err.count("settings not reloaded, the old ones stay active: ") == 1
     process.signal(signal.SIGTERM)
     assert process.wait() == 0, process.err
 
@@ -248,7 +248,7 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
     """A client is not ready before its router is there, and says for whom it waits."""
     endpoint = free_endpoint()
     with notified(systemd, connect=endpoint):
-        assert systemd.receive() == {"STATUS": f"waits for a router at {endpoint}"}
+        assert systemd.receive() == {"STATUS": f"waiting for a router at {endpoint}"}
         router = open_router(listen=(endpoint,))
         assert "1 session" in systemd.receive_until(is_ready)[-1]["STATUS"]
         router.close()
@@ -258,7 +258,7 @@ def test_client_waits_for_its_router(systemd: Systemd) -> None:
 def test_client_is_started_without_its_router(systemd: Systemd) -> None:
     """A client whose router does not answer for long counts as started: neither it nor the boot is held up."""
     with notified(systemd, connect=free_endpoint(), patience=0.1):
-        assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waits for a router at tcp/")
+        assert systemd.receive_until(is_ready)[-1]["STATUS"].startswith("waiting for a router at tcp/")
 
 
 def test_nothing_without_notify_socket() -> None:

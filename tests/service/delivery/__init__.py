@@ -1,1 +1,1 @@
-"""Delivery: recovery, downsampling, slow readers, heartbeats."""
+"""Tests of recovery, downsampling, slow readers and heartbeats."""

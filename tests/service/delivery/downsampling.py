@@ -1,4 +1,4 @@
-"""Publishers that thin by a clock of the test, and a link that counts what it carries."""
+"""Downsampling publishers with a fake clock, and a link that counts its bytes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MS = 1_000_000  # ns
 
 
 class Link:
-    """A TCP link to a router; `carried` counts its bytes, and nothing passes while `flows` is not set."""
+    """A TCP link to a router; `carried` counts its bytes, and it blocks while `flows` is not set."""
 
     def __init__(self, endpoint: str) -> None:
         self.carried = 0
@@ -68,7 +68,7 @@ class Link:
 
 
 class Clock:
-    """The clock of publishers."""
+    """The fake clock of publishers."""
 
     def __init__(self) -> None:
         self.now = 10**18
@@ -79,7 +79,7 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    """Let publishers of this process thin by a clock of the test's."""
+    """Downsample with a fake clock in the publishers of this process."""
     clock = Clock()
     monkeypatch.setattr(downsampler, "time", clock)
     return clock
@@ -93,19 +93,19 @@ def publish(publisher: nedbus.Publisher, clock: Clock, first: int, count: int) -
 
 
 def is_wanted(publisher: nedbus.Publisher) -> bool:
-    """Return whether a publisher knows that somebody reads its vehicle downsampled."""
+    """Return True if a publisher is matched by a downsampling reader of its vehicle."""
     return publisher._downsampler.vehicle.is_matched()  # what it does about that shows only once it publishes
 
 
 def wait_for_demand(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher knows that somebody reads it downsampled."""
+    """Wait until a publisher is matched by a downsampling reader."""
     wait_for(partial(is_wanted, publisher), what="the demand for a downsampled stream")
 
 
 def take_last(publisher: nedbus.Publisher, subscription: nedbus.Subscription) -> None:
-    """Wait until a subscription has begun: with message 0, which was published before it, and a demand.
+    """Wait until a subscription is open and matched: take message 0, which was published before.
 
-    The last message is queried, and one that is published meanwhile may be overtaken by the answer.
+    The last message is queried, and one published meanwhile may be overtaken by the reply.
     """
     assert take(subscription, 1) == [0]
     wait_for_demand(publisher)

@@ -1,4 +1,4 @@
-"""Subscriptions to which messages do not come, and the questions they ask: nothing is lost on loopback."""
+"""Subscriptions that miss messages, and their retransmission requests; loopback itself is lossless."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .publishing import publish, take
 
 
 class LossyQueue(PendingQueue):
-    """A queue to which the messages `missing`, by sequence number, do not come."""
+    """A queue that does not receive the messages `missing`, by sequence number."""
 
     def __init__(self) -> None:
         super().__init__("every", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
@@ -26,7 +26,7 @@ class LossyQueue(PendingQueue):
 
 
 class Lossy:
-    """A subscription with a lossy queue, and its requests, the first `unanswered` of which get no answer."""
+    """A subscription with a lossy queue, and its requests; the first `unanswered` get no reply."""
 
     def __init__(self, session: Session, queue: LossyQueue, receiver: Receiver, publisher: nedbus.Publisher) -> None:
         self.session = session
@@ -48,7 +48,7 @@ class Lossy:
 
 
 class Counted:
-    """Answers of a question that counts as open until they have ended."""
+    """The replies to a request, which counts as open until they have ended."""
 
     def __init__(self, answers: RetransmitRequest, lossy: Lossy) -> None:
         self._answers = answers

@@ -1,4 +1,4 @@
-"""Publishers of many numbered messages, which begin once a reader is there."""
+"""Publishers of numbered messages, which start once a reader is subscribed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def publish(publisher: nedbus.Publisher, *timestamps: int) -> None:
 
 
 def is_read(publisher: nedbus.Publisher) -> bool:
-    """Return whether a publisher knows of a subscriber."""
+    """Return True if a publisher is matched by a subscriber."""
     probe = publisher._writer.session.declare_publisher(publisher.key)  # no other session knows what this one does
     status = cast("zenoh.MatchingStatus", probe.matching_status)
     probe.undeclare()
@@ -36,7 +36,7 @@ def is_read(publisher: nedbus.Publisher) -> bool:
 
 
 def wait_for_subscriber(publisher: nedbus.Publisher) -> None:
-    """Wait until a publisher knows of a subscriber: what it publishes before goes nowhere."""
+    """Wait until a publisher is matched by a subscriber; earlier messages would go nowhere."""
     wait_for(partial(is_read, publisher), what=f"a subscriber of {publisher.key}")
 
 

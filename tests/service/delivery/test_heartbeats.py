@@ -1,4 +1,4 @@
-"""Heartbeats of our publishers, as Zenoh's own advanced subscriber takes them."""
+"""Heartbeats of nedbus as received by Zenoh's own advanced subscriber."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .publishing import publish, wait_for_subscriber
 
 
 def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> None:
-    """It was lost on the way, and nothing came after it: a heartbeat tells any advanced subscriber."""
+    """Zenoh's advanced subscriber recovers the last message after a heartbeat, although no other message follows."""
     channel: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(100)
     recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
     samples: list[zenoh.Sample] = []
@@ -41,7 +41,7 @@ def test_last_message_is_recovered_by_zenoh(endpoint: str, bus: nedbus.Bus) -> N
 
 
 def test_downsampled_streams_have_heartbeats(bus: nedbus.Bus, raw: Session) -> None:
-    """Each has numbers of its own, and tells the last of them."""
+    """Each downsampled stream has its own numbers, and heartbeats with the last one."""
     heard: Heartbeats = {}
     take, undeclare = follow_heartbeats(raw, f"nedbus/*/{VLP}/@rate/*")
     with bus.publisher(VLP, vehicle="1") as publisher, bus.subscribe(VLP, mode="every", max_rate=1):

@@ -1,6 +1,6 @@
-"""A subscription with a maximum rate, over a real router: what arrives, what the link carries, what is counted.
+"""A subscription with a maximum rate, through a real router: arrivals, bytes on the link, and counts.
 
-Publishers thin by a clock that these tests turn: 10 ms a message, however fast the machine is.
+Publishers downsample by a fake clock, at 10 ms per message, whatever the speed of the machine.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ BOTH: list[Mode] = ["latest", "every"]
 
 @pytest.mark.parametrize("mode", BOTH)
 @pytest.mark.parametrize("max_rate", [1, 7.5, 20, 99])
-def test_exactly_so_many_arrive(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, mode: Mode, max_rate: float) -> None:
-    """Of 10 s at 100 Hz there arrive 10 times the rate, evenly, after the last message; the rest is not lost."""
+def test_exact_rate_arrives(client: nedbus.Bus, bus: nedbus.Bus, clock: Clock, mode: Mode, max_rate: float) -> None:
+    """Of 10 s at 100 Hz, 10 times the rate arrive, evenly spaced, after the last message; the rest is not lost."""
     step = rate_step(max_rate)
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
@@ -49,7 +49,7 @@ def test_exactly_so_many_arrive(client: nedbus.Bus, bus: nedbus.Bus, clock: Cloc
 
 
 def test_invalid_rate_is_refused(client: nedbus.Bus) -> None:
-    """A rate that is none is a ConfigError that names it, from either client."""
+    """An invalid rate is a ConfigError that names it, with either client."""
     with pytest.raises(nedbus.ConfigError, match="max_rate: 0 is invalid"):
         client.subscribe(max_rate=0)
     with pytest.raises(nedbus.ConfigError, match="max_rate: nan is invalid"):
@@ -57,7 +57,7 @@ def test_invalid_rate_is_refused(client: nedbus.Bus) -> None:
 
 
 def test_every_topic_and_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
-    """Each stream of a selection is downsampled for itself, with its address; instances too."""
+    """Each stream of a selection is downsampled separately, with its address and instance."""
     addresses = [Address("1", VLP), Address("2", VLP), Address("2", "estimator_local_position", 3)]
     publishers = [bus.publisher(each.topic, vehicle=each.vehicle, instance=each.instance) for each in addresses]
     for publisher in publishers:
@@ -75,7 +75,7 @@ def test_every_topic_and_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
 
 
 def test_messages_arrive_as_they_were(bus: nedbus.Bus, clock: Clock) -> None:
-    """Payload, source, missing fields and the time of sending are those of the stream."""
+    """Payload, source, missing fields and time of sending are those of the original stream."""
     publisher = bus.publisher(VLP, vehicle="7", source="ins")
     with bus.subscribe(VLP, mode="every") as whole, bus.subscribe(VLP, mode="every", max_rate=5) as downsampled:
         wait_for_demand(publisher)
@@ -89,7 +89,7 @@ def test_messages_arrive_as_they_were(bus: nedbus.Bus, clock: Clock) -> None:
 
 
 def test_array_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
-    """publish_many thins as well: what is sent at once counts as one moment."""
+    """publish_many is downsampled too: messages sent at once count as one moment."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
@@ -102,12 +102,12 @@ def test_array_is_downsampled(bus: nedbus.Bus, clock: Clock) -> None:
 
 
 def thinned_by(raw: Session) -> list[str]:
-    """Return the downsampled streams that are declared, by their liveliness tokens."""
+    """Return the declared downsampled streams, by their liveliness tokens."""
     return [str(reply.ok.key_expr) for reply in raw.liveliness().get("nedbus/**/@rate/*") if reply.ok]
 
 
-def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
-    """A publisher declares downsampled streams for their readers, and withdraws them a minute after; not for others."""
+def test_nothing_is_declared_without_readers(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
+    """Downsampled streams are declared for their readers only, and withdrawn a minute after the last one."""
     publisher, other = (bus.publisher(VLP, vehicle=vehicle) for vehicle in "78")
     subscription = bus.subscribe(VLP, mode="every")
     wait_for_subscriber(publisher)
@@ -132,24 +132,24 @@ def test_nothing_is_declared_for_nobody(bus: nedbus.Bus, raw: Session, clock: Cl
         wait_for(withdraws, what="the end of the downsampled stream")
 
 
-def test_demand_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
-    """Closed publishers leave nothing, and another one of the same vehicle is downsampled again."""
+def test_listener_ends_with_the_last_publisher_of_a_vehicle(bus: nedbus.Bus, clock: Clock) -> None:
+    """Closed publishers leave no declarations, and a new one of the same vehicle is downsampled again."""
     first = bus.publisher(VLP, vehicle="8")
     first.publish(message(0))
     with bus.subscribe(VLP, mode="every", max_rate=5) as subscription:
         take_last(first, subscription)
         first.close()
-        for start in (1000, 1):  # a vehicle that restarts: its timestamps begin anew
+        for start in (1000, 1):  # a vehicle that restarts: its timestamps start again
             with bus.publisher(VLP, vehicle="7") as publisher:
                 wait_for_demand(publisher)
                 publish(publisher, clock, start, 100)
                 assert take(subscription, 5) == list(range(start, start + 100, 20))
-            assert not bus._publishers._matched  # as nobody else could see
+            assert not bus._publishers._matched  # not visible from outside
         assert subscription.counts == nedbus.Counts(received=11)
 
 
 def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> None:
-    """A subscription starts with last messages of publishers, and not with what a storage kept of vehicles."""
+    """A subscription starts with the last messages of publishers, not with those of a storage."""
     stored = reply_with({f"nedbus/8/{VLP}": encode(message(99))}, timestamp=raw.new_timestamp())
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(1))
@@ -163,7 +163,7 @@ def test_storage_is_no_vehicle(bus: nedbus.Bus, raw: Session, clock: Clock) -> N
 def publish_over_a_break(
     publisher: nedbus.Publisher, subscription: nedbus.Subscription, clock: Clock, link: Link, seconds: int
 ) -> list[nedbus.Sample]:
-    """Publish 1 s of 100 Hz, the rest while the link is cut, and on; return all that arrived until a later one."""
+    """Publish 1 s of 100 Hz, the rest while the link is down and after; return all that arrived until a later one."""
     take_last(publisher, subscription)
     taken = []
     for first in range(1, 101, 20):
@@ -191,7 +191,7 @@ def publish_over_a_break(
 
 @pytest.mark.parametrize(("mode", "seconds"), [("every", 10), ("every", 40), ("latest", 10)])
 def test_broken_link(endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, seconds: int) -> None:
-    """Losses of a downsampled stream by a broken link are recovered in mode "every", for 20 s; the rest is counted."""
+    """Losses of a downsampled stream are recovered in mode "every" for 20 s after a broken link; others are counted."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     with (
@@ -215,7 +215,7 @@ def test_broken_link(endpoint: str, bus: nedbus.Bus, clock: Clock, mode: Mode, s
 
 
 def test_lossless_publisher_does_not_wait(endpoint: str, bus: nedbus.Bus) -> None:
-    """A replay at full speed does not wait for a reader who asked for less and stands still, nor sends it more."""
+    """A replay at full speed does not wait for a downsampling reader that does not read, nor sends it more."""
     publisher = bus.publisher(VLP, vehicle="7", lossless=True)
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every", max_rate=1) as subscription:
         wait_for_demand(publisher)
@@ -234,8 +234,8 @@ def test_lossless_publisher_does_not_wait(endpoint: str, bus: nedbus.Bus) -> Non
 
 
 @pytest.mark.parametrize(("mode", "thin"), [("latest", "reader"), ("every", "vehicle")])
-def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: Mode, thin: str) -> None:
-    """5 Hz of a 100 Hz stream take less than 5 kB/s of a link, be it the reader's or the vehicle's."""
+def test_thin_link_carries_the_requested_rate(endpoint: str, clock: Clock, mode: Mode, thin: str) -> None:
+    """5 Hz of a 100 Hz stream take less than 5 kB/s of a link, at the reader's or the vehicle's end."""
     with closing(Link(endpoint)) as link:
         near, far = (link.endpoint, endpoint) if thin == "reader" else (endpoint, link.endpoint)
         with nedbus.connect(far) as vehicle, nedbus.connect(near) as reader:
@@ -256,7 +256,7 @@ def test_thin_link_carries_what_is_asked_for(endpoint: str, clock: Clock, mode: 
 def test_publisher_that_does_not_downsample_is_named(
     endpoint: str, bus: nedbus.Bus, clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its stream does not arrive, and the log says so once; it is never read at full rate, nor is any other."""
+    """A stream that is not downsampled does not arrive, which is logged once; no stream is read at full rate."""
     put, cannot = Downsampler.put, []
     monkeypatch.setattr(Downsampler, "put", lambda self, *args: None if self in cannot else put(self, *args))
     publishers = [bus.publisher(VLP, vehicle=vehicle) for vehicle in ("7", "8")]
@@ -269,12 +269,12 @@ def test_publisher_that_does_not_downsample_is_named(
         assert not any(map(is_read, publishers))
         monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
         wait_for(lambda: "not downsampled" in caplog.text, what="the warning")
-        assert caplog.text.count("1 streams that are not downsampled") == caplog.text.count(publishers[1].key) == 1
+        assert caplog.text.count("1 streams are not received") == caplog.text.count(publishers[1].key) == 1
         assert subscription.counts == nedbus.Counts(received=2)
 
 
 def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -> None:
-    """`nedbus echo --max-rate 5` prints each 20th message of 100 Hz."""
+    """`nedbus echo --max-rate 5` prints every 20th message of 100 Hz."""
     publisher = bus.publisher(VLP, vehicle="7")
     publisher.publish(message(0))
     echo = run_nedbus("echo", "-c", endpoint, "--max-rate", "5", "--every", "--csv", "--field", "timestamp", "-n", "51")
@@ -289,7 +289,7 @@ def test_echo(run_nedbus: Start, endpoint: str, bus: nedbus.Bus, clock: Clock) -
 
 
 def test_rate_keys() -> None:
-    """The key of a downsampled stream is that of the stream, a chunk that no wildcard matches, and the rate."""
+    """The key of a downsampled stream is the key of the stream, a chunk that no wildcard matches, and the rate."""
     address = Address("7", "estimator_local_position", 1)
     assert address.rate_key(5) == "nedbus/7/estimator_local_position/1/@rate/5"
     assert Address.from_rate_key("nedbus/7/estimator_local_position/1/@rate/5") == address

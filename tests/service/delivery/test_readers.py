@@ -1,4 +1,4 @@
-"""Readers that stand still, are stopped, die or are slow: nobody else waits for them, and nothing is lost unseen."""
+"""Readers that do not read, are suspended, die or are slow: they delay no other reader, and all losses are counted."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ with nedbus.connect(endpoint) as bus, bus.subscribe("vehicle_local_position", mo
 
 
 def subscribe(endpoint: str) -> Iterator[nedbus.Subscription]:
-    """Open a reader; named before `bus` it ends after that, which would wait 5 s for one that has gone."""
+    """Open a reader; requested before `bus`, it closes after it, which else waits 5 s for the reader."""
     with nedbus.connect(endpoint) as other, other.subscribe(VLP, mode="every") as subscription:
         yield subscription
 
@@ -62,7 +62,7 @@ stuck_reader = pytest.fixture(name="stuck")(subscribe)
 def publish_all(
     bus: nedbus.Bus, *, count: int = COUNT, before: Callable[[], object] = lambda: None
 ) -> tuple[nedbus.Publisher, threading.Thread]:
-    """Start to publish messages without losing any, once there is a reader, and something was done before."""
+    """Publish messages losslessly, once there is a reader, after a first action."""
     publisher = bus.publisher(VLP, vehicle="1", lossless=True)
     wait_for_subscriber(publisher)
     before()
@@ -74,7 +74,7 @@ def publish_all(
 def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
     stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
 ) -> None:
-    """More than a window is not sent at once while one reader reads nothing, but others see more; both get all."""
+    """While a reader reads nothing, a window is sent at once and then a trickle for others; both get everything."""
     publisher, sending = publish_all(bus)
     got = take(reader, WINDOW + 5)
     assert publisher.published < COUNT
@@ -95,7 +95,7 @@ def test_replay_goes_on_slowly_beside_a_reader_that_stands_still(
 def test_stopped_reader_gets_everything(
     start: Start, endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch, *, when: str, lease: int
 ) -> None:
-    """One that is stopped (SIGSTOP) until Zenoh's lease has ended, of 5 s or here 1 s, comes back, and lost nothing."""
+    """A reader suspended (SIGSTOP) until its lease of 5 s, here 1 s, has expired returns without losses."""
     assert COMMON_SETTINGS["transport/link/tx/lease"] == 1000 * LEASE == 5000
     begin = time.monotonic()
     if lease != LEASE:
@@ -123,7 +123,7 @@ def test_stopped_reader_gets_everything(
 
 @pytest.mark.parametrize("lossless", [False, True])
 def test_publishers_that_began_while_the_link_was_broken(endpoint: str, bus: nedbus.Bus, lossless: bool) -> None:
-    """A reader that was away when they began gets all that they still keep, in order: it has subscribed before."""
+    """A reader that was offline when publishers started gets their whole history cache in order, once it is back."""
     near = free_endpoint()
     router = open_router(listen=(near,), connect=(endpoint,))
     vehicles = [str(number) for number in range(10)]
@@ -176,7 +176,7 @@ def test_reader_that_dies_is_given_up(
     *,
     number: signal.Signals,
 ) -> None:
-    """A replay goes on without one that is killed, or ends, and others miss nothing."""
+    """A replay continues without a reader that is killed or ends, and other readers miss nothing."""
     monkeypatch.setattr("nedbus.client.publishing.flow_control.RETURN_TIMEOUT", 0.5)
     dying = start("-c", READER, endpoint, str(COUNT), "slow", measured=False)
     wait_for(lambda: "ready" in dying.out, what="the reader")
@@ -191,7 +191,7 @@ def test_reader_that_dies_is_given_up(
 def test_flush_waits_for_arrival_and_not_for_scripts(
     stuck: nedbus.Subscription, reader: nedbus.Subscription, bus: nedbus.Bus
 ) -> None:
-    """Messages at a script that reads nothing are safe: the end of a replay does not wait until they are read."""
+    """A flush waits for messages to arrive at readers, not for scripts to read them."""
     publisher, sending = publish_all(bus, count=WINDOW // 2)
     assert take(reader, WINDOW // 2)[-1] == WINDOW // 2
     reader.close()

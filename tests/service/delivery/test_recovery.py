@@ -1,7 +1,7 @@
-"""Recovery of lost messages by a reader of mode `every`: real publishers and sessions on loopback.
+"""Recovery of lost messages by a reader of mode `every`, with real publishers and sessions on loopback.
 
-Nothing is lost there, so what arrives at one reader goes missing behind Zenoh, just before its queue. In the last test
-it is a router that dies, and nothing is made.
+Loopback loses nothing, so messages are removed behind Zenoh, before the queue of one reader. The last test restarts a
+real router.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ KEY = f"nedbus/7/{VLP}"
 
 @pytest.fixture
 def housekeeping() -> Iterator[Housekeeping]:
-    """Run the thread that a session's receivers share."""
+    """Run the thread shared by the receivers of a session."""
     with closing(Housekeeping()) as thread:
         yield thread
 
@@ -44,7 +44,7 @@ def housekeeping() -> Iterator[Housekeeping]:
 def lossy(
     endpoint: str, bus: nedbus.Bus, housekeeping: Housekeeping, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Lossy]:
-    """Subscribe to all vehicles, and wait until the one that publishes knows it."""
+    """Subscribe to all vehicles, and wait until the publisher is matched."""
     publisher, queue = bus.publisher(VLP, vehicle="7"), LossyQueue()
     with closing(open_client([endpoint], timeout=DEADLINE)) as session:
         lossy = Lossy(session, queue, Receiver(session, f"nedbus/*/{VLP}", queue, housekeeping=housekeeping), publisher)
@@ -59,8 +59,8 @@ def fail(*_: object) -> None:
 
 
 @pytest.mark.parametrize("unanswered", [0, 3])
-def test_what_is_missing_is_asked_for_by_the_exact_key(lossy: Lossy, unanswered: int) -> None:
-    """Each router compares wildcards with all caches; it is asked again: one that has just started knows no cache."""
+def test_missing_samples_are_requested_by_the_exact_key(lossy: Lossy, unanswered: int) -> None:
+    """Requests have an exact key, as routers compare wildcards with all caches, and are repeated after a restart."""
     lossy.queue.missing, lossy.unanswered = {1, 2, 3, 4}, unanswered
     lossy.publish(*range(7))
     assert lossy.receive(7) == list(range(7))
@@ -68,8 +68,8 @@ def test_what_is_missing_is_asked_for_by_the_exact_key(lossy: Lossy, unanswered:
     assert lossy.subscription.counts == Counts(received=7)
 
 
-def test_what_a_publisher_keeps_no_more_is_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A publisher that sends the newest one has no more: the rest is lost, once it was asked for a second time."""
+def test_samples_no_longer_in_the_cache_are_lost(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages no longer in the publisher's cache are lost, after a second request."""
 
     def forget(session: Session, key: str, name: str, numbers: range, *, timeout: float) -> RetransmitRequest:
         return request_samples(session, key, name, range(max(3, numbers.start), numbers.stop), timeout=timeout)
@@ -82,10 +82,10 @@ def test_what_a_publisher_keeps_no_more_is_lost(lossy: Lossy, monkeypatch: pytes
     assert lossy.subscription.counts == Counts(received=4, lost=2)
 
 
-def test_publisher_that_keeps_nothing_is_asked_once(
+def test_publisher_without_a_cache_gets_one_request(
     lossy: Lossy, raw: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another program numbers its messages, and has no cache: after one wait in vain it is asked once for a hole."""
+    """A publisher of another program, with sequence numbers but no cache, gets one request per gap after a timeout."""
     monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
     misses = zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=None)
     key = f"nedbus/foreign/{VLP}"
@@ -106,7 +106,7 @@ def test_publisher_that_keeps_nothing_is_asked_once(
 
 
 def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that was silent has lost nothing by that once it has answered."""
+    """A publisher that timed out has lost nothing once it replies again."""
     monkeypatch.setattr(writer_proxy, "RETRANSMIT_TIMEOUT", 0.2)
     lossy.queue.missing, lossy.unanswered = {1, 3, 5}, 1_000_000
     lossy.publish(0, 1, 2)
@@ -124,9 +124,9 @@ def test_publisher_that_answers_again_is_waited_for_again(lossy: Lossy, monkeypa
 def test_newest_message_is_recovered_by_heartbeat(
     lossy: Lossy, raw: Session, housekeeping: Housekeeping, waits: str
 ) -> None:
-    """No message comes after it, and whoever waits without a timeout waits for Zenoh's channel, where nothing comes.
+    """The newest message is recovered by a heartbeat, also if its reader waits in Zenoh's channel without timeout.
 
-    What wakes that one is no message for other readers of its session, and does not leave the process.
+    The sample that wakes it up is invisible to other readers of its session, and does not leave the process.
     """
     received: list[int] = []
     seen: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(100)
@@ -162,7 +162,7 @@ def test_newest_message_is_recovered_by_heartbeat(
 
 
 def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
-    """Whoever answers in the place of a publisher, without being it, adds nothing."""
+    """Replies of peers other than the publisher are ignored."""
     lie = reply_with({KEY: encode(message(666))}, encoding=encoding_of("sim"))
     with answering(raw, f"{KEY}/@adv/pub/**", lie):
         lossy.queue.missing = {1}
@@ -172,8 +172,8 @@ def test_answers_of_others_are_left_out(lossy: Lossy, raw: Session) -> None:
 
 
 @pytest.mark.parametrize("when", ["open", "closed"])
-def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, housekeeping: Housekeeping, when: str) -> None:
-    """More answers than were asked for: the session goes on receiving, also after its reader has closed."""
+def test_flood_of_replies_delays_no_other(lossy: Lossy, raw: Session, housekeeping: Housekeeping, when: str) -> None:
+    """A flood of replies to a request does not stop the session, not even after its reader has closed."""
     asked = threading.Event()
 
     def flood(query: zenoh.Query) -> None:
@@ -205,7 +205,7 @@ def test_flood_of_answers_holds_up_nobody(lossy: Lossy, raw: Session, housekeepi
     "entity", ["a::b/1/_", "_", ":/_", "../1/_", "ab/1", "ab/1/_/x", f"{'a' * 33}/1/_", "ab/12345678901/_", "AB/1/_"]
 )
 def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> None:
-    """A heartbeat that no publisher of Zenoh sends makes no request, and keeps no other from being made."""
+    """A forged heartbeat causes no request, and prevents no other."""
     raw.put(f"nedbus/evil/{VLP}/@adv/pub/{entity}", b"\x05\x00\x00\x00")
     raw.put(f"nedbus/evil/{VLP}/@adv/pub/ab/1/_", b"longer than a number")
     lossy.queue.missing = {1}
@@ -217,8 +217,8 @@ def test_odd_heartbeats_are_none(lossy: Lossy, raw: Session, entity: str) -> Non
     assert not lossy.queue.account.requesting
 
 
-def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Session) -> None:
-    """A peer may invent publishers by heartbeats, and take the questions for them without an answer."""
+def test_requests_without_replies_delay_no_others(lossy: Lossy, raw: Session) -> None:
+    """Requests to invented publishers, announced by heartbeats, do not delay requests to real ones."""
     taken: list[zenoh.Query] = []
     evil = f"nedbus/evil/{VLP}/@adv/pub"
     with answering(raw, f"{evil}/**", taken.append):
@@ -233,7 +233,7 @@ def test_questions_that_nobody_answers_hold_up_nobody_else(lossy: Lossy, raw: Se
 
 
 def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pytest.LogCaptureFixture) -> None:
-    """A bug in what one subscription needs is logged once, and keeps neither it nor any other from what is due."""
+    """An exception in the job of one subscription is logged once, and delays neither it nor others."""
     calls: list[float] = []
 
     def fail_at_first(now: float) -> float:
@@ -252,8 +252,8 @@ def test_job_that_fails_is_called_again(housekeeping: Housekeeping, caplog: pyte
     assert sum("unexpected error" in text for text in caplog.messages) == 1
 
 
-def test_only_so_many_questions_are_open(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gaps of 60 vehicles at the same moment are requested a few at a time, and all are filled."""
+def test_number_of_open_requests_is_bounded(lossy: Lossy, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gaps of 60 vehicles at once are requested a few at a time, and all are filled."""
     monkeypatch.setattr(retransmission, "_MAX_OPEN", 4)
     publishers = [bus.publisher(VLP, vehicle=f"v{number}") for number in range(60)]
     for publisher in publishers:
@@ -267,7 +267,7 @@ def test_only_so_many_questions_are_open(lossy: Lossy, bus: nedbus.Bus, monkeypa
 
 
 def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
-    """A script that ends is told what it did not get."""
+    """A close counts the missing messages as lost."""
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1, 2}
     lossy.publish(*range(4))
     assert lossy.receive(1) == [0]
@@ -276,8 +276,8 @@ def test_closing_counts_what_is_missing(lossy: Lossy) -> None:
     assert lossy.subscription.counts.lost == 2
 
 
-def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory is bounded: beyond it what is missing is lost, and what waited arrives."""
+def test_number_of_held_back_samples_is_bounded(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The number of held back samples is bounded; beyond it gaps are lost, and the samples arrive."""
     monkeypatch.setattr(stateful_reader, "MAX_HELD", 50)
     lossy.unanswered, lossy.queue.missing = 1_000_000, {1}
     lossy.publish(*range(60))
@@ -286,7 +286,7 @@ def test_too_much_that_waits_is_let_go(lossy: Lossy, monkeypatch: pytest.MonkeyP
 
 
 def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recovered messages do not push out those that a slow reader has not read yet."""
+    """Recovered messages do not displace those that a slow reader has not read yet."""
     monkeypatch.setattr(retransmission, "_MAX_WAITING", 5)
     lossy.queue.missing = {10}
     lossy.publish(*range(20))
@@ -302,7 +302,7 @@ def test_reader_that_is_behind_asks_when_it_has_read(lossy: Lossy, monkeypatch: 
 def test_unexpected_error_costs_what_caused_it(
     lossy: Lossy, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A bug that a recovered message triggers is logged, the message is lost, and the reader goes on."""
+    """An exception caused by a recovered message is logged, the message is lost, and the reader goes on."""
     take = lossy.queue.on_retransmission
     monkeypatch.setattr(
         lossy.queue,
@@ -313,12 +313,12 @@ def test_unexpected_error_costs_what_caused_it(
     lossy.publish(0, 1, 2)
     assert lossy.receive(2) == [0, 2]
     assert lossy.subscription.counts == Counts(received=2, lost=1)
-    assert any("left out after an unexpected error" in text for text in caplog.messages)
+    assert any("unexpected error, recovered messages discarded" in text for text in caplog.messages)
 
 
 @pytest.mark.parametrize("rest", [0, 1])
 def test_newest_messages_survive_a_restart_of_the_router(rest: int) -> None:
-    """They were published while it was away, and nothing, or one more, after it: a reader that waits gets them all."""
+    """A reader that was disconnected gets the newest messages, whether another one follows or not."""
     endpoint = free_endpoint()
     router = open_router(listen=(endpoint,))
     received: list[int] = []

@@ -1,4 +1,4 @@
-"""A process in which publishers come and go, while others ask and subscribe, never stands still."""
+"""A process whose publishers come and go, while others query and subscribe, never stops."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tests.peers.processes import Start
 
 @pytest.mark.slow
 def test_process_never_stands_still_while_publishers_come_and_go(start: Start) -> None:
-    """No Python code runs on Zenoh's threads, and none holds the interpreter's lock while it waits for Zenoh's.
+    """No Python code runs on Zenoh's threads, and none holds the interpreter's lock while waiting for Zenoh.
 
-    A stop lasts 10 s, or for good: 5 s tell it from a machine that is busy.
+    A deadlock lasts 10 s or forever; the limit of 5 s tolerates a busy machine.
     """
     options = ["--seconds", "15", "--restart", "6", "--busy", "0", "--limit", "5"]
     process = start(

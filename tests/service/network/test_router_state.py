@@ -197,9 +197,9 @@ def test_router_whose_limit_is_not_told(tmp_path: Path) -> None:
     for metadata in (["a", "list"], "mine"):
         with open_router(config_file=write_config(tmp_path, where, metadata=metadata)):
             assert [(state.max_sessions, state.load) for state in ask(where)] == [(None, None)]
-            assert router_in(where, "sessions that are connected: 1").state == "ok"
+            assert router_in(where, "connected sessions: 1").state == "ok"
     with open_router(config_file=write_config(tmp_path, where, adminspace={"enabled": False})):
-        assert router_in(where, "joined; its other sessions are not shown to this client").state == "ok"
+        assert router_in(where, "connected; its other sessions are not visible to this client").state == "ok"
 
 
 def test_metrics_of_a_service_with_a_router(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def exporting(bus: nedbus.Bus) -> Iterator[Callable[..., bool]]:
 
 def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It asks the routers now and then, keeps the first few, and knows nothing of them when they are silent."""
-    monkeypatch.setattr(exporter, "_ROUTERS_PERIOD", 0.05)
+    monkeypatch.setattr(exporter, "_ROUTERS_INTERVAL", 0.05)
     with nedbus.connect(small) as bus, exporting(bus) as shows:
         (state,) = ask(small)
         label = f'{{router="{state.zid}"}}'
@@ -250,7 +250,7 @@ def test_metrics_of_an_exporter(small: str, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_exporter_at_a_full_router(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a session to ask with it goes on reading, and asks as soon as there is room for one."""
-    monkeypatch.setattr(exporter, "_ROUTERS_PERIOD", 0.05)
+    monkeypatch.setattr(exporter, "_ROUTERS_INTERVAL", 0.05)
     monkeypatch.setattr(exporter, "_SESSION_TIMEOUT", 0.1)
     where, tries, original = free_endpoint(), [], nedbus.Bus.open_session
 
@@ -338,7 +338,7 @@ def test_files_of_a_router(
     assert limits.now[0] == soft
     assert bool(caplog.records) is warns
     if warns:
-        assert f"only {soft} open files are allowed: room for about {soft - 100} sessions" in caplog.text
+        assert f"the limit of {soft} open files has room for about {soft - 100} sessions" in caplog.text
 
 
 LIMITED = """
@@ -364,4 +364,4 @@ def test_router_that_may_not_says_so(start: Start) -> None:
     """With a hard limit of 300 it starts, and logs how many sessions it has room for."""
     router = start("-c", LIMITED, "300", "300", "router", "--listen", free_endpoint())
     wait_for(lambda: "router on" in router.err, what="the router")
-    assert "only 300 open files are allowed: room for about 200 sessions" in router.err
+    assert "the limit of 300 open files has room for about 200 sessions" in router.err

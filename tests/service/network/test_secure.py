@@ -176,7 +176,7 @@ def test_certificate_reads_what_it_is_for(join: Join, open_as: Open) -> None:
 @pytest.mark.parametrize(
     ("ca", "certificate", "key", "reason"),
     [
-        (None, "vehicle-1.crt", "vehicle-1.key", "tls_ca: a certificate is given, but not"),
+        (None, "vehicle-1.crt", "vehicle-1.key", "tls_ca: a certificate is set, but not"),
         ("ca.crt", None, "vehicle-1.key", "a certificate needs its key"),
         ("gone.crt", None, None, "gone.crt cannot be read"),
     ],
@@ -209,7 +209,7 @@ def test_commands_use_certificates(secure: str, pki: Path, run_nedbus: Start) ->
     assert "sim:" in info.out
     refused = run_command("health", "-v", "2", **environment)
     assert refused.exit_code == 1
-    assert "vehicle 2 is not published, though its service reports that it is" in refused.err
+    assert "vehicle 2 is not published, although its service reports it as published" in refused.err
 
 
 def test_px4_reaches_the_secure_router_through_its_own(
@@ -249,7 +249,7 @@ def test_list_does_not_ask_for_a_source_that_is_there(secure: str, pki: Path, ru
 
     assert "start a source with 'nedbus serve'" in hint()
     run_nedbus("serve", "--connect", secure, *flags_of(pki, "vehicle-1"), "-s", "sim:?vehicle=2")
-    wait_for(lambda: "a service answers, so see 'nedbus info'" in hint(), what="the other hint")
+    wait_for(lambda: "a service answers: see 'nedbus info'" in hint(), what="the other hint")
 
 
 def test_pki_commands_never_overwrite(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_missing_certificate_is_named(run_nedbus: Start, tmp_path: Path) -> None
     file.write_text((CONFIG / "router-secure.json5").read_text().replace("/etc/nedbus/pki", str(tmp_path / "nowhere")))
     router = run_nedbus("router", str(file))
     assert router.wait() == 2
-    assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: does it exist", router.err)
+    assert re.search(r"secure\.json5: \w+: \S+/nowhere/\S+ cannot be read: check that it exists", router.err)
 
 
 @pytest.mark.parametrize(
@@ -297,9 +297,9 @@ def test_refused_clients_are_logged(
     assert "refused" not in router.err
 
     for name, ca, reason in (
-        ("foreign/reader", "ca.crt", "its certificate is of another authority"),
+        ("foreign/reader", "ca.crt", "its certificate is signed by another authority"),
         ("expired", "ca.crt", "its certificate has expired"),
-        (None, "ca.crt", "it shows no certificate"),
+        (None, "ca.crt", "it sent no certificate"),
         ("reader", "foreign/ca.crt", "it does not accept the certificate of this router"),
     ):
         with pytest.raises(nedbus.ConnectError, match=r"check that tls_ca is the router's authority"):
@@ -373,7 +373,7 @@ def test_refused_service_says_so_until_the_rules_are_mended(
     file.write_text(file.read_text().replace(own, own.replace('vehicle-2"] }', f'{certificate}"] }}')))
     router.kill()
     start_router()
-    wait_for(lambda: "the router takes vehicle 2 now: all is well again" in service.err, what="its end")
+    wait_for(lambda: "the router accepts vehicle 2 now" in service.err, what="its end")
     assert (pages.ask("/healthz"), pages.ask("/readyz")) == ((200, "ok\n"), (200, "ready\n"))
     assert pages.values("nedbus_vehicle_refused", vehicle="2") == [0.0]
     health = run_command("health", "--vehicle", "2", *reader)

@@ -130,7 +130,7 @@ def test_vehicle_that_restarted_wins_over_the_storage(start: Start, tmp_path: Pa
         stored = run_command("get", "-c", zenohd)
         assert stored.exit_code == 1
         assert ", only stored" in stored.out
-        assert "no publisher answers: these are what a storage kept" in stored.err
+        assert "no publisher answers: these messages are from a storage" in stored.err
         listed = run_command("list", "-c", zenohd)
         assert (listed.exit_code, "stored" in listed.out) == (0, True)
         with nedbus.connect(zenohd) as vehicle:
@@ -193,6 +193,6 @@ def test_bridge_to_ros_2_needs_its_router(run_nedbus: Start, secure: str, zenohd
         vehicle.publisher(VLP, vehicle="1")
         alone = run_nedbus("ros2", "-c", secure, *flags)
         assert alone.wait() == 1
-        assert "name it with --to" in alone.err
+        assert "set its endpoint with --to" in alone.err
         bridge = run_nedbus("ros2", "-c", secure, *flags, "--to", zenohd)
         wait_for(lambda: f"-> /fmu/out/{VLP}" in bridge.err, what=f"the bridge {bridge.err}")

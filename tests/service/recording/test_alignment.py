@@ -149,9 +149,9 @@ def test_odd_streams_are_aligned(tmp_path: Path) -> None:
     assert table[f"{VLP}.x"].tolist() == [0, 1, 2, 3, 4, 5]
     assert nedbus.align({VLP: twice}, on=[1_000_000, 1_300_000])[f"{VLP}.x"].tolist() == [1, 3]
     again = np.concatenate([POSITIONS, POSITIONS])
-    with pytest.raises(ConfigError, match=f"^{VLP}: its timestamps start again: align the messages of one boot"):
+    with pytest.raises(ConfigError, match=f"^{VLP}: timestamps restart: align the messages of each boot"):
         nedbus.align({VLP: again})
-    with pytest.raises(ConfigError, match="'spline' is none of last, nearest, linear"):
+    with pytest.raises(ConfigError, match="'spline' is not one of last, nearest, linear"):
         nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # that is the mistake
     with pytest.raises(AddressError, match=f"topic 'home_position' is not valid: expected one of {VLP}"):
         nedbus.align({VLP: POSITIONS}, topics=["home_position"])
@@ -187,7 +187,7 @@ def test_file_is_read_by_streams(tmp_path: Path) -> None:
             writer.write(
                 array, definition, repeat((address, Provenance())), logged=[1] * len(array), published=repeat(1)
             )
-    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: expected one of those in .*: 1, 2"):
+    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: expected one vehicle of .*: 1, 2"):
         nedbus.read(tmp_path / "two.mcap", ["*"])
     with pytest.raises(AddressError, match=r"vehicle '\*' is not valid"):
         nedbus.utc_of(tmp_path / "two.mcap")

@@ -15,7 +15,7 @@ from typing import Final
 
 import pytest
 
-from nedbus.events import Event, Story, tell
+from nedbus.events import Event, Story, stories_of
 from nedbus.sources import read_account
 from nedbus.sources.account import FileAccount
 from tests.flights.ulogs import LOGS
@@ -42,7 +42,7 @@ def account_of(name: str) -> FileAccount:
 
 
 def told_in(name: str) -> list[Event]:
-    return account_of(name).account.take(0)[0]
+    return account_of(name).account.events_since(0)[0]
 
 
 def time_of(event: Event) -> float:
@@ -102,8 +102,8 @@ def test_every_event_of_the_table_is_told(name: str) -> None:
         event = next((each for each in left if is_same(row, each)), None)
         assert event is not None, f"not told: {row}"
         left.remove(event)
-        assert ("changes that are not told" in event.text) == (count > 1), event.text
-        assert count == 1 or f"the last of {count} changes" in event.text
+        assert ("suppressed changes" in event.text) == (count > 1), event.text
+        assert count == 1 or f"the last of {count} suppressed changes" in event.text
         sizes = sizes_of(event)
         for number, value in row["numbers"].items():
             if number == "distance" and row["kind"] == "jump":
@@ -150,7 +150,7 @@ def why(name: str, *, at: float | None = None) -> list[Story]:
     followed = read.account.vehicles["1"]
     if at is not None:
         at = read.times.find(str(at), told[-1])
-    return tell(told, followed.conditions.values(), topics=list(followed.topics), at=at)
+    return stories_of(told, followed.conditions.values(), topics=list(followed.topics), at=at)
 
 
 def short(events: Sequence[Event]) -> list[tuple[str, float | None]]:

@@ -52,7 +52,7 @@ def told_by(path: Path) -> list[Event]:
     """Return the events of a log, and the begin of what held all the time."""
     account = read_account(path).account
     held = [each.begin for each in account.vehicles["1"].conditions.values() if each.initial]
-    return [*held, *account.take(0)[0]]
+    return [*held, *account.events_since(0)[0]]
 
 
 def marks_of(axes: Any, marker: str) -> list[tuple[float, float]]:
@@ -156,7 +156,7 @@ def test_events_are_marked_by_severity() -> None:
         assert [x for x, _ in marks_of(parts[name], "D")] == [3.0, 7.5]
     assert len({parts[name].get_xlim() for name in ("altitude", "speed", "flags", "events")}) == 1
     labels = [text.get_text() for text in parts["track"].get_legend().get_texts()]
-    assert labels == [f"7/{VLP}", "an event to watch", "a bad event"]
+    assert labels == [f"7/{VLP}", "watch event", "bad event"]
     others = drawn([flight_of(vehicle="8")], events)
     assert "events" not in others, "events of a vehicle that is not drawn"
     assert not marks_of(others["track"], "x")
@@ -191,7 +191,7 @@ def test_command_marks_events(tmp_path: Path) -> None:
         plot = run_command("plot", str(flight), "-o", str(tmp_path / "a.svg"))
     assert plot.exit_code == 0, plot.err
     texts = set(re.findall(r"<text[^>]*>([^<]*)</text>", (tmp_path / "a.svg").read_text()))
-    assert {"xy invalid", "gps fix lost", "mode", "Mission", "only 0 satellites", "a bad event"} <= texts
+    assert {"xy invalid", "gps fix lost", "mode", "Mission", "only 0 satellites", "bad event"} <= texts
 
 
 @pytest.mark.logs

@@ -77,12 +77,12 @@ def test_frames_have_named_columns(flight: Path) -> None:
 
 def test_selection_must_match_one_stream(flight: Path, tmp_path: Path) -> None:
     """A selection that matches several streams or none is an error that names the available ones."""
-    with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: name instance too, of 1/"):
+    with pytest.raises(AddressError, match=r"^instance None is not valid: .*several match: set instance to one of 1/"):
         nedbus.read(flight, "estimator_local_position")
     has = f"which has 1/.*, 1/estimator_local_position/0, .*1/{VLP}"
-    with pytest.raises(AddressError, match=f"^vehicle '2' is not valid: expected one that is in {flight}, {has}"):
+    with pytest.raises(AddressError, match=f"^vehicle '2' is not valid: expected one in {flight}, {has}"):
         nedbus.read(flight, vehicle="2")
-    with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one that is in {flight}, {has}"):
+    with pytest.raises(AddressError, match=f"^instance 5 is not valid: expected one in {flight}, {has}"):
         nedbus.read(flight, "estimator_local_position", instance=5)
     with pytest.raises(SourceError, match="no such file"):
         nedbus.read(tmp_path / "none.ulg")
@@ -98,14 +98,14 @@ def test_several_vehicles_must_be_told_apart(tmp_path: Path) -> None:
         writer.write(
             rows, DEFAULT, ((address, Provenance()) for address in addresses), logged=repeat(1), published=repeat(1)
         )
-    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: .*name vehicle too, of 1/.* and 3 more$"):
+    with pytest.raises(AddressError, match=r"vehicle '\*' is not valid: .*set vehicle to one of 1/.* and 3 more$"):
         nedbus.read(path)
-    with pytest.raises(AddressError, match="name topic and vehicle and instance too"):
+    with pytest.raises(AddressError, match="set topic and vehicle and instance to one of"):
         nedbus.read(path, "*")
     truth = f"{VLP}_groundtruth"
-    with pytest.raises(AddressError, match=f"topic '{truth}' is not valid: expected one that is in .* has 1/.* more$"):
+    with pytest.raises(AddressError, match=f"topic '{truth}' is not valid: expected one in .* has 1/.* more$"):
         nedbus.read(path, truth)
-    with pytest.raises(AddressError, match=f"topic '{VLP}' is not valid: expected one that is in"):
+    with pytest.raises(AddressError, match=f"topic '{VLP}' is not valid: expected one in"):
         nedbus.read(path, vehicle="99")
 
 
@@ -228,7 +228,7 @@ def test_plot_leaves_out_what_the_flight_does_not_have(tmp_path: Path) -> None:
     assert "xy_valid" in texts
     assert "dead_reckoning" not in texts
     assert "heading resets" not in texts
-    assert f"1/{VLP} does not have dead_reckoning, heading_reset_counter" in texts
+    assert f"not in 1/{VLP}: dead_reckoning, heading_reset_counter" in texts
 
 
 def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_plot_of_nothing_valid_is_explained(tmp_path: Path) -> None:
     array = to_array([message(each + 1) for each in range(20)])
     name = "flight $1$ of $x, \u0631\u062d\u0644\u0629, \u98db\u884c and broken \udcff.ulg"
     texts = texts_of([(Address("1", VLP), array)], tmp_path / "a.svg", title=name)
-    assert {"altitude; thin: z invalid, dashed: a reset of z or vz", "speed; thin: v_xy invalid"} <= set(texts)
+    assert {"altitude; thin: z invalid, dashed: z or vz reset", "speed; thin: v_xy invalid"} <= set(texts)
     assert name.replace("\udcff", "?") in texts
 
 
@@ -316,7 +316,7 @@ def test_messages_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.Lo
         writer.write(to_array([message(1), message(2)]), DEFAULT, streams, logged=(1, 2), published=(1, 2))
     assert nedbus.addresses_of(path) == addresses[1:]
     nedbus.read(path)
-    assert "messages of type VehicleLocalPosition, where vehicle_attitude has VehicleAttitude" in caplog.text
+    assert "its messages are VehicleLocalPosition, but vehicle_attitude has VehicleAttitude" in caplog.text
 
 
 def test_recording_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -369,12 +369,12 @@ def test_recipe_measures_the_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (
             "flight.mcap -v 9",
             2,
-            "vehicle '9' is not valid: expected one that is in flight.mcap, which has 1/battery_status/0, 1/est",
+            "vehicle '9' is not valid: expected one in flight.mcap, which has 1/battery_status/0, 1/est",
         ),
-        ("flight.mcap -o a.foo", 2, "a.foo: expected a picture: a file that ends with .png or .svg or .pdf"),
-        ("flight.mcap -o /dev/full", 2, "/dev/full: expected a picture: a file that ends with .png or .svg or .pdf"),
+        ("flight.mcap -o a.foo", 2, "a.foo: not a picture format: the name must end with .png or .svg or .pdf"),
+        ("flight.mcap -o /dev/full", 2, "/dev/full: not a picture format: the name must end with .png or .svg or .pdf"),
         ("flight.mcap -o /nowhere/a.png", 1, "cannot be written"),
-        ("invalid.mcap", 1, "no message of what is selected is valid"),
+        ("invalid.mcap", 1, "the selected streams have no valid message"),
     ],
 )
 def test_plot_that_cannot_be_drawn_is_an_error(flight: Path, arguments: str, exit_code: int, reason: str) -> None:

@@ -188,7 +188,7 @@ def empty_recording() -> bytes:
         (b"not mcap", "not a readable MCAP file"),
         (b"\x89MCAP0\r\n" + bytes(100), "no message can be read"),
         (bytes(10_000), "not a readable MCAP file"),
-        (empty_recording(), "no message of these topics"),
+        (empty_recording(), "none of the requested topics"),
         (None, "no such file"),
     ],
 )
@@ -225,7 +225,7 @@ def test_bags_of_ros2_are_replayed(tmp_path: Path, layout: str) -> None:
         writer.finish()
     run = open_replay(f"mcap:{path}")
     assert list(map(str, run.addresses)) == ["1/vehicle_local_position", "px4_1/estimator_local_position/1"]
-    assert f"/{ADDRESS} is left out: cdr with ros2idl, not cdr, ros2msg" in run.warnings
+    assert f"skipped /{ADDRESS}: its encoding is cdr with ros2idl, not cdr with ros2msg" in run.warnings
     for each in run.messages:
         assert upgrade(each.fields) == upgrade(downgrade(sent, layout))
 
@@ -351,7 +351,7 @@ def test_deleted_recording_is_an_error(run_nedbus: Start, endpoint: str, tmp_pat
     wait_for(lambda: path.exists() and path.stat().st_size > 5000, what="messages")
     path.unlink()
     assert recorder.wait() == 1
-    reason = "it was deleted while it was written): what was written is lost; write to a folder that nothing cleans up"
+    reason = "the file was deleted while it was being written): the written data is lost; write to a folder that is not"
     assert f"{path} cannot be written ({reason}" in recorder.err
     assert " messages" not in recorder.err
 
@@ -382,13 +382,13 @@ def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: p
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1
     assert existed == [True]
-    assert "nothing on nedbus/9/** yet, waiting; 'nedbus list' shows" in recorder.err
-    assert f"{path}: 0 messages: the empty file is removed" in recorder.err
+    assert "nothing on nedbus/9/** yet, still waiting; 'nedbus list' shows" in recorder.err
+    assert f"{path}: 0 messages: empty file removed" in recorder.err
     assert "nothing arrived on nedbus/9/** within" in recorder.err
     assert not path.exists()
 
 
-NAME = "expected a recording: a file that ends with .mcap"
+NAME = "not a recording: its name must end with .mcap"
 
 
 @pytest.mark.parametrize(
@@ -399,7 +399,7 @@ NAME = "expected a recording: a file that ends with .mcap"
         ("convert a.ulg b", 2, f"b: {NAME}\n"),
         ("record -o a.txt", 2, f"a.txt: {NAME}\n"),
         ("record -o a.csv", 2, f"a.csv: {NAME}\n"),
-        ("convert flight.txt a.mcap", 2, "a file that ends with .ulg or .mcap"),
+        ("convert flight.txt a.mcap", 2, "its name must end with .ulg or .mcap"),
         ("convert flight.ulg a.mcap", 1, "no such file"),
     ],
 )

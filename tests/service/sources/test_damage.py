@@ -275,7 +275,7 @@ def test_index_that_points_elsewhere_is_not_used(tmp_path: Path, field: str, val
     rewrite_index(path, field, value)
     read, reader = payloads_of(path)
     assert read == original
-    assert reader.warnings == ["its index is damaged: it is read without"]
+    assert reader.warnings == ["the index is damaged: reading without it"]
 
 
 def add_chunk(path: Path, records: bytes, *, size: int, compression: str, in_index: bool) -> None:
@@ -316,7 +316,7 @@ def test_chunk_too_large_is_left_out(tmp_path: Path, size: int, said: int, compr
     assert peak < 2**26
     assert reader.damaged != in_index
     if size == 2**20:
-        assert reader.warnings == ["damaged: a chunk has an invalid record; the rest of that chunk is left out"]
+        assert reader.warnings == ["damaged: a chunk has an invalid record; skipped the rest of that chunk"]
 
 
 def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
@@ -326,10 +326,10 @@ def test_damage_everywhere_is_said_with_an_end(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-50] + (place + struct.pack("<BQ", 0x80, 0)) * 1000)
     reader = payloads_of(path)[1]
     assert len(reader.warnings) == 101
-    assert reader.warnings[-1] == "there is more damage"
+    assert reader.warnings[-1] == "further damage is not listed"
 
 
-CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are left out"
+CHUNK = r"the chunk at byte \d+ \(10\.\d to 10\.\d s\) is damaged: its messages are skipped"
 
 
 def test_commands_read_the_rest_and_fail(tmp_path: Path) -> None:
@@ -373,7 +373,7 @@ def test_cut_log_is_converted_and_fails(tmp_path: Path) -> None:
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert convert.exit_code == 1
     assert "179 messages" in convert.err
-    assert "cut: it ends inside a message" in convert.err
+    assert "truncated: the file ends inside a message" in convert.err
 
 
 def write_payloads(path: Path, payloads: Iterable[bytes], *, layout: str = "1.16") -> Path:
@@ -443,4 +443,4 @@ def test_invalid_message_is_left_out(tmp_path: Path, layout: str, caplog: pytest
     payloads = payload(1, layout=layout), bytes(bad), payload(3, layout=layout)
     path = write_payloads(tmp_path / "a.mcap", payloads, layout=layout)
     assert nedbus.read(path)["timestamp"].tolist() == [1, 3]
-    assert "vehicle_local_position: 1 of 3 messages violate the rules" in caplog.text
+    assert "vehicle_local_position: skipped 1 of 3 messages as invalid" in caplog.text

@@ -142,7 +142,7 @@ def test_requests_are_repeated_while_nothing_arrives(vehicle: Vehicle, caplog: p
     for number in (*NEEDED, ORIGIN):
         assert 10 < requested.count(number) < 30
     assert caplog.text.count("does not send") == len(NEEDED)
-    assert "9/vehicle_local_position: does not send ODOMETRY when it is requested" in caplog.text
+    assert "9/vehicle_local_position: the vehicle does not send ODOMETRY on request" in caplog.text
 
 
 def test_messages_that_arrive_are_requested_three_times(vehicle: Vehicle) -> None:

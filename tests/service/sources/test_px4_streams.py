@@ -49,7 +49,7 @@ def test_address_is_free_after_3_seconds(streams: StreamRegistry) -> None:
     first, second = streams.hear(key(), 100.0), streams.hear(key(layout="V0"), 100.0)
     assert (streams.hear(key(), 100.0), str(second.address)) == (first, f"1/{VLP}")
     streams.accept(first, None, 100.0)
-    with pytest.raises(NotAcceptedError, match="already: name one of them with vehicles="):
+    with pytest.raises(NotAcceptedError, match="already: rename one of them with vehicles="):
         streams.accept(second, None, 102.9)
     streams.accept(second, None, 103.0)
     with pytest.raises(NotAcceptedError, match="already"):
@@ -81,7 +81,7 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
     stream = streams.hear(key(), 100.0)
     for sequence, now in ((10, 100.0), (1, 100.1), (20, 100.2)):
         streams.accept(stream, Attachment(sequence, 0, GID), now)
-    with pytest.raises(NotAcceptedError, match="goes back and forth"):
+    with pytest.raises(NotAcceptedError, match="sequence numbers go back and forth"):
         streams.accept(stream, Attachment(2, 0, GID), 103.0)
     assert streams.accept(stream, Attachment(1, 0, GID), 106.1) == (0, True)
     with pytest.raises(NotAcceptedError, match="sequence number 1 is a duplicate"):

@@ -78,7 +78,7 @@ def test_what_is_chosen_is_the_same_flight(topic: str) -> None:
 
 def test_topic_that_no_simulated_vehicle_has_is_an_error() -> None:
     """A choice of nothing is said, not flown."""
-    with pytest.raises(SourceError, match="does not have timesync_status"):
+    with pytest.raises(SourceError, match="has no timesync_status"):
         simulate("?duration=1&topics=timesync_status")
 
 

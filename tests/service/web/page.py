@@ -27,7 +27,7 @@ from nedbus.recording import RecordingWriter
 from nedbus.web import Where, serve_live
 from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import Fleet, Line, Picture, Row
-from nedbus.web.stream import Stream
+from nedbus.web.stream import PageStream
 from nedbus.web.viewer import Viewer
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, Provenance, Selection
 from nedbus_msgs.arrays import arrays_of
@@ -86,9 +86,9 @@ class Sky:
             address: stream_state(health, alive=None if alive is None else address in alive, connected=not link).name
             for address, health in healths.items()
         }
-        self.account.look(self.time, arrival, link=link, is_behind=is_behind)
+        self.account.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
-        return self.fleet.look(self.time, healths, states, alive=alive, link=link, own=own)
+        return self.fleet.update(self.time, healths, states, alive=alive, link=link, own=own)
 
     def row(self, vehicle: str = "wing", **known: Any) -> Row:
         row = self.look(**known).row(vehicle)
@@ -98,7 +98,7 @@ class Sky:
     def line(self, address: Address = WING, **known: Any) -> Line:
         return next(line for line in self.row(address.vehicle, **known).lines if line.address == address)
 
-    def stream(self, address: Address = WING) -> Stream:
+    def stream(self, address: Address = WING) -> PageStream:
         return self.fleet.streams[address]
 
 
@@ -155,7 +155,7 @@ class Shown:
 
     def say_raw(self, said: str) -> None:
         """Let a browser say anything."""
-        self.viewer._said.value = said
+        self.viewer._message.value = said
         self.update()
 
     def search(self, text: str) -> None:
@@ -177,7 +177,7 @@ class Shown:
     @property
     def address(self) -> str:
         """The query string of the address that the browser shows."""
-        return str(self.viewer._address.value)
+        return str(self.viewer._url.value)
 
     @property
     def listed(self) -> dict[str, dict[str, str]]:

@@ -190,8 +190,8 @@ def test_every_part_says_the_same(sky: Sky) -> None:
     assert page.grades == {"quad": "bad", "wing": "ok"}
     assert page.chosen == "quad"
     assert "■ xy not valid" in page.part("why")
-    assert "nowhere: it never had a valid position" in page.part("why")
-    assert "never had a valid position: quad" in page.part("tool")
+    assert "last valid position: none yet" in page.part("why")
+    assert "no valid position yet: quad" in page.part("tool")
     assert set(page.marks) == {"wing"}
     sky.fly(3, WING, QUAD, x=5.0, z=-7.0)
     page.look(alive=[WING, QUAD])
@@ -227,12 +227,12 @@ def test_page_that_is_behind_says_so(sky: Sky) -> None:
     """Messages that this reader did not read in time are the page's own fault, in the header; no vehicle changes."""
     sky.fly(3, WING, QUAD)
     page = Page(sky)
-    assert "this page reads all of it" in page.part("head")
+    assert "page up to date" in page.part("head")
     sky.time += 20
-    own = "this page does not read in time: 7000 messages wait, 12 were never read"
+    own = "this page falls behind: 7000 messages queued, 12 dropped"
     page.look(alive=[WING, QUAD], is_behind=True, own=own)
     assert f'<span class="alarm">{own}</span>' in page.part("head")
-    assert "this page reads all of it" not in page.part("head")
+    assert "page up to date" not in page.part("head")
     assert page.grades == {"quad": "ok", "wing": "ok"}
     assert page.document.title == "nedbus"
 
@@ -702,7 +702,7 @@ def test_page_follows_its_vehicles(endpoint: str, bus: nedbus.Bus, raw: Session)
         raw.put(Address("wing", VLP).rejected_key(), json.dumps({"reason": "a rule"}))
         page.say("streams")
         until(lambda: "<td>a rule</td>" in page.part("more"), "the report")
-        until(lambda: any("rejected: a rule" in event.text for event in page.viewer._world.events), "its event")
+        until(lambda: any("rejected: a rule" in event.text for event in page.viewer._chronicle.events), "its event")
 
 
 def test_page_outlives_the_router() -> None:
@@ -723,6 +723,8 @@ def test_page_outlives_the_router() -> None:
         router = open_router(listen=(where,))
         until(lambda: page.marks["wing"]["fill"] != DARK.ground, "the vehicle again")
         until(lambda: "no link to" not in page.part("head"), "the header to say so")
-        told = [event.text.partition(" after")[0] for event in page.viewer._world.events if event.kind == "link_down"]
+        told = [
+            event.text.partition(" after")[0] for event in page.viewer._chronicle.events if event.kind == "link_down"
+        ]
         assert told == [f"no link to {where}", "link is back"]
     router.close()

@@ -129,7 +129,7 @@ def test_browser_says_little_at_a_time(url: str) -> None:
 def test_too_many_viewers_are_told(monkeypatch: pytest.MonkeyPatch, url: str) -> None:
     """One page more than the limit, which is 1 here, says so instead of taking the memory of all."""
     monkeypatch.setattr("nedbus.web.server.MAX_VIEWERS", 1)
-    for said in ("a word", "1 pages are open, which is the limit: close one"):
+    for said in ("a word", "limit of 1 open pages reached: close one"):
         session = pull_session(url=url)
         assert [root.text for root in session.document.roots if isinstance(root, Div)] == [said]
 
@@ -139,7 +139,7 @@ def test_listening_for_others_says_what_that_means(run_nedbus: Start, endpoint: 
     port = free_port()
     url, listen = f"http://127.0.0.1:{port}", f"--http=0.0.0.0:{port}"
     process = run_nedbus("web", "-c", endpoint, listen, "--origin", "ground.example:8420", measured=False)
-    wait_for(lambda: "without a password" in process.err, what="the warning")
+    wait_for(lambda: "no password protects" in process.err, what="the warning")
     assert status_of(f"{url}/healthz", Host="evil.example") == 200
     assert status_of(url, Host="ground.example:8420") == 200
     assert status_of(url, Host="evil.example:8420") == 403

@@ -10,7 +10,7 @@ import pytest
 from nedbus.events import Account, Times
 from nedbus.web.chronicle import Chronicle
 from nedbus.web.fleet import TRUTH
-from nedbus.web.stream import COLUMNS, POINTS, Stream
+from nedbus.web.stream import COLUMNS, POINTS, PageStream
 from nedbus_msgs import Address, MapProjection
 from tests.flights.messages import VLP
 from tests.service.web.page import NOON, QUAD, WING, Sky, addresses_of, sky
@@ -23,7 +23,7 @@ SECOND_EKF = Address("wing", "estimator_local_position", 1)
 GROUND_TRUTH = Address("wing", TRUTH)
 
 
-def column(stream: Stream, name: str) -> list[float]:
+def column(stream: PageStream, name: str) -> list[float]:
     values: list[float] = stream.minute.points(0, stream.minute.written)[:, COLUMNS.index(name)].tolist()
     return values
 
@@ -79,7 +79,7 @@ def test_other_estimates_do_not_speak_for_a_vehicle(sky: Sky, other: Address, be
 def test_slow_stream_is_watched(sky: Sky) -> None:
     """At less than half of its usual rate a position is to be watched, with both rates; another stream is not.
 
-    While the page itself does not read in time nothing is known of rates.
+    While the page itself falls behind, rates are unknown.
     """
     attitude = Address("wing", "vehicle_attitude")
     sky.fly(20, WING, attitude, rate=20)
@@ -90,7 +90,7 @@ def test_slow_stream_is_watched(sky: Sky) -> None:
     assert sky.row().grade == "ok"
     sky.fly(3, rate=5)
     assert (sky.row().grade, sky.row().state.text[:22]) == ("watch", "slow: 5.0 Hz, usually ")
-    assert sky.row(own="this page does not read in time").grade == "ok"
+    assert sky.row(own="this page falls behind").grade == "ok"
 
 
 def test_page_that_is_behind_blames_no_vehicle(sky: Sky) -> None:
@@ -228,7 +228,7 @@ def test_other_messages_tell_facts(sky: Sky) -> None:
 def test_last_valid_place_is_told(sky: Sky) -> None:
     """Where a vehicle was last is where it was valid last; beside it its latitude and longitude, if it has them."""
     sky.fly(1, xy_valid=False, x=9.0)
-    assert "never had a valid position" in sky.row().where
+    assert sky.row().where == "none yet"
     sky.fly(1, x=3.0, y=-4.0, z=-5.0)
     sky.fly(1, xy_valid=False, x=77.0, y=77.0)
     assert sky.row().where == "3.0 m north, -4.0 m east, altitude 5.0 m"

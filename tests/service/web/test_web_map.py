@@ -20,7 +20,7 @@ PLACE = MapProjection(47.397, 8.545)
 RING = [[8.545, 47.397], [8.546, 47.397], [8.546, 47.398], [8.545, 47.397]]
 FEATURE = {"type": "Feature", "geometry": {"type": "LineString", "coordinates": RING}}
 WORLD = "0.0001 0 0 -0.0001 8.54505 47.39895"
-HINT = "GeoJSON, or a picture with a world file"
+HINT = "expected GeoJSON, or a picture with a world file"
 
 
 def drawn(background: Background) -> Any:
@@ -91,14 +91,14 @@ def test_large_picture_is_made_smaller(tmp_path: Path) -> None:
     [
         (None, "no such file"),
         ("no JSON", HINT),
-        ("[]", "it has no lines, polygons or points"),
+        ("[]", "has no lines, polygons or points"),
         ('{"type": "Nonsense"}', f"'coordinates' is missing): {HINT}"),
         ('{"type": "Topology", "objects": {}}', HINT),
-        ('{"type": "LineString", "coordinates": []}', "it has no lines, polygons or points"),
+        ('{"type": "LineString", "coordinates": []}', "has no lines, polygons or points"),
         ('{"type": "LineString", "coordinates": [["a", "b"]]}', HINT),
-        ('{"type": "Point", "coordinates": [2600000, 1200000]}', "is no longitude and latitude"),
-        ('{"type": "Point", "coordinates": [NaN, 1]}', "is no longitude and latitude"),
-        ('{"type": "FeatureCollection", "features": []}', "it has no lines, polygons or points"),
+        ('{"type": "Point", "coordinates": [2600000, 1200000]}', "is not a longitude and latitude"),
+        ('{"type": "Point", "coordinates": [NaN, 1]}', "is not a longitude and latitude"),
+        ('{"type": "FeatureCollection", "features": []}', "has no lines, polygons or points"),
         ("[" * 100_000, HINT),
         ('{"type": "LineString", "coordinates": ' + "[" * 400 + "1" + "]" * 400 + "}", HINT),
     ],
@@ -117,7 +117,7 @@ def test_file_that_is_no_map_is_named(tmp_path: Path, content: str | None, said:
 @pytest.mark.parametrize(
     ("world", "said"),
     [
-        (None, "no world file field.pgw beside it"),
+        (None, "world file field.pgw not found"),
         ("0.5 0 0 -0.5 2600000 1200000", "not north up in degrees"),
         ("0.0001 0.1 0.1 -0.0001 8.5 47.3", "not north up in degrees"),
         ("0.0001 0 0 0.0001 8.5 47.3", "not north up in degrees"),

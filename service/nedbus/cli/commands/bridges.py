@@ -1,4 +1,4 @@
-"""Commands that pass data on to browsers, Prometheus, Foxglove and ROS 2: web, export, foxglove, ros2."""
+"""Commands that serve data to browsers, Prometheus, Foxglove and ROS 2: web, export, foxglove, ros2."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ _log = logging.getLogger("nedbus")
 
 MapOption = Annotated[
     Path | None,
-    typer.Option("--map", exists=True, dir_okay=False, metavar="FILE", help="GeoJSON, or a picture with a world file"),
+    typer.Option(
+        "--map", exists=True, dir_okay=False, metavar="FILE", help="Map: GeoJSON, or an image with a world file"
+    ),
 ]
 NamespaceOption = Annotated[
-    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Topics as /NAMESPACE/fmu/out/...; repeatable")
+    list[str] | None, typer.Option(metavar="VEHICLE:NAMESPACE", help="Publish as /NAMESPACE/fmu/out/...; repeatable")
 ]
-HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Where to listen; port 0 for any")]
+HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Address to listen on (port 0: any)")]
 
 
 @command
@@ -49,11 +51,11 @@ def web(
     http: HttpOption = "127.0.0.1:8420",
     origin: Annotated[
         list[str] | None,
-        typer.Option(metavar="HOST:PORT", help="Another name that browsers call this page by; repeatable"),
+        typer.Option(metavar="HOST:PORT", help="Additional host name of this page, for example of a proxy; repeatable"),
     ] = None,
     background: MapOption = None,
 ) -> None:
-    """Show all vehicles in a browser: a map, their faults, and plots; live, or of a recording."""
+    """Serve a web page with map, faults and plots of all vehicles."""
     host, port = _split("--http", http)
     for name in origin or ():
         _split("--origin", name)
@@ -61,9 +63,9 @@ def web(
     where = page.Where(host, port, tuple(origin or ()), background)
 
     def tell(url: str) -> None:
-        write_stderr(f"open {url} in a browser; Ctrl-C ends it")
+        write_stderr(f"open {url} in a browser; Ctrl-C stops the server")
         if not is_loopback(host):
-            write_stderr(f"any client that reaches {http} can see all vehicles, without a password, and change nothing")
+            write_stderr(f"no password protects {http}: every client that reaches it can view, but not change anything")
 
     if file is not None:
         run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
@@ -75,7 +77,10 @@ def web(
 
 @command
 def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: HttpOption = "127.0.0.1:9464") -> None:
-    """Serve a reader's metrics for Prometheus, until Ctrl-C: for routers without a nedbus service."""
+    """Serve metrics for Prometheus, measured by a reader, until Ctrl-C.
+
+    For routers without a nedbus service; a service has its own (serve --http).
+    """
     from nedbus.monitoring import Exporter
 
     _split("--http", http)
@@ -89,7 +94,10 @@ def export(open_bus: Callable[[], Bus], selection: Selection = ALL, *, http: Htt
 def foxglove(
     open_bus: Callable[[], Bus], *, vehicle: VehicleOption = ANY, http: HttpOption = f"127.0.0.1:{FOXGLOVE_PORT}"
 ) -> None:
-    """Serve live vehicles to Foxglove, until Ctrl-C: plots of every field, poses in 3D, positions on the map."""
+    """Serve live vehicles to Foxglove until Ctrl-C.
+
+    Foxglove can plot every field, show poses in 3D and positions on the map.
+    """
     host, port = _split("--http", http)
     with open_bus() as bus, bridges.FoxgloveServer(bus, host=host, port=port) as server:
         write_stderr(f"open {server.url} in Foxglove: Open connection, Foxglove WebSocket")
@@ -101,23 +109,25 @@ def ros2(
     bus: Bus,
     selection: Selection = ALL,
     *,
-    humble: Annotated[bool, typer.Option("--humble", help="For ROS 2 Humble, whose keys have no type hash")] = False,
+    humble: Annotated[bool, typer.Option("--humble", help="Use keys of ROS 2 Humble, without type hash")] = False,
     layout: Annotated[
-        str, typer.Option(help=f"Release of PX4 whose px4_msgs the ROS 2 workspace has: {', '.join(RELEASES)}")
+        str, typer.Option(help=f"PX4 release of px4_msgs in the ROS 2 workspace: {', '.join(RELEASES)}")
     ] = RELEASES[-1],
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", min=0, max=232, help="ROS domain")] = 0,
     namespace: NamespaceOption = None,
-    to: Annotated[str | None, typer.Option(metavar="ENDPOINT", help="The router of ROS 2, if it is another")] = None,
+    to: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Router of ROS 2 (default: the one of nedbus)")
+    ] = None,
 ) -> None:
-    """Publish to ROS 2 nodes that use rmw_zenoh, until Ctrl-C: px4_msgs on /fmu/out/..."""
+    """Publish px4_msgs on /fmu/out/... to ROS 2 with rmw_zenoh."""
     for each in namespace or ():
         if ":" not in each:
-            raise ConfigError("--namespace", f"{each!r} is not VEHICLE:NAMESPACE")
+            raise ConfigError("--namespace", f"{each!r}: expected VEHICLE:NAMESPACE")
     namespaces = dict(each.partition(":")[::2] for each in namespace or ())
     try:
         session, observer = bus.open_session(to), bus.open_session(to)
     except ConnectError as exc:
-        raise NedbusError(f"nothing answers at {to}: start the router of ROS 2 there, or correct --to") from exc
+        raise NedbusError(f"no router answers at {to}: start the router of ROS 2 there, or correct --to") from exc
     with closing(session), closing(observer):
         bridge = bridges.Ros2Bridge(
             bus,
@@ -134,14 +144,14 @@ def ros2(
 
 @contextmanager
 def serve_pages(where: str, pages: Mapping[str, Callable[[], Page]]) -> Iterator[None]:
-    """Serve pages on HOST:PORT for as long as this is entered."""
+    """Serve pages on HOST:PORT inside a `with` block."""
     from nedbus.monitoring import HttpServer
 
     with closing(HttpServer(where, pages)):
         text = "metrics and health on http://%s/metrics, /healthz, /readyz, /vehicles, /status"
         _log.info(text, where, extra=about("http"))
         if not is_loopback(split_http(where)[0]):
-            _log.warning("any client that reaches %s can read them; it can change nothing", where, extra=about("http"))
+            _log.warning("no password protects %s: every client can read it, but not write", where, extra=about("http"))
         yield
 
 

@@ -1,4 +1,4 @@
-"""Commands that look for faults: doctor, of a system in which nothing arrives; check, of configuration files."""
+"""Commands for troubleshooting: doctor examines a running system, check configuration files."""
 
 from __future__ import annotations
 
@@ -26,14 +26,17 @@ def doctor(
     read_settings: Callable[[], Settings],
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Look at this vehicle, and whether this client may write it")
+        str | None, typer.Option("--vehicle", "-v", help="Examine only this vehicle; also test the write permission")
     ] = None,
-    mavlink: Annotated[str | None, typer.Option(metavar="LINK", help="Listen there too: udpin:0.0.0.0:14550")] = None,
+    mavlink: Annotated[
+        str | None, typer.Option(metavar="LINK", help="Also listen to a MAVLink link, such as udpin:0.0.0.0:14550")
+    ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Find out why nothing arrives: router, certificates, permissions, clocks, vehicles, MAVLink; the worst comes last.
+    """Diagnose why no messages arrive.
 
-    Exit 0 when nothing is wrong, 1 otherwise. It takes a few seconds, and changes nothing.
+    Checks router, certificates, permissions, clocks, vehicles and MAVLink; lists the worst findings last.
+    Takes a few seconds and changes nothing. Exits with 1 if a finding is wrong, else 0.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -48,7 +51,7 @@ def doctor(
 
 
 def _to_report(findings: Sequence[Finding]) -> str:
-    """Return the findings as lines, and the number of each state."""
+    """Format findings as lines, followed by the number of findings in each state."""
     lines = []
     for each in findings:
         name = f"{each.check} {each.subject}".strip()
@@ -63,12 +66,19 @@ def _to_report(findings: Sequence[Finding]) -> str:
 def check(
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="CONFIG...", help="Settings (.toml) and router files (.json5)", show_default=False),
+        typer.Argument(
+            metavar="CONFIG...",
+            help="Settings (.toml) or router files (.json5); default: the settings of serve",
+            show_default=False,
+        ),
     ] = None,
     *,
-    offline: Annotated[bool, typer.Option("--offline", help="Check the text only, not this host")] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Check only the text of the files")] = False,
 ) -> None:
-    """Report all mistakes in settings and router files, with file, line and column; exit with 2 if there is one."""
+    """Check settings and router files.
+
+    Reports every mistake with file, line and column. Exits with 2 if there is one.
+    """
     mistakes = [] if files else check_service(offline=offline)
     for file in files or ():
         is_toml = file.suffix == ".toml"
@@ -77,10 +87,10 @@ def check(
 
 
 def report_mistakes(mistakes: Iterable[ConfigError]) -> None:
-    """Write each mistake to stderr, once, and exit with 2 if there is one."""
+    """Write each mistake to stderr once; exit with 2 if there is one."""
     lines = dict.fromkeys(map(str, mistakes))
     for line in lines:
         write_stderr(f"nedbus: {line}")
     if lines:
         raise typer.Exit(2)
-    write("nothing is wrong")
+    write("no mistakes found")

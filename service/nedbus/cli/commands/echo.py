@@ -1,4 +1,4 @@
-"""The command that prints messages as they arrive: echo."""
+"""The command echo: print messages as they arrive."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from nedbus.cli.output.streams import write, write_stderr
 from nedbus.client import Bus, Mode, Sample, Subscription, check_max_rate
 from nedbus_msgs import Address, Selection
 
-_EVERY: Final = "Every message, in order; a replay at speed=max then waits for this terminal or pipe"
+_EVERY: Final = "Print every message in order; a replay at speed=max waits for this terminal or pipe"
 
 
 @command
@@ -35,19 +35,22 @@ def echo(
     selection: Selection = POSITIONS,
     *,
     field: FieldOption = None,
-    full: Annotated[bool, typer.Option("--full", "-f", help="All fields, each on its line")] = False,
+    full: Annotated[bool, typer.Option("--full", "-f", help="Print all fields, one per line")] = False,
     every: Annotated[bool, typer.Option("--every", help=_EVERY)] = False,
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
-    interval: Annotated[float, typer.Option(min=0.0, help="Seconds between two messages shown of a stream")] = 0.0,
+    interval: Annotated[float, typer.Option(min=0.0, help="Minimum time between messages of a stream, in s")] = 0.0,
     max_rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Messages a second of each stream, downsampled by its publisher")
+        float | None, typer.Option(metavar="HZ", help="Let the publisher downsample each stream to this rate, in Hz")
     ] = None,
-    once: Annotated[bool, typer.Option("--once", help="End after one message, as --count 1")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Stop after one message, same as --count 1")] = False,
     count: CountOption = None,
     duration: DurationOption = None,
 ) -> None:
-    """Print messages as they arrive, a line each; a terminal that is too slow skips to the newest (see --every)."""
+    """Print messages as they arrive, one line each.
+
+    If the terminal or pipe is too slow, older messages are skipped (see --every).
+    """
     require_one({"--full": full, "--json": json_output, "--csv": csv_output})
     require_one({"--once": once, "--count": count is not None})
     if max_rate is not None:
@@ -70,7 +73,7 @@ def echo(
         try:
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
-            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has its lines
+            if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has got its lines
                 _write_counts(subscription)
 
 

@@ -1,4 +1,4 @@
-"""Commands for events of vehicles and their causes: events, why."""
+"""Commands for vehicle events and their causes: events, why."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ import typer
 from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FileArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
+from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, to_age
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import SEVERITIES, WINDOW, AccountReport, Event, Story, Times, Vehicle, by_vehicle, tell
+from nedbus.events import SEVERITIES, WINDOW, AccountReport, Event, Story, Times, Vehicle, by_vehicle, stories_of
 from nedbus.monitoring import Observer
 from nedbus.sources import FileAccount, read_account
 from nedbus_msgs import ANY, Selection, check_vehicle
@@ -35,17 +36,18 @@ def events(
     *,
     vehicle: VehicleOption = ANY,
     within: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Start with the last SECONDS")
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="First show the events of the last SECONDS")
     ] = None,
-    severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Only these, and worse ones")] = "info",
+    severity: Annotated[str, typer.Option(metavar="bad|watch|info", help="Lowest severity to show")] = "info",
     json_output: JsonOption = False,
     csv_output: CsvOption = False,
     duration: DurationOption = None,
 ) -> None:
-    """Show events of vehicles, each with its evidence; live until Ctrl-C, or of a file.
+    """Show vehicle events and their evidence, live or from a file.
 
     Events: validity, dead reckoning, resets, origin, GPS, fusion, failsafe, mode, arming, landing, battery, reboot,
-    silence, loss, rejected messages, and the link; of each the events of the ten seconds before that may explain it.
+    silence, loss, rejected messages and the link. The evidence of an event are earlier events, up to ten seconds
+    before, that may explain it. Live events are shown until Ctrl-C.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     if severity not in SEVERITIES:
@@ -68,7 +70,7 @@ def events(
             _follow(bus, Selection(ANY, vehicle), lambda found: show(found, times), duration)
         return
     if within is not None or duration is not None:
-        raise ConfigError("--within" if within is not None else "--duration", "is for live vehicles, not for a file")
+        raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(file)
     if vehicle != ANY:
         _choose_vehicle(file, read.account.vehicles, vehicle)
@@ -81,9 +83,9 @@ def events(
     initial = {name: _held_from_start(each) for name, each in sorted(read.account.vehicles.items())}
     texts = [f"{name}: {text}" for name, text in initial.items() if text and vehicle in (ANY, name)]
     if texts:
-        write_stderr(f"from the first message to the end: {'; '.join(texts)}")
+        write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
-        write_stderr(f"{file}: nothing happened: no event in {read.end:.0f} s")
+        write_stderr(f"{file}: no events in {read.end:.0f} s")
 
 
 @command
@@ -91,14 +93,15 @@ def why(
     open_bus: Callable[[], Bus],
     file: FileArgument = None,
     *,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed where there are several")] = None,
-    at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC), or seconds since boot")] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed if there are several")] = None,
+    at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC) or seconds since boot")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Explain the faults of a vehicle: begin, duration and causes; live as services remember it, or of a file.
+    """Explain the faults of a vehicle, live or from a file.
 
-    Evidence is an event of the ten seconds before, or a condition that goes on since before; topics that are needed
-    and missing are named, with a hint. Exit 0 with or without anything wrong.
+    Shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions that
+    were active already. Names topics that would help but are missing, with a hint. Live data is the history kept by
+    nedbus services. Exits with 0, with and without faults.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -110,26 +113,26 @@ def why(
         conditions = [each for each in followed.conditions.values() if each.severity != "info"]
         topics, times = list(followed.topics), read.times
         until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
-        nothing = f"nothing was wrong in {read.end:.0f} s"
+        nothing = f"no faults in {read.end:.0f} s"
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
             where = " or ".join(bus.routers)
         reporting = by_vehicle(reports)
         if not reporting:
-            raise NedbusError(f"no nedbus service at {where} knows a vehicle: 'nedbus serve' remembers what happens")
+            raise NedbusError(f"no nedbus service at {where} has data of a vehicle: start one with 'nedbus serve'")
         name = _choose_vehicle("the network", reporting, vehicle)
         found = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
         state = reporting[name].vehicles[name]
         conditions, topics, times = list(state.held), list(state.topics), Times(is_live=True)
-        until, advice, nothing = "until now", _LIVE_ADVICE, "nothing was wrong, as far as services remember"
+        until, advice, nothing = "until now", _LIVE_ADVICE, "no faults in the history of the services"
     moment = None
     if at is not None:
         try:
             moment = times.find(at, found[-1]) if found else None
         except ValueError as exc:
             raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
-    stories = tell(found, conditions, topics=topics, at=moment)
+    stories = stories_of(found, conditions, topics=topics, at=moment)
     if json_output:
         for story in stories:
             write(_story_json(story, times))
@@ -139,46 +142,46 @@ def why(
         return
     _write_clock(found, times)
     if moment is not None and not any(each.since <= moment <= (each.until or moment) for each in stories):
-        write(f"{name}: nothing was wrong at {at}; the nearest:")
+        write(f"{name}: no fault at {at}; the nearest one:")
     write("\n\n".join("\n".join(_describe(name, story, times, advice, until)) for story in stories))
 
 
 def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
-    """Yield the lines of a story."""
+    """Yield the lines that explain a fault."""
     since = "the first message on" if story.begin is None else times.text(story.begin)
     lasted = until if story.until is None else f"for {to_age(story.until - story.since)}"
     when = f"at {since}" if story.begin and story.until == story.since else f"from {since}, {lasted}"
-    yield f"{vehicle}: {to_text(story.what, _MAX_TEXT)} {when}"
+    yield fold(f"{vehicle}: ", f"{to_text(story.what, _MAX_TEXT)} {when}")
     if story.before:
         yield "  before it"
-        yield from (f"    {times.text(each)}  {_before(each, story.since)}" for each in story.before)
+        yield from (fold(f"    {times.text(each)}  ", _before(each, story.since)) for each in story.before)
     if story.meanwhile:
         yield "  meanwhile"
-        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.meanwhile)
+        yield from (fold(f"    {times.text(each)}  ", _shown(each)) for each in story.meanwhile)
     if story.end is not None:
-        yield f"  it ended at {times.text(story.end)}" + (" with" if story.after else "")
-        yield from (f"    {times.text(each)}  {_shown(each)}" for each in story.after)
+        yield f"  ended at {times.text(story.end)}" + (" with" if story.after else "")
+        yield from (fold(f"    {times.text(each)}  ", _shown(each)) for each in story.after)
     if not story.before and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
-        yield f"  not in the data: {', '.join(story.lacking)}, which may tell why: {advice}"
+        yield fold("  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}")
 
 
 _LIVE_ADVICE: Final = (
-    "publish them too: PX4's dds_topics.yaml or pub.csv, a source without topics=; 'nedbus info' shows what is there"
+    "to publish them: PX4's dds_topics.yaml or pub.csv, a source without topics=; 'nedbus info' lists the topics"
 )
 _ADVICE: Final = {
-    ".ulg": "PX4 from 1.14 on logs them by default (SDLOG_PROFILE, bit 0)",
-    ".mcap": "record them: 'nedbus record' without --topic, from a source that has them",
+    ".ulg": "PX4 1.14 and later log them by default (SDLOG_PROFILE, bit 0)",
+    ".mcap": "to record them: 'nedbus record' without --topic, from a source that has them",
 }
 
 
 def to_line(event: Event, times: Times) -> str:
-    """Return an event as a line: time, vehicle, severity, text and evidence."""
+    """Format an event as one line: time, vehicle, severity, text and evidence."""
     evidence = ", ".join(_before(each, event.time) for each in event.evidence)
     because = f"  <- {evidence}" if event.evidence and event.severity != "info" else ""
     severity = "" if event.severity == "info" else event.severity.upper()
-    return f"{times.text(event):>10}  {to_text(event.vehicle):<8} {severity:<5}  {_shown(event)}{because}"
+    return fold(f"{times.text(event):>10}  {to_text(event.vehicle):<8} {severity:<5}  ", f"{_shown(event)}{because}")
 
 
 def _shown(event: Event) -> str:
@@ -195,14 +198,14 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
 
     def show_new() -> None:
         nonlocal seen
-        observer.look()
-        new, seen = observer.account.take(seen)
+        observer.poll()
+        new, seen = observer.account.events_since(seen)
         show(new)
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)
                 if initial := _held_from_start(each):
-                    write_stderr(f"{name}: {initial}, since before this began")
+                    write_stderr(f"{name}: {initial}, from the start")
 
     def handle(sample: Sample[Any]) -> bool:
         observer.add(sample)
@@ -213,10 +216,10 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
 
 
 def _read(file: Path) -> tuple[FileAccount, list[Event]]:
-    """Return the account of a file and its events in order; write its warnings to stderr."""
+    """Read the account of a file and its events in order of time; write warnings to stderr."""
     read = read_account(file)
-    found, told = read.account.take(0)
-    warnings = [*read.warnings, *([f"of {told} events only the last {len(found)}"] if told > len(found) else [])]
+    found, told = read.account.events_since(0)
+    warnings = [*read.warnings, *([f"showing the last {len(found)} of {told} events"] if told > len(found) else [])]
     for warning in warnings:
         write_stderr(f"{file}: {warning}")
     return read, sorted(found, key=lambda event: event.time)
@@ -227,7 +230,7 @@ def _merge(reports: Iterable[AccountReport]) -> list[Event]:
 
 
 def _held_from_start(vehicle: Vehicle) -> str:
-    """Return the faults that held at the first message already, and never ended."""
+    """Return the faults that were present in the first message and never ended."""
     held = [each.text for each in vehicle.conditions.values() if each.initial and each.severity != "info"]
     return ", ".join(dict.fromkeys(held))
 
@@ -235,8 +238,8 @@ def _held_from_start(vehicle: Vehicle) -> str:
 def _write_clock(found: Sequence[Event], times: Times) -> None:
     clocks = {times.clock(event) for event in found}
     texts = {
-        "boot": "seconds since boot, as no message tells UTC", "vehicle": "UTC, as the vehicle's messages tell it",
-        "host": "UTC, by the clocks of these hosts",
+        "boot": "seconds since boot, no message contains UTC", "vehicle": "UTC, from the vehicle's messages",
+        "host": "UTC, from the clocks of the hosts",
     }  # fmt: skip
     if clocks:
         write_stderr(f"times: {'; '.join(texts[each] for each in sorted(clocks))}")
@@ -282,5 +285,5 @@ def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) 
     if vehicle is not None and vehicle in names:
         return vehicle
     shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
-    unknown = "" if vehicle is None else f"there is no vehicle {to_text(vehicle, 64)}; "
-    raise ConfigError("--vehicle", f"{unknown}name one of {where}: {shown}")
+    problem = "several vehicles" if vehicle is None else f"no vehicle {to_text(vehicle, 64)}"
+    raise ConfigError("--vehicle", f"{problem} in {where}: choose one of {shown}")

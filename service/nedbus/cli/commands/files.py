@@ -1,4 +1,4 @@
-"""Commands about files: record, convert, plot."""
+"""Commands for files: record, convert, plot."""
 
 from __future__ import annotations
 
@@ -31,10 +31,13 @@ def record(
     bus: Bus,
     selection: Selection = ALL,
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="The recording to write")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE.mcap", help="Recording to write")],
     duration: DurationOption = None,
 ) -> None:
-    """Record every message to an MCAP file, until Ctrl-C; a power cut costs at most the last second."""
+    """Record messages to an MCAP file until Ctrl-C.
+
+    A power cut costs at most the last second.
+    """
     notice = time.monotonic() + SILENCE_TIMEOUT
     with bus.subscribe_to(selection, mode="every") as subscription:
         recorder = recording.Recorder(subscription, output)
@@ -47,10 +50,10 @@ def record(
                 write_notice(subscription)
 
         try:
-            with show_progress() as show, suppress(typer.Exit):  # Ctrl-C ends a recording as it is meant to end
+            with show_progress() as show, suppress(typer.Exit):  # Ctrl-C is the normal end of a recording
                 run_until_stopped(lambda stop: recorder.run(stop, duration=duration), on_tick=tick)
         except NoDataError:
-            write_stderr(f"{output}: {recorder.status}: the empty file is removed")
+            write_stderr(f"{output}: {recorder.status}: empty file removed")
             raise
     write_stderr(f"{output}: {recorder.status}")
 
@@ -58,12 +61,15 @@ def record(
 @command
 def convert(
     source: FlightArgument,
-    output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording to write", show_default=False)],
+    output: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="Recording to write", show_default=False)],
     *,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of a log of one vehicle")] = None,
-    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Separated by commas; "*" for all')] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id of a log of one vehicle")] = None,
+    topics: Annotated[str | None, typer.Option("--topics", "-t", help='Topics, separated by commas, or "*"')] = None,
 ) -> None:
-    """Convert a flight log to a recording, validated, with all topics whose messages nedbus knows."""
+    """Convert a flight log to an MCAP recording.
+
+    Validates every message, and converts all topics of messages that nedbus knows.
+    """
     spec = parse_source(source_text_of_file(source, vehicle=vehicle, topics=topics))
     replay = spec.open_source(vehicle="1")
     if isinstance(replay, LiveSource):
@@ -80,7 +86,7 @@ def convert(
         )
     write_stderr(f"{output}: {report}")
     if run.damage:
-        raise SourceError(str(source), "damage cost messages: what could be read is written")
+        raise SourceError(str(source), "the file is damaged: only the readable messages were converted")
 
 
 @command
@@ -88,39 +94,40 @@ def plot(
     source: FlightArgument,
     *,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE.png", help="The picture (default: beside the flight)")
+        Path | None,
+        typer.Option("--output", "-o", metavar="FILE.png", help="Image to write (default: next to the flight)"),
     ] = None,
     topic: Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all positions')] = DEFAULT_TOPIC,
     vehicle: VehicleOption = ANY,
     instance: InstanceOption = None,
 ) -> None:
-    """Draw a flight: track, altitude, speed, flags, resets of the estimator, and events."""
+    """Plot a flight: track, altitude, speed, flags, resets and events."""
     draw, limit = recording.draw, recording.MAX_STREAMS
     selection = Selection(topic, vehicle, instance)
     if topic not in (ANY, *DEFAULT.topics):
         table = f'nedbus.read("{source}", "{topic}", dataframe="pandas")'
-        raise ConfigError("--topic", f"{topic} has no track to draw, {', '.join(DEFAULT.topics)} have: see {table}")
+        raise ConfigError("--topic", f"{topic} has no track; plot {' or '.join(DEFAULT.topics)}, or read it: {table}")
     with recording.Flight(source) as flight:
         found = recording.matching(source, flight.addresses, selection)
         selected = [address for address in found if address.topic in DEFAULT.topics]
         if len(selected) > limit:
-            hint = f"of which the first {limit} are drawn: choose with -v, -t, -i"
+            hint = f"plotting the first {limit}: choose others with -v, -t, -i"
             write_stderr(f"{source}: {len(selected)} streams, {hint}")
         streams = [(address, messages) for address, (messages, _) in flight.read(selected[:limit]).items()]
         for warning in flight.warnings:
             write_stderr(f"{source}: {warning}")
         streams = [(address, messages) for address, messages in streams if len(messages)]
         if not streams:
-            raise SourceError(str(source), "nothing to draw: no message of what is selected is valid")
+            raise SourceError(str(source), "nothing to plot: the selected streams have no valid message")
         target = output or source.with_suffix(".png")
         draw(streams, target, title=source.name, events=_read_events(source))
         write(str(target))
         if flight.damaged:
-            raise SourceError(str(source), "damage cost messages: what could be read is drawn")
+            raise SourceError(str(source), "the file is damaged: only the readable messages were plotted")
 
 
 def _read_events(path: Path) -> list[Event]:
-    """Return the events of a file, and the begin of conditions that held from the first message to the end."""
+    """Return the events of a file, preceded by the conditions that held throughout the file."""
     account = read_account(path).account
     held = (each for vehicle in account.vehicles.values() for each in vehicle.conditions.values() if each.initial)
-    return [*dict.fromkeys(each.begin for each in held), *account.take(0)[0]]
+    return [*dict.fromkeys(each.begin for each in held), *account.events_since(0)[0]]

@@ -1,4 +1,4 @@
-"""The command for health checks and watchdogs: health."""
+"""The command health, for health checks and watchdogs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()
 _REFUSED: Final = (
-    ", though its service reports that it is: does the router let that service write this vehicle, and this client"
-    " read? (docs/security.md)"
+    ", although its service reports it as published: check that the router allows the service to write this vehicle,"
+    " and this client to read it (docs/security.md)"
 )
 
 
@@ -28,24 +28,25 @@ def health(
     bus: Bus,
     *,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", "-v", help="Judge this vehicle, of any publisher, by an answer")
+        str | None, typer.Option("--vehicle", "-v", help="Require an answer of this vehicle, from any publisher")
     ] = None,
-    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="N services answer, on all hosts")] = None,
-    max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Age of the newest message at most")] = 3.0,
-    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="These vehicles are heard, on all hosts")] = None,
-    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="N vehicles are heard, on all hosts")] = None,
-    valid: Annotated[str | None, typer.Option(metavar="xy,z", help="These are valid: xy, z, vxy, vz")] = None,
+    services: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N services, on any hosts")] = None,
+    max_age: Annotated[float, typer.Option(metavar="SECONDS", min=0.0, help="Maximum age of the newest message")] = 3.0,
+    expect: Annotated[str | None, typer.Option(metavar="1,2,7", help="Require these vehicles, on any hosts")] = None,
+    vehicles: Annotated[int | None, typer.Option(metavar="N", min=1, help="Require N vehicles, on any hosts")] = None,
+    valid: Annotated[str | None, typer.Option(metavar="xy,z", help="Require valid estimates: xy, z, vxy, vz")] = None,
     within: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.0, help="No bad or watch event in these")
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Require no bad or watch event in the last SECONDS")
     ] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Exit 0 when all is well: services answer, sources work, messages flow, no vehicle is silent; else 1 and why.
+    """Check services, sources, messages and vehicles; exit 0 if healthy.
 
-    A line on stderr for each fault. Without --vehicle, --services, --expect and --vehicles it judges the services of
-    this host, by what they report; a vehicle that was silent for an hour was switched off, and is no fault.
-    With --vehicle that vehicle must answer, as it does to any reader. --valid and --within are of all vehicles that are
-    judged, as their services remember them.
+    Otherwise exits with 1, and writes one line per fault to stderr.
+
+    By default checks the services of this host by their own reports; --services, --expect and --vehicles include other
+    hosts. --vehicle queries the vehicle itself, as any reader would. --valid and --within use the history kept by the
+    services. A vehicle that has been silent for an hour is considered switched off, not faulty.
     """
     if vehicle is not None:
         check_vehicle(vehicle)
@@ -54,7 +55,7 @@ def health(
         check_vehicle(name)
     asked = _parse_names("--valid", valid)
     if unknown := [each for each in asked if each not in VALID]:
-        raise ConfigError("--valid", f"{unknown[0]!r}: expected some of {', '.join(VALID)}")
+        raise ConfigError("--valid", f"{unknown[0]!r}: expected a list of {', '.join(VALID)}")
     judged = tuple(dict.fromkeys([*names, *([vehicle] if vehicle is not None else [])]))
     check = _Check(bus, vehicle, services, max_age, Expectation(judged, vehicles, asked, within))
     faults = [*check.service_faults(), *check.vehicle_faults()]
@@ -74,12 +75,12 @@ def health(
 def _parse_names(option: str, text: str | None) -> tuple[str, ...]:
     names = tuple(name.strip() for name in (text or "").split(",") if name.strip())
     if text is not None and not names:
-        raise ConfigError(option, "names nothing: is a variable of the shell not set?")
+        raise ConfigError(option, "the list is empty: check that the shell variable is set")
     return names
 
 
 class _Check:
-    """The answers of services and publishers, and their faults; `ages`: of each vehicle's newest message [s]."""
+    """Answers of services and publishers, and the faults in them; `ages`: age of each vehicle's newest message [s]."""
 
     def __init__(self, bus: Bus, vehicle: str | None, count: int | None, max_age: float, expected: Expectation) -> None:
         self._vehicle, self._count, self._max_age, self._expected = vehicle, count, max_age, expected
@@ -94,7 +95,7 @@ class _Check:
         if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
             only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
             self._answers = [sample for sample in bus.latest(ANY, vehicle=only) if not sample.stored]
-        # A status lists published streams, also those that the router's access rules drop.
+        # The status also lists streams that the router's access rules drop.
         self._is_refused = False
         if vehicle is not None:
             latencies = [sample.latency for sample in self._answers if sample.vehicle == vehicle]
@@ -103,15 +104,15 @@ class _Check:
             self.ages = {vehicle: age} if latencies and age is not None else {}
 
     def service_faults(self) -> Iterator[str]:
-        """Yield the first fault of services, their sources, and the age of the newest message."""
+        """Yield the first fault of the services, their sources, or the age of the newest message."""
         refused = sorted({to_text(name, 64) for service in self.services for name in service.refused})
         failed = [source for source in self.sources if source.state in {"retrying", "failed"}]
         if self._count is not None and len(self.services) < self._count:
             yield f"{len(self.services)} of {self._count} services answer at {self._routers}"
         elif not self.services and self._is_local:
-            yield f"no service of {_HOST} answers at {self._routers}: --services 1 accepts those of other hosts"
+            yield f"no service of {_HOST} answers at {self._routers}: to accept other hosts, use --services 1"
         elif refused and self._vehicle is None:
-            yield f"the router refuses vehicle {', '.join(refused)[:300]}: do its access rules name it?"
+            yield f"the router refuses vehicle {', '.join(refused)[:300]}: add it to its access rules"
         elif failed and self._vehicle is None:
             source = failed[0]
             yield f"{to_text(source.source)} is {to_text(source.state)}: {to_text(source.error, 300)}"
@@ -122,10 +123,10 @@ class _Check:
         elif self.ages and min(self.ages.values()) > self._max_age:
             name = min(self.ages, key=lambda each: self.ages[each])
             age = to_age(self.ages[name])
-            yield f"the newest message is {age} old, from vehicle {name}: at most {self._max_age:g} s"
+            yield f"the newest message is {age} old, from vehicle {name}: the limit is {self._max_age:g} s"
 
     def vehicle_faults(self) -> Iterator[str]:
-        """Yield the faults of vehicles, as services remember them, and as others answer that no service knows."""
+        """Yield the faults of vehicles: those that services report, and of answering vehicles without a service."""
         expected = self._expected
         others = [
             sample
@@ -134,14 +135,14 @@ class _Check:
         ]
         heard = {sample.vehicle for sample in others}
         for fault in faults_of(self._reports, expected, heard=heard, only=_HOST if self._is_local else None):
-            if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # said already
+            if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above
                 yield fault
         if expected.valid or expected.within is not None:
             remembering = {report.service for report in self._reports}
             for service in self.services:
                 if service.service not in remembering:
                     name = to_text(service.service, 64)
-                    yield f"service {name} does not say what happens to its vehicles: update nedbus there"
+                    yield f"service {name} keeps no history of its vehicles: update nedbus there"
         for sample in others:
             if sample.topic == DEFAULT_TOPIC and (not expected.expect or sample.vehicle in expected.expect):
                 invalid = [each for each in expected.valid if not getattr(sample.message, VALID[each])]
@@ -150,7 +151,7 @@ class _Check:
 
 
 def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:
-    """Return the age of the newest message of each vehicle that is published, as its service measures it [s]."""
+    """Return the age of the newest message of each published vehicle, measured by its service [s]."""
     ages: dict[str, float] = {}
     for source in sources:
         for stream in source.streams:

@@ -1,4 +1,4 @@
-"""The command that measures streams: hz."""
+"""The command hz: measure rates, latencies and losses of streams."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CSV_HEAD: Final = (
     "time", "vehicle", "topic", "instance", "state", "reason", "rate", "usual_rate", "nominal", "jitter", "latency",
     "latency_max", "age", "messages", "lost", "gaps", "out_of_order", "reboots", *DOUBT_FLAGS,
 )  # fmt: skip
-_FORGET_AFTER: Final = 60.0  # s after which a stream that is gone is not shown any more
+_FORGET_AFTER: Final = 60.0  # s until a stream that is gone is hidden
 
 Stream = tuple[Address, Health, StreamState]
 
@@ -36,9 +36,10 @@ def hz(
     count: CountOption = None,
     duration: DurationOption = None,
 ) -> None:
-    """Measure rate, jitter, latency, loss and validity of each vehicle and topic, every second, the worst first.
+    """Measure rate, jitter, latency, loss and validity of each stream.
 
-    With --json and --csv there is a line for each stream that had messages, or whose state changed.
+    Updates every second; the worst streams come first. With --json and --csv, each second has a line for every stream
+    that received messages or changed its state.
     """
     require_one({"--json": json_output, "--csv": csv_output})
     monitor = Monitor()
@@ -61,7 +62,7 @@ def hz(
 
 
 def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
-    """Yield all streams with their states; forget those that have been gone for a minute."""
+    """Yield all streams with their states; forget those that have been gone for more than a minute."""
     alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
     for address, health in monitor.snapshot().items():
         state = stream_state(health, alive=address in alive, connected=bus.connected)

@@ -1,4 +1,4 @@
-"""Commands that query once: list, get, info, schema."""
+"""Commands that send one query: list, get, info, schema."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _SOURCE_OPTIONAL: Final = ("REBOOTS", "RETRIES", "LOST", "REJECTED", "PUBLISHED"
 _STREAM_HEAD: Final = ("VEHICLE/TOPIC", "HZ", "OF", "AGE", "MESSAGES", "STATE")
 _STREAM_OPTIONAL: Final = ("OF", "MESSAGES", "AGE")
 _ABSENT: Final = {"stale": "gone: ", "silent": "announced, nothing arrives: ", "not_carried": "not carried: "}
-_SIMILAR: Final = 0.8  # of a name from which one is taken for a misspelling of it
-_MAX_ROWS: Final = 200  # of a table, and services: any peer may claim to be a service
-_MAX_VEHICLES: Final = 2000  # characters of the names of vehicles
+_SIMILAR: Final = 0.8  # similarity from which a name counts as a misspelling
+_MAX_ROWS: Final = 200  # of a table, and services shown: any peer may claim to be a service
+_MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 
 
 @command
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
-    """List the vehicles and topics that are published now, how old their last message is, and their state."""
+    """List published streams, the age of their last message and state."""
     selection = Selection(ANY, vehicle)
     published = {each for addresses in bus.vehicles().values() for each in addresses if selection.matches(each)}
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
@@ -63,8 +63,11 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
     if rows and not json_output:
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
-        hint = "see 'nedbus info'; with certificates, may it write, and may this client read?"
-        hint = f"a service answers, so {hint}" if bus.services() else "start a source with 'nedbus serve'"
+        hint = "start a source with 'nedbus serve'"
+        if bus.services():
+            hint = (
+                "a service answers: see 'nedbus info', and check its and this client's permissions (docs/security.md)"
+            )
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
 
@@ -73,25 +76,26 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
 def get(
     bus: Bus, selection: Selection = POSITIONS, *, field: FieldOption = None, json_output: JsonOption = False
 ) -> None:
-    """Show the last message of each vehicle and topic, all fields; exit 1 when no publisher answers.
+    """Show the last message of each stream with all its fields.
 
-    Messages that only a storage kept are marked.
+    Messages from a storage without a publisher are marked. Exits with 1 if no publisher answers.
     """
     fields = parse_fields(field, selection)
     samples = bus.latest(selection.topic, vehicle=selection.vehicle, instance=selection.instance)
     for sample in samples:
         write(to_json(sample, fields) if json_output else to_fields(sample, fields))
     if not samples:
-        write_stderr(f"nothing is published on {selection.key_expr(prefix=bus.prefix)}: 'nedbus list' shows what is")
+        expression = selection.key_expr(prefix=bus.prefix)
+        write_stderr(f"nothing is published on {expression}: 'nedbus list' shows the published streams")
     elif all(sample.stored for sample in samples):
-        write_stderr("no publisher answers: these are what a storage kept")
+        write_stderr("no publisher answers: these messages are from a storage")
     if all(sample.stored for sample in samples):
         raise typer.Exit(1)
 
 
 @command
 def info(bus: Bus, *, json_output: JsonOption = False) -> None:
-    """Show the services on this network: the state of their sources and streams, and rejected messages."""
+    """Show the services of the network, their sources and streams."""
     services = bus.services()
     vehicles = bus.vehicles()
     if json_output:
@@ -116,21 +120,21 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
             table = to_table(_STREAM_HEAD, streams, optional=_STREAM_OPTIONAL, max_rows=_MAX_ROWS)
             write(f"\n{table}")
     if len(services) > _MAX_ROWS:
-        write(f"{len(services) - _MAX_ROWS} services more")
+        write(f"{len(services) - _MAX_ROWS} more services")
     if not services:
-        write_stderr("no nedbus service answers here")
+        write_stderr("no nedbus service answers")
 
 
 @command
 def schema(
     open_bus: Callable[[], Bus],
-    message: Annotated[str, typer.Argument(help="A message, such as VehicleAttitude, or a topic")] = DEFAULT_TOPIC,
+    message: Annotated[str, typer.Argument(help="Message, such as VehicleAttitude, or topic")] = DEFAULT_TOPIC,
     *,
-    layouts: Annotated[bool, typer.Option("--layouts", help="PX4's layouts: fields and types in order")] = False,
+    layouts: Annotated[bool, typer.Option("--layouts", help="Print PX4's layouts: fields and types in order")] = False,
 ) -> None:
-    """Print the JSON Schema of a message, or the layouts that can be read.
+    """Print the JSON Schema of a message, or its supported layouts.
 
-    For a topic of an undeclared message, the publisher is asked.
+    The schema of an undeclared message is requested from its publisher.
     """
     try:
         definition: Definition[Any] = definition_of(message)
@@ -140,9 +144,9 @@ def schema(
 
 
 def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
-    reason = "nor is it a topic that is published"
+    reason = "and no such topic is published"
     try:
-        get_topic(topic)  # "*" is none
+        get_topic(topic)  # raises for "*"
         with open_bus() as bus:
             for sample in bus.latest(topic):
                 message: Message = sample.message
@@ -150,10 +154,10 @@ def _ask_publisher(open_bus: Callable[[], Bus], topic: str) -> Definition[Any]:
     except AddressError:
         pass
     except ConnectError as exc:
-        reason = f"and no publisher can be asked: {exc}"
+        reason = f"and no publisher can be queried: {exc}"
     near = get_close_matches(topic, [*MESSAGES, *BY_TOPIC], 3, _SIMILAR)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"{', '.join(MESSAGES)} are known"
-    raise ConfigError("message", f"there is no file for {topic!r}, {reason}: {hint}")
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known messages are {', '.join(MESSAGES)}"
+    raise ConfigError("message", f"unknown message {topic!r}, {reason}: {hint}")
 
 
 def _source_row(source: SourceStatus) -> list[str]:

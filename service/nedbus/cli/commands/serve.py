@@ -1,4 +1,4 @@
-"""Commands that run until they are stopped: serve, router."""
+"""Commands that run a service or a router: serve, router."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from .doctor import report_mistakes
 
 _log = logging.getLogger("nedbus")
 _KINDS = ", ".join(f"{name}:{kind.target or ''}" for name, kind in SOURCE_KINDS.items())
-_SOURCES = f"{_KINDS}, with ?OPTION=VALUE&...; repeatable"
+_SOURCES = f"Source to publish: {_KINDS}, with ?OPTION=VALUE&...; repeatable"
 
-_LISTEN = f"Address of the router (default: {DEFAULT_ENDPOINT})"
+_LISTEN = f"Endpoint to listen on; repeatable (default: {DEFAULT_ENDPOINT})"
 ListenOption = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT", help=_LISTEN)]
 JoinOption = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help="Router to join")]
 
@@ -43,22 +43,23 @@ def serve(
     source: Annotated[list[str] | None, typer.Option("--source", "-s", metavar="SOURCE", help=_SOURCES)] = None,
     connect: JoinOption = None,
     listen: ListenOption = None,
-    router_config: Annotated[Path | None, typer.Option(help="JSON5 configuration of the embedded router")] = None,
+    router_config: Annotated[Path | None, typer.Option(help="Configuration file of the embedded router, JSON5")] = None,
     tls_ca: TlsCaOption = None,
     tls_certificate: TlsCertificateOption = None,
     tls_key: TlsKeyOption = None,
     prefix: PrefixOption = None,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle of sources that name none")] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Vehicle id of sources that name none")] = None,
     http: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status there")
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve metrics, health and status on this address")
     ] = None,
-    until_done: Annotated[bool | None, typer.Option("--until-done", help="End when every finite source ended")] = None,
+    until_done: Annotated[bool | None, typer.Option("--until-done", help="Stop when finite sources have ended")] = None,
     config: ConfigOption = None,
-    check: Annotated[bool, typer.Option("--check", help="Only report all mistakes in the settings")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check the settings and exit")] = False,
 ) -> None:
-    """Publish sources, validated; the service is a router itself unless it is to join one (--connect).
+    """Run a service: publish validated messages from sources.
 
-    SIGHUP reads the settings again: new sources start, those that are gone end, all others go on.
+    The service runs its own router unless it joins one (--connect). SIGHUP reloads the settings: it starts new sources,
+    stops removed ones, and leaves all others running.
     """
     given = {name: value for name, value in locals().items() if name not in {"config", "check"}}
     if check:
@@ -89,20 +90,21 @@ def serve(
 
 
 def _reload(daemon: Daemon, notifier: Notifier, config: Path | None, given: Mapping[str, object]) -> None:
-    """Read the settings again; invalid ones change nothing."""
+    """Reload the settings; invalid ones change nothing."""
     try:
         with notifier.reloading():
             done = daemon.reload(load_settings(config, **given))
     except NedbusError as exc:
-        _log.error("the settings are rejected, and nothing changes: %s", exc, extra=about("reload"))
+        _log.error("settings not reloaded, the old ones stay active: %s", exc, extra=about("reload"))
     else:
-        _log.info("the settings were read again: %s", done, extra=about("reload"))
+        _log.info("settings reloaded: %s", done, extra=about("reload"))
 
 
 @command
 def router(
     config_file: Annotated[
-        Path | None, typer.Argument(metavar="CONFIG.json5", help="A file that zenohd reads too", show_default=False)
+        Path | None,
+        typer.Argument(metavar="CONFIG.json5", help="Router configuration in the format of zenohd", show_default=False),
     ] = None,
     *,
     listen: ListenOption = None,
@@ -112,9 +114,9 @@ def router(
     tls_key: TlsKeyOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Run a Zenoh router, without sources, that services and scripts connect to.
+    """Run a Zenoh router without sources, for services and scripts.
 
-    Endpoints that are given replace those of the file, as the flags of zenohd do.
+    --listen and --connect replace the endpoints of the file, like the flags of zenohd.
     """
     settings = load_settings(config, listen=listen, tls_ca=tls_ca, tls_certificate=tls_certificate, tls_key=tls_key)
     endpoints, routers = settings.listen, tuple(connect or ())

@@ -1,4 +1,4 @@
-"""Rate limit of the log: no peer can fill a disk, whatever it sends, and the number of suppressed lines is logged."""
+"""Rate limit of the log, against peers that flood it; the number of suppressed lines is logged."""
 
 from __future__ import annotations
 
@@ -14,35 +14,37 @@ from nedbus.log_event import EVENTS, About
 from .streams import MAX_TEXT
 
 BURST: Final = 50
-"""Lines of one kind that are logged at once."""
+"""Lines of one kind that may be logged at once."""
 
 PER_MINUTE: Final = 6
-"""Lines of one kind that are logged in each minute after that."""
+"""Lines of one kind that may be logged per minute after a burst."""
 
 _MAX_KINDS: Final = 1000  # nedbus itself has about 40
 
 Kind = tuple[str, str | None, str]
-"""A logger, an event, and the text before the values were put in."""
+"""Logger, event and unformatted text of a record."""
 
 
 @dataclass(slots=True, eq=False)
 class _TokenBucket:
-    """The number of lines of one kind that may be logged now, and the number left out since the last report."""
+    """Token bucket of one kind of line, and the number of lines suppressed since the last report."""
 
     filled: float
     tokens: float = BURST
     left_out: int = 0
-    report: Mapping[str, object] = field(default_factory=dict)  # no record: it may keep a traceback alive
+    report: Mapping[str, object] = field(
+        default_factory=dict
+    )  # not the record itself, which may keep a traceback alive
 
     def fill(self, now: float) -> bool:
-        """Add the tokens of the time since the last call; return whether there is one."""
+        """Add the tokens earned since the last call; return True if a line may be logged."""
         self.tokens = min(BURST, self.tokens + (now - self.filled) * PER_MINUTE / 60)
         self.filled = now
         return self.tokens >= 1
 
     def leave_out(self, record: logging.LogRecord) -> None:
         if not self.left_out:
-            text = f"%d more lines like this one were left out: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
+            text = f"suppressed %d more lines like this one: {record.getMessage()[:MAX_TEXT].replace('%', '%%')}"
             self.report = {"name": record.name, "levelno": record.levelno, "levelname": record.levelname, "msg": text}
         self.left_out += 1
 
@@ -54,10 +56,10 @@ class _TokenBucket:
 
 
 class RateLimit(logging.Filter):
-    """Let a burst of each kind of record pass, then a few a minute.
+    """Pass a burst of each kind of record, then a few per minute.
 
-    `handle` is the handler's: it gets a record with the number of lines left out, as soon as one could be logged again.
-    Records of events that are not limited always pass.
+    `handle`, the method of the handler, gets a record with the number of suppressed lines once that kind may be logged
+    again. Records of unlimited events always pass.
     """
 
     def __init__(
@@ -67,10 +69,10 @@ class RateLimit(logging.Filter):
         self._handle = handle
         self._now = now
         self._buckets: dict[Kind, _TokenBucket] = {}
-        self._lock = threading.RLock()  # as those of logging: collecting garbage may log in the midst of this
+        self._lock = threading.RLock()  # reentrant, as in logging: garbage collection may log while it is held
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log a record; before, log the number left out of each kind that may be logged again."""
+        """Return True if a record may be logged; first report suppressed lines of kinds that may be logged again."""
         now = self._now()
         self._report(lambda bucket: bucket.fill(now))
         about = about_of(record)
@@ -89,7 +91,7 @@ class RateLimit(logging.Filter):
             return True
 
     def flush(self) -> None:
-        """Log the numbers of lines left out so far."""
+        """Report all suppressed lines."""
         self._report(lambda _: True)
 
     def _report(self, is_due: Callable[[_TokenBucket], bool]) -> None:
@@ -101,6 +103,6 @@ class RateLimit(logging.Filter):
 
 
 def about_of(record: logging.LogRecord) -> About | None:
-    """Return the facts of a log call besides its text; None for those of other packages."""
+    """Return the structured fields of a log call; None for records of other packages."""
     about = getattr(record, "about", None)
     return about if isinstance(about, About) else None

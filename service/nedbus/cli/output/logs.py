@@ -1,4 +1,4 @@
-"""The log on stderr: text for people, priorities for the journal, JSON for programs."""
+"""Logging to stderr: text for terminals, syslog priorities for the journal, or JSON."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
 from .log_limit import RateLimit, about_of
-from .streams import FOR_PROGRAMS, MAX_TEXT, printable, to_text
+from .streams import MAX_TEXT, STRUCTURED, printable, to_text
 
 _log = logging.getLogger("nedbus")
 _DATE: Final = "%Y-%m-%d %H:%M:%S"
-_MAX_TRACEBACK: Final = 20_000  # characters, the last ones, in which the error is named
+_MAX_TRACEBACK: Final = 20_000  # characters, the last ones: they name the error
 _KEYS: Final = ("vehicle", "topic", "instance", "source", "reason", "count", "of")
 _PRIORITIES: Final = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
@@ -30,30 +30,30 @@ ExcInfo = tuple[type[BaseException], BaseException, TracebackType | None] | tupl
 
 
 class TextFormatter(logging.Formatter):
-    """Format a record as one line of printable characters; with a traceback as several."""
+    """Format a record as one printable line, plus those of a traceback."""
 
     def __init__(self, style: str = "%(asctime)s %(levelname)-7s %(message)s") -> None:
         super().__init__(style, _DATE)
 
-    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name is that of logging
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - overrides logging
         """Return the line without a traceback."""
         record.message = to_text(record.message, MAX_TEXT)
         return super().formatMessage(record)
 
-    def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - the name is that of logging
-        """Return the end of a traceback."""
+    def formatException(self, ei: ExcInfo) -> str:  # noqa: N802 - overrides logging
+        """Return the last part of a traceback."""
         return super().formatException(ei)[-_MAX_TRACEBACK:]
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line, or the lines."""
+        """Return the line or lines of a record."""
         return printable(super().format(record))
 
 
 class JsonFormatter(TextFormatter):
-    """Format a record as one JSON object on one line; unknown facts have no key. python-json-logger is longer."""
+    """Format a record as a JSON object on one line; fields without a value are omitted."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the object."""
+        """Return the JSON object of a record."""
         about = about_of(record)
         fields: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")[:-6] + "Z",
@@ -72,20 +72,20 @@ class JsonFormatter(TextFormatter):
 
 
 class JournalFormatter(logging.Formatter):
-    """Put the priority of syslog before each line of another formatter, as sd-daemon(3) describes."""
+    """Prefix each line of another formatter with its syslog priority, see sd-daemon(3)."""
 
     def __init__(self, inner: logging.Formatter) -> None:
         super().__init__()
         self._inner = inner
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line, or the lines."""
+        """Return the line or lines of a record."""
         priority = next(number for level, number in _PRIORITIES if record.levelno >= level)
         return "\n".join(f"<{priority}>{line}" for line in self._inner.format(record).split("\n"))
 
 
 class _StderrHandler(logging.StreamHandler[TextIO]):
-    """Write to `sys.stderr` as it is at the moment: a live table replaces it, to stay below the log."""
+    """Write to the current `sys.stderr`: a live table replaces it, to stay below the log."""
 
     def emit(self, record: logging.LogRecord) -> None:
         self.setStream(sys.stderr)
@@ -93,13 +93,13 @@ class _StderrHandler(logging.StreamHandler[TextIO]):
 
 
 def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
-    """Log to stderr, a line for each record; with priorities where that is the journal."""
+    """Log to stderr, one line per record, with syslog priorities if stderr is the journal."""
     is_journal, is_json = _is_journal(), log_format == "json"
     formatter = JsonFormatter() if is_json else TextFormatter("%(message)s") if is_journal else TextFormatter()
     handler = _StderrHandler()
     handler.setFormatter(JournalFormatter(formatter) if is_journal else formatter)
     if is_journal or is_json:
-        handler.name = FOR_PROGRAMS
+        handler.name = STRUCTURED
         _log_uncaught_errors()
     limit = RateLimit(handler.handle)
     handler.addFilter(limit)
@@ -111,21 +111,21 @@ def log_to_stderr(*, level: LogLevel, log_format: LogFormat) -> None:
 
 
 def _is_journal() -> bool:
-    """Return whether stderr is connected to the journal, as sd_journal_print(3) describes JOURNAL_STREAM."""
+    """Return True if stderr is connected to the journal; see JOURNAL_STREAM in systemd.exec(5)."""
     try:
         status = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):  # closed, or no file
+    except (OSError, ValueError):  # closed, or not a file
         return False
     return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
 
 
 def _log_uncaught_errors() -> None:
-    """Log uncaught errors, which Python itself would print as several lines."""
+    """Log uncaught errors; Python would print them as several lines."""
 
     def log(kind: type[BaseException], error: BaseException | None, traceback: TracebackType | None) -> None:
         if not issubclass(kind, SystemExit):
             exc_info = None if error is None else (kind, error, traceback)
-            text = str(error) if issubclass(kind, NedbusError) else f"an unexpected {kind.__name__}: {error}"
+            text = str(error) if issubclass(kind, NedbusError) else f"unexpected {kind.__name__}: {error}"
             _log.error("%s", text, exc_info=exc_info, extra=about("error"))
 
     sys.excepthook = log

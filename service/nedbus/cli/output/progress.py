@@ -1,4 +1,4 @@
-"""Progress: log lines of `nedbus serve`, and a bar on a terminal for commands that write files."""
+"""Progress reports: log lines of `nedbus serve`, and the progress bar of commands that write files."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from nedbus.daemon import Daemon
 from nedbus.log_event import about
 from nedbus.transport import DEFAULT_ENDPOINT, dial_endpoint
 
-from .streams import logs_for_programs, write_stderr
+from .streams import is_log_structured, write_stderr
 
 _log = logging.getLogger("nedbus")
-_REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports; then the last one
+_REPORT_INTERVALS: Final = (10.0,) * 6 + (60.0,)  # s between reports; the last one repeats
 
 _HINT: Final = """In a second terminal:
   {nedbus} list{where}  published vehicles and topics
-  {nedbus} echo{where}  messages as they arrive, a line each
+  {nedbus} echo{where}  messages as they arrive, one per line
   {nedbus} hz{where}    rate, jitter, latency, loss
   {nedbus} get{where}   all fields of the last message"""
-_TLS_HINT: Final = "Readers at {endpoint} need a certificate of their own: docs/security.md"
+_TLS_HINT: Final = "Readers at {endpoint} need their own certificate, see docs/security.md"
 _ENCRYPTED: Final = ("tls/", "quic/")
 
 
 class ProgressLog:
     """Log the progress of a daemon; `update` is called several times a second.
 
-    Once the daemon is ready, stderr gets the commands for a second terminal.
+    Once the daemon is ready, commands to try in a second terminal are written to stderr.
     """
 
     def __init__(self, daemon: Daemon) -> None:
@@ -41,15 +41,15 @@ class ProgressLog:
         self._hinted = False
         self._reports = 0
         self._reported = time.monotonic()
-        self._counts: dict[str, int] = {}  # messages published of each source at the last report
+        self._counts: dict[str, int] = {}  # messages published by each source until the last report
 
     def update(self) -> None:
-        """Log the progress if a report is due."""
+        """Log a report if one is due."""
         if not self._daemon.ready.is_set():
             return
         if not self._hinted:
             self._hinted = True
-            if not logs_for_programs() and not self._daemon.until_done:
+            if not is_log_structured() and not self._daemon.until_done:
                 write_stderr(what_to_type(self._daemon.endpoints))
         elapsed = time.monotonic() - self._reported
         if elapsed >= _REPORT_INTERVALS[min(self._reports, len(_REPORT_INTERVALS) - 1)]:
@@ -77,7 +77,7 @@ def _numbers(status: SourceStatus, rate: float) -> str:
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
-    """Yield a function that shows a text, and a number done of a total; without a terminal it does nothing."""
+    """Yield a function that shows a text, the number done and the total; it does nothing without a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -88,7 +88,7 @@ def show_progress() -> Iterator[Callable[[str, int | None, int | None], None]]:
 
 
 def what_to_type(endpoints: Sequence[str]) -> str:
-    """Return commands for a second terminal, which need no certificate, if any endpoint takes clients without one."""
+    """Return commands to try in a second terminal; a hint if all endpoints require a client certificate."""
     plain = [each for each in endpoints if not each.startswith(_ENCRYPTED)]
     if not plain:
         return _TLS_HINT.format(endpoint=endpoints[0])
@@ -97,6 +97,6 @@ def what_to_type(endpoints: Sequence[str]) -> str:
 
 
 def _program() -> str:
-    """Return the command that runs nedbus: its path, if this one was called by it and PATH has no nedbus."""
+    """Return the command to run nedbus: the path of this one if PATH has no nedbus."""
     path = sys.argv[0]
     return path if Path(path).name == "nedbus" and shutil.which("nedbus") is None else "nedbus"

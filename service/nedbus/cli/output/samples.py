@@ -1,4 +1,4 @@
-"""Samples as text: a line, columns of a terminal, all fields, JSON and CSV."""
+"""Text formats of samples: lines, terminal columns, all fields, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from .streams import csv_line
 from .table import COLUMN_GAP, fit_columns, terminal_width
 
 _TIMES: Final = ("timestamp", "timestamp_sample")
-_DIGITS: Final = {"float32": 9}  # which distinguish any two of them; those of a float64 are all there are
+_DIGITS: Final = {"float32": 9}  # enough to distinguish any two values; float64 is printed in full
 _SUMMARY_DIGITS: Final = {"float32": 6, "float64": 10}  # 1 mm of a latitude
-_OLD: Final = 1.0  # s of latency from which on a line shows it: the last value of a stream that ended, or recovered
+_OLD: Final = 1.0  # s of latency from which it is shown: the last value of an ended stream, or a recovered message
 
-_MIN_PAGE: Final = 10  # lines between two headings, on the lowest terminal
+_MIN_PAGE: Final = 10  # minimum number of lines between two headings
 _FIELD_WIDTH: Final = 13  # characters; a longer value widens its column
 _ADDRESS, _POSITION, _STATE = "VEHICLE/TOPIC", f"{'X m':>7} {'Y m':>7} {'Z m':>7}", "STATE"
 _VELOCITY, _HEADING, _EPH = f"{'VX m/s':>6} {'VY m/s':>6} {'VZ m/s':>6}", "HDG deg", "EPH m"
-_OPTIONAL: Final = (_EPH, _HEADING, _VELOCITY)  # in the order in which a narrow terminal leaves them out
+_OPTIONAL: Final = (_EPH, _HEADING, _VELOCITY)  # in the order of removal on a narrow terminal
 
 
 def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38) -> str:
-    """Return one line with these fields, or with the most important ones; NED, metres, degrees.
+    """Format a sample as one line with these fields, or the most important ones; NED, metres, degrees.
 
-    `width`: that of the address.
+    `width`: width of the address column.
     """
     message = sample.message
     start = f"{sample.address!s:<{width}} {message.timestamp / 1e6:12.3f} s"
     if fields:
         return "  ".join([start, *(f"{name} {_to_value(sample, name)}" for name in fields)]) + _notes(sample)
     if not _is_position(message):
-        return f"{start}{_notes(sample)}  {_to_summary(message)}"  # whose end has no room on a terminal
+        return f"{start}{_notes(sample)}  {_to_summary(message)}"  # a terminal cuts the end of the line
     position = " ".join(f"{value:9.3f}" for value in (message.x, message.y, message.z))
     velocity = " ".join(f"{value:7.3f}" for value in (message.vx, message.vy, message.vz))
     heading = f"hdg {math.degrees(message.heading):6.1f}  eph {message.eph:6.2f}"
@@ -45,10 +45,10 @@ def to_line(sample: Sample[Any], fields: Sequence[str] = (), *, width: int = 38)
 
 
 class Lines:
-    """Format samples as lines: on a terminal in columns, with a heading in each screenful and when the columns change.
+    """Format samples as lines; on a terminal in columns, with a heading per screenful and when the columns change.
 
-    A terminal that is too narrow shows no eph, then no heading, then no velocity; position, doubts and loss always.
-    Where stdout is no terminal, a line is complete and has no heading.
+    A narrow terminal omits eph, then heading, then velocity, but never position, doubts and loss.
+    If stdout is not a terminal, lines are complete and have no heading.
     """
 
     def __init__(self) -> None:
@@ -57,12 +57,12 @@ class Lines:
         self._left = 0  # lines before the next heading
 
     def __call__(self, sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-        """Return the line of a sample, after a heading if one is due."""
+        """Return the line of a sample, preceded by a heading if one is due."""
         width = terminal_width()
         if width is None:
             return to_line(sample, fields)
         self._left -= 1
-        if not fields and not _is_position(sample.message):  # it has no columns: all that fits into a line
+        if not fields and not _is_position(sample.message):  # no columns: as much as fits into a line
             line = to_line(sample, width=self._widths.get(_ADDRESS, 0))
             return line if len(line) <= width else f"{line[: width - 1]}…"
         cells = {_ADDRESS: str(sample.address), **_cells(sample, fields), _STATE: _to_state(sample)}
@@ -76,14 +76,14 @@ class Lines:
         return f"{head}\n{line}"
 
     def _join(self, cells: dict[str, str]) -> str:
-        """Return cells as a line; numbers are aligned to the right, and the state, the last one, is not padded."""
+        """Join cells to a line; numbers are right-aligned, and the state at the end is not padded."""
         address, *numbers, state = cells.items()
         padded = [cell.rjust(self._widths[name]) for name, cell in numbers]
         return COLUMN_GAP.join([address[1].ljust(self._widths[_ADDRESS]), *padded, state[1]])
 
 
 def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
-    """Return time, then these fields, or position, velocity, heading and eph, by their headings; NED, degrees."""
+    """Return the cells by heading: time, then these fields, or position, velocity, heading and eph; NED, degrees."""
     message = sample.message
     time = {"TIME s": f"{message.timestamp / 1e6:8.2f}"}
     if fields:
@@ -97,17 +97,17 @@ def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
 
 
 def _to_state(sample: Sample[Any]) -> str:
-    """Return the doubts about a sample, or "ok"; then its age, if it is old, and the number lost before it."""
+    """Return the doubts about a sample, or "ok"; then its age if it is old, and the number lost before it."""
     return (message_doubts(sample.message) if _is_position(sample.message) else "ok") + _notes(sample)
 
 
 def _is_position(message: Message) -> bool:
-    """Return whether this is the message whose position, flags and doubts are shown."""
+    """Return True for the message with columns for position, flags and doubts."""
     return message.DEFINITION is DEFAULT
 
 
 def _to_summary(message: Message) -> str:
-    """Return the numbers of a message by name, then the flags that are set; unknown values are left out."""
+    """Return the numbers of a message by name, then its true flags; unknown values are omitted."""
     numbers, flags = [], []
     for name, kind in message.DEFINITION.types.items():
         value = getattr(message, name)
@@ -125,7 +125,7 @@ def _notes(sample: Sample[Any]) -> str:
 
 
 def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-    """Return these fields, or all, each on a line of its own, as `ros2 topic echo` does."""
+    """Format these fields, or all, one per line, like `ros2 topic echo`."""
     age = "" if sample.latency is None else f", {to_age(sample.latency)} old"
     source = "" if sample.source is None else f", from {sample.source}"
     stored = ", only stored" if sample.stored else ""
@@ -138,7 +138,7 @@ def to_fields(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 
 
 def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
-    """Return one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
+    """Format a sample as one line of JSON; non-finite numbers are the strings NaN, Infinity and -Infinity."""
     head = {
         "vehicle": sample.vehicle,
         "topic": sample.topic,
@@ -155,9 +155,9 @@ def to_json(sample: Sample[Any], fields: Sequence[str] = ()) -> str:
 
 
 class CsvLines:
-    """Format samples as lines of CSV, the first one below a line of names.
+    """Format samples as lines of CSV, preceded by a header line.
 
-    Raises ConfigError for a sample that has other columns than the first one.
+    Raises ConfigError for a sample whose columns differ from those of the first one.
     """
 
     def __init__(self) -> None:
@@ -170,15 +170,15 @@ class CsvLines:
             self._head = head
             return f"{csv_line(head)}\n{csv_line(cells)}"
         if head != self._head:
-            text = f"a table has one kind of message, and {sample.address} is another: name a topic"
+            text = f"a table has only one message type, and {sample.address} has another: select a topic"
             raise ConfigError("--csv", text)
         return csv_line(cells)
 
 
 def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
-    """Return the names and cells of a row of CSV: the address, when it was sent [ns], PX4's time [us], these fields.
+    """Return names and cells of a CSV row: address, time of sending [ns], PX4's time [us], these fields.
 
-    An array has a cell for each element; a field that this message does not have is empty.
+    An array has one cell per element; the cell of a field that this message does not have is empty.
     """
     address, message = sample.address, sample.message
     row: list[tuple[str, object]] = [
@@ -199,13 +199,13 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
-    """Return the value of a field as text, "-" for one that this message does not have."""
+    """Return the value of a field as text, "-" if the message has no such field."""
     kind = sample.message.DEFINITION.types.get(name)
     return "-" if kind is None else _to_number(getattr(sample.message, name), _DIGITS.get(kind.base))
 
 
 def _to_number(value: object, digits: int | None) -> str:
-    """Return a value, or those of an array, with this number of significant digits, or with all there are."""
+    """Format a value, or the elements of an array, with `digits` significant digits; None: all digits."""
     if isinstance(value, tuple):
         return " ".join(_to_number(each, digits) for each in value)
     return str(value) if digits is None else f"{value:.{digits}g}"

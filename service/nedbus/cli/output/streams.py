@@ -1,4 +1,4 @@
-"""Standard output and standard error: printable text alone reaches them, and a closed one is an error of one line."""
+"""Writing to stdout and stderr: printable characters only; a closed stdout is a one-line error."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from nedbus.errors import NedbusError
 from nedbus.log_event import about
 
 MAX_TEXT: Final = 1000
-"""Characters that are shown of an error or a line of the log."""
+"""Maximum number of characters of an error or log line."""
 
-FOR_PROGRAMS: Final = "for programs"
-"""The name of a log handler whose lines are read by a program."""
+STRUCTURED: Final = "structured"
+"""Name of the log handler if the log is read by a program: JSON, or the journal."""
 
-_MAX_CELL: Final = 120  # characters that are shown of a value that some peer sent
+_MAX_CELL: Final = 120  # characters of a value from a peer
 _log = logging.getLogger("nedbus")
 
 
 def printable(text: str) -> str:
-    """Return text whose control characters are spelt out, so that none acts on a terminal; lines stay lines."""
+    """Escape control characters, except newlines, to keep them from the terminal."""
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     return "".join(
@@ -35,7 +35,7 @@ def printable(text: str) -> str:
 
 
 def to_text(value: object, limit: int = _MAX_CELL) -> str:
-    """Return a peer's text as one line of at most `limit` characters, all of them printable."""
+    """Return text from a peer as one printable line of at most `limit` characters, before escapes."""
     text = str(value)
     short = text if len(text) <= limit else f"{text[: limit - 3]}..."
     return printable(short.replace("\n", "\\n"))[: 4 * limit]
@@ -47,16 +47,16 @@ def counted(number: int, noun: str) -> str:
 
 
 def csv_line(cells: Iterable[object]) -> str:
-    """Return a line of CSV, with quotes where they are needed; None is an empty cell."""
+    """Format cells as a line of CSV, quoted where necessary; None is an empty cell."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(cells)
     return line.getvalue()
 
 
 def write(line: str) -> None:
-    """Write a line of output, or several, at once.
+    """Write one or more lines to stdout and flush it.
 
-    Raises BrokenPipeError when its reader is gone, NedbusError when it cannot be written.
+    Raises BrokenPipeError if the reader has gone, NedbusError for other failures.
     """
     try:
         if sys.stdout is None:
@@ -67,12 +67,12 @@ def write(line: str) -> None:
         raise
     except OSError as exc:
         discard_stdout()
-        raise NedbusError(f"cannot write: {(exc.strerror or str(exc)).lower()}") from exc
+        raise NedbusError(f"cannot write to stdout: {(exc.strerror or str(exc)).lower()}") from exc
 
 
 def write_stderr(text: str) -> None:
-    """Write a line for a person to stderr, at once, or log it for programs; a closed stderr is no error."""
-    if logs_for_programs():
+    """Write a notice to stderr, or log it if the log is structured; a closed stderr is ignored."""
+    if is_log_structured():
         for line in text.splitlines():
             _log.info("%s", line, extra=about("notice"))
         return
@@ -81,12 +81,12 @@ def write_stderr(text: str) -> None:
         sys.stderr.flush()
 
 
-def logs_for_programs() -> bool:
-    """Return whether the log is read by programs: then nothing else is written to stderr."""
-    return any(handler.name == FOR_PROGRAMS for handler in logging.getLogger().handlers)
+def is_log_structured() -> bool:
+    """Return True if the log is JSON or goes to the journal; then stderr must contain nothing else."""
+    return any(handler.name == STRUCTURED for handler in logging.getLogger().handlers)
 
 
 def discard_stdout() -> None:
-    """Redirect stdout to the null device, so that flushing it at exit does not fail again."""
+    """Redirect stdout to /dev/null: otherwise the flush at exit would fail again."""
     if sys.stdout is not None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Tables that rich fits into a terminal, printed once or redrawn in place; elsewhere nothing is folded or left out."""
+"""Tables, printed once or redrawn in place; fitted to the width of a terminal, else complete."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from typing import Final, Literal
 from .streams import write
 
 COLUMN_GAP: Final = "  "
-_READABLE: Final = 16  # characters of the last column, for which others are left out
-_MAX_ROWS: Final = 50  # of a table that is redrawn
-_UNLIMITED: Final = 10_000  # columns, where stdout is no terminal
+_WHOLE: Final = len("disconnected: no link")  # width of the last column for which optional ones are removed
+_FOLDED: Final = 16  # minimum width of the last column; the first one is folded for it
+_MAX_ROWS: Final = 50  # of a live table
+_UNLIMITED: Final = 10_000  # width if stdout is not a terminal
 
 Rows = Sequence[Sequence[str]]
 
 
 def terminal_width() -> int | None:
-    """Return the width of the terminal that stdout is, None if it is none."""
+    """Return the width of the terminal; None if stdout is not a terminal."""
     is_terminal = sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     return shutil.get_terminal_size().columns if is_terminal else None
 
 
 def fold(head: str, text: str) -> str:
-    """Return a line; on a terminal its text is folded, and its further lines are indented like the first."""
+    """Return `head` and `text`; on a terminal, `text` is wrapped and indented by the length of `head`."""
     width = terminal_width()
     if width is None:
         return head + text
@@ -37,7 +38,7 @@ def fold(head: str, text: str) -> str:
 
 
 def fit_columns(widths: Mapping[str, int], optional: Sequence[str], width: int) -> list[str]:
-    """Return the columns that fit into a width; the others are left out in the order of `optional`."""
+    """Return the columns that fit into `width`; those of `optional` are removed in this order until they do."""
     kept = list(widths)
     for name in optional:
         if _width_of(kept, widths) <= width:
@@ -52,10 +53,10 @@ def _width_of(columns: Sequence[str], widths: Mapping[str, int]) -> int:
 
 
 def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), max_rows: int | None = None) -> str:
-    """Return rows in columns: the first and the last one are text, aligned to the left, the others numbers.
+    """Format rows as a table: the first and the last column are text, aligned left, the others numbers.
 
-    A terminal that is too narrow shows no columns that are `optional`, in this order, and then folds text.
-    A last line has the number of rows beyond `max_rows`.
+    On a narrow terminal columns of `optional` are removed in this order; after that, text is folded.
+    The last line shows the number of rows beyond `max_rows`.
     """
     from rich.console import Console
     from rich.table import Table
@@ -64,8 +65,9 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
     shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
     first, last = head[0], head[-1]
     widths = {name: max(len(name), *map(len, cells)) for name, *cells in zip(head, *shown, strict=True)}
-    widths[last] = min(widths[last], _READABLE)
+    widths[last] = min(widths[last], _WHOLE)
     kept = fit_columns(widths, optional, width)
+    widths[last] = min(widths[last], _FOLDED)
     folded = (last,) if _width_of(kept, widths) <= width else (first, last)
     table = Table(box=None, pad_edge=False, padding=(0, len(COLUMN_GAP), 0, 0), header_style="")
     for name in kept:
@@ -81,7 +83,7 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
 
 @contextmanager
 def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callable[[Rows], None]]:
-    """Yield a function that shows the rows that fit; on a terminal in place of the last ones, below the log."""
+    """Yield a function that shows rows; on a terminal it replaces the previous rows, below the log."""
     if terminal_width() is None:
         yield lambda rows: write(to_table(head, rows, optional=optional, max_rows=_MAX_ROWS))
         return
@@ -90,7 +92,7 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
     from rich.text import Text
 
     def show(rows: Rows) -> None:
-        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # beside the head and the rest's number
+        most = max(1, min(_MAX_ROWS, shutil.get_terminal_size().lines - 3))  # minus header and the line with the rest
         text = to_table(head, rows, optional=optional, max_rows=most)
         live.update(Text(text, no_wrap=True, overflow="crop"), refresh=True)
 
@@ -101,4 +103,4 @@ def live_table(head: Sequence[str], optional: Sequence[str]) -> Iterator[Callabl
         with live:
             yield show
     finally:
-        console.show_cursor()  # also if a signal came while it was being hidden
+        console.show_cursor()  # in case a signal came while it was being hidden

@@ -1,1 +1,1 @@
-"""The health of streams, from their samples: rates, gaps, flags, ages."""
+"""Stream health, computed from samples: rates, gaps, flags and ages."""

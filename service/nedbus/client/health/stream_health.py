@@ -1,7 +1,7 @@
-"""The health of streams: rate, jitter, age, gaps, order, reboots, resets, and the share of their flags; no I/O.
+"""Stream health: rate, jitter, latency, age, gaps, order, reboots, resets and flags; no I/O.
 
-The same object serves `nedbus hz`, the status of a service, and scripts.
-Rates and ages are of a monotonic clock: the wall clock may be set at any time.
+Used by `nedbus hz`, the status of services and scripts.
+Rates and ages use a monotonic clock, as the wall clock may be set at any time.
 """
 
 from __future__ import annotations
@@ -18,32 +18,32 @@ from typing import Final, cast
 from nedbus.client.sample import Sample
 from nedbus_msgs import BY_TOPIC, DEFAULT, DOUBT_FLAGS, RESET_COUNTERS, Address, Message, Quantity, get_topic
 
-_REBOOT: Final = 1_000_000  # us that PX4's time goes back when a vehicle reboots; less is disorder
-_GAP: Final = 3.0  # times the usual step of PX4's time
-_SETTLED: Final = 5  # steps from which on there is a usual one
-_WEIGHT: Final = 0.05  # of a new step in the usual one, and of a new second in the usual rate
-_MAX_MEASURED: Final = 1000  # intervals and latencies that are kept of a window
+_REBOOT_STEP: Final = 1_000_000  # us by which PX4's time steps back in a reboot; less is a message out of order
+_GAP_FACTOR: Final = 3.0  # multiple of the usual step of PX4's time
+_MIN_STEPS: Final = 5  # steps before gaps are counted
+_SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rate
+_MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
-_STALE: Final = 3.0  # s without a message after which a stream has no rate
-_COUNTER: Final = 256  # where reset counters wrap
-_LATENCIES: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, limits of the histogram
-_MAX_STREAMS: Final = 4096  # that a monitor follows
-_NAMES: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # fields of a position that are followed
+_STALE: Final = 3.0  # s without a message until a stream is stale and has no rate
+_COUNTER_MODULUS: Final = 256  # modulus of reset counters
+_LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
+_MAX_STREAMS: Final = 4096  # per monitor
+_FIELDS: Final = ("timestamp", *DOUBT_FLAGS, *RESET_COUNTERS.values())  # evaluated fields of a position
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The health of one stream; None where there were too few messages to measure it.
+    """Health of one stream; values are None while there are too few messages to measure them.
 
-    Of the last full second: `rate` [Hz], `jitter` (standard deviation of the intervals of arrival) [s], `latency`
-    (median) and `latency_max` [s], and `flags`, the share of the messages with each flag set, 0 to 1.
-    Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's own time of more than three usual ones),
-    `out_of_order`, `reboots` (that time went back by more than 1 s), `resets` of each quantity, and `flags_ever`.
-    `nominal`: the rate that PX4 has for this topic [Hz], 0 if it has none; logs and links have less.
+    Over the last full second: `rate` [Hz], `jitter` (standard deviation of arrival intervals) [s], `latency` (median)
+    and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1.
+    Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's time above three times the usual step),
+    `out_of_order`, `reboots` (PX4's time stepped back by more than 1 s), `resets` per quantity, and `flags_ever`.
+    `nominal`: PX4's rate of this topic [Hz], 0 if it has none; logs and links are usually slower.
     `age`: seconds since the last message.
-    `usual_rate`: the rate that this stream has had so far [Hz]; `rate` is far below it when a stream becomes slow.
-    `on_change`: messages come whenever something changes: neither pauses nor bursts say anything.
-    `resets` is empty, and flags are None, for other messages than positions.
+    `usual_rate`: smoothed rate so far [Hz]; a `rate` far below it means that the stream has become slow.
+    `on_change`: published on change only, so pauses and bursts are normal.
+    For messages other than positions, `resets` is empty and flags are None.
     """
 
     rate: float | None
@@ -65,7 +65,7 @@ class Health:
 
     @property
     def stale_after(self) -> float:
-        """Seconds without a message after which this stream is stale: 3, or more where it is slow by nature."""
+        """Seconds without a message until this stream is stale: at least 3, infinity if it may pause forever."""
         if self.on_change:
             return max(_STALE, 2 / self.nominal) if self.nominal else math.inf
         return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
@@ -73,7 +73,7 @@ class Health:
 
 @dataclass(slots=True, eq=False)
 class _Window:
-    """One second of a stream, or more where it is slow."""
+    """Measurements of one second, or longer for a slow stream."""
 
     start: int
     messages: int = 0
@@ -83,18 +83,18 @@ class _Window:
 
     @property
     def mean(self) -> float:
-        """The mean interval [s], 0 without any."""
+        """Mean interval [s], 0 if there is none."""
         return sum(self.intervals) / len(self.intervals) if self.intervals else 0.0
 
     @property
     def deviation(self) -> float:
-        """The standard deviation of the intervals [s]."""
-        mean, intervals = self.mean, tuple(self.intervals)  # a copy: another thread may add to them
+        """Standard deviation of the intervals [s]."""
+        mean, intervals = self.mean, tuple(self.intervals)  # copied: another thread may add to them
         return math.sqrt(sum((each - mean) ** 2 for each in intervals) / len(intervals))
 
 
 class Histogram:
-    """Count measurements by size; `limits` are the largest of each bucket but the last, which has no limit."""
+    """Histogram of measurements; `limits` are the upper bounds of all buckets but the last, which is unbounded."""
 
     def __init__(self, limits: Sequence[float]) -> None:
         self.limits = tuple(limits)
@@ -108,36 +108,36 @@ class Histogram:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Number of measurements in each bucket, the one without a limit last."""
+        """Number of measurements in each bucket, the unbounded one last."""
         return tuple(self._counts)
 
 
 class StreamHealth:
-    """Follow one stream, message by message, in a fixed amount of memory.
+    """Measure one stream, message by message, in constant memory.
 
-    All times are of one clock, which the caller chooses: `time.monotonic_ns` unless it gives another.
+    All times are from one clock that the caller chooses; the default is `time.monotonic_ns`.
     """
 
     def __init__(self, topic: str) -> None:
         self._topic = get_topic(topic)
         self._is_position = BY_TOPIC.get(topic) is DEFAULT  # the message that has flags and reset counters
-        self._messages = self._lost = self._gaps = self._disorders = self._reboots = 0
+        self._messages = self._lost = self._gaps = self._out_of_order = self._reboots = 0
         self._received: int | None = None
         self._time: int | None = None
-        self._usual = 0.0  # us between two messages
+        self._usual_step = 0.0  # us between two messages
         self._usual_rate: float | None = None
         self._steps = 0
-        self._ever = dict.fromkeys(DOUBT_FLAGS, 0)
+        self._flag_counts = dict.fromkeys(DOUBT_FLAGS, 0)
         self._counters: tuple[int, ...] = ()
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
-        self.latencies = Histogram(_LATENCIES)
+        self.latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
 
     def add(
         self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
     ) -> None:
-        """Add a valid message, or the fields of one by name, that was received at this time [ns]."""
-        names = _NAMES if self._is_position else _NAMES[:1]
+        """Add a valid message, or its fields by name, received at time `received` [ns]."""
+        names = _FIELDS if self._is_position else _FIELDS[:1]
         if isinstance(message, Mapping):
             timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
         else:
@@ -153,9 +153,9 @@ class StreamHealth:
         self._received = received
         rebooted, counters = self._add_time(int(timestamp)), tuple(seen[len(DOUBT_FLAGS) :])
         if counters != self._counters:
-            if self._counters and not rebooted:  # after a reboot they begin anew
+            if self._counters and not rebooted:  # a reboot restarts the counters
                 for quantity, before, after in zip(self._resets, self._counters, counters, strict=True):
-                    self._resets[quantity] += (after - before) % _COUNTER
+                    self._resets[quantity] += (after - before) % _COUNTER_MODULUS
             self._counters = counters
         if latency is not None:
             window.latencies.append(latency)
@@ -163,10 +163,10 @@ class StreamHealth:
         for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
             if is_set:
                 window.flags[flag] += 1
-                self._ever[flag] += 1
+                self._flag_counts[flag] += 1
 
     def snapshot(self, now: int | None = None) -> Health:
-        """Return the health at this time [ns]."""
+        """Return the health at time `now` [ns]."""
         now = time.monotonic_ns() if now is None else now
         age = None if self._received is None else (now - self._received) / 1e9
         window = self._last_window if self._last_window.messages else self._window
@@ -182,55 +182,55 @@ class StreamHealth:
             messages=self._messages,
             lost=self._lost,
             gaps=self._gaps,
-            out_of_order=self._disorders,
+            out_of_order=self._out_of_order,
             reboots=self._reboots,
             flags=_shares(window.flags, window.messages) if self._is_position else None,
-            flags_ever=_shares(self._ever, self._messages) if self._is_position else None,
+            flags_ever=_shares(self._flag_counts, self._messages) if self._is_position else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
         )
 
     def _end_window(self, received: int) -> None:
-        """Begin the next window; a burst, such as what was recovered, counts little in the usual rate."""
+        """Start the next window; the usual rate is capped against bursts, such as recovered messages."""
         window, self._window = self._window, _Window(received)
         if window.messages:
             self._last_window = window
         if (mean := window.mean) > 0:
             rate = 1 / mean
             usual = self._usual_rate or rate
-            self._usual_rate = usual + _WEIGHT * (min(rate, 2 * usual) - usual)
+            self._usual_rate = usual + _SMOOTHING * (min(rate, 2 * usual) - usual)
 
     def _add_time(self, timestamp: int) -> bool:
-        """Follow PX4's time; return whether it went back, as after a reboot."""
+        """Track PX4's time; return True if it is the first one or stepped back in a reboot."""
         step = None if self._time is None else timestamp - self._time
-        if step is None or step < -_REBOOT:
+        if step is None or step < -_REBOOT_STEP:
             self._reboots += step is not None
             self._time, self._steps = timestamp, 0
             return True
         if step < 0:
-            self._disorders += 1
+            self._out_of_order += 1
             return False
         self._time = timestamp
-        if self._steps >= _SETTLED and step > _GAP * self._usual:
+        if self._steps >= _MIN_STEPS and step > _GAP_FACTOR * self._usual_step:
             self._gaps += not self._topic.on_change
         else:
             self._steps += 1
-            self._usual += max(_WEIGHT, 1 / self._steps) * (step - self._usual)
+            self._usual_step += max(_SMOOTHING, 1 / self._steps) * (step - self._usual_step)
         return False
 
 
 class Monitor:
-    """Follow all streams of a subscription, at most 4096: then the one that was silent for longest is forgotten.
+    """Measure all streams of a subscription, at most 4096; beyond, the least recently updated one is evicted.
 
-    The first sample of each address does not count: it may be the last value that a subscription starts with.
+    The first sample of each address does not count: it may be a last value sent on subscribing.
     """
 
     def __init__(self) -> None:
-        self._streams: dict[Address, StreamHealth | None] = {}  # the one that was silent for longest comes first
+        self._streams: dict[Address, StreamHealth | None] = {}  # least recently updated first
 
     def add(self, sample: Sample[Message], *, received: int | None = None) -> bool:
-        """Add a sample that was received just now, or at this time [ns] of another clock; return whether it counts."""
+        """Add a sample received now, or at `received` [ns] of another clock; return True if it counts."""
         address = sample.address
         known = address in self._streams
         stream = self._streams.pop(address, None)
@@ -244,17 +244,17 @@ class Monitor:
         return known
 
     def snapshot(self, now: int | None = None) -> dict[Address, Health]:
-        """Return the health of each stream, sorted by address, now or at this time [ns] of the other clock."""
+        """Return the health of each stream, sorted by address, now or at `now` [ns] of the other clock."""
         streams = sorted(self._streams.items(), key=itemgetter(0))
         return {address: stream.snapshot(now) for address, stream in streams if stream is not None}
 
     def latencies(self, address: Address) -> Histogram | None:
-        """Return the latencies of a stream since the start [s]."""
+        """Return the latency histogram of a stream since the start [s]; None for an unknown stream."""
         stream = self._streams.get(address)
         return stream.latencies if stream is not None else None
 
     def forget(self, address: Address) -> None:
-        """Forget a stream; it is followed anew if it comes back."""
+        """Remove a stream; it starts over if it comes back."""
         self._streams.pop(address, None)
 
 

@@ -1,4 +1,4 @@
-"""The state of a stream: ok, slow, stale, gone or disconnected, each with its reason; no I/O."""
+"""Stream state: ok, slow, stale, gone or disconnected, with the reason; no I/O."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from nedbus_msgs import Message, describe_flags
 
 from .stream_health import Health, StreamHealth
 
-StateName = Literal["disconnected", "gone", "stale", "slow", "ok"]  # the worst first
+StateName = Literal["disconnected", "gone", "stale", "slow", "ok"]  # worst first
 
-_LATE: Final = 1.0  # s of latency from which on a stream is slow
-_SLOW: Final = 0.5  # of the usual rate, below which a stream is slow
-_ABSENT: Final = 1.0  # s without a message after which a stream without a liveliness token is gone
+_LATE: Final = 1.0  # s; a higher latency makes a stream slow
+_SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
+_ABSENT: Final = 1.0  # s without a message until a stream without a liveliness token is gone
 
 
 @dataclass(frozen=True, slots=True)
 class StreamState:
-    """The state of a stream now, and the reason unless it is ok."""
+    """Current state of a stream, with a reason unless it is ok."""
 
     name: StateName
     reason: str = ""
 
     @property
     def severity(self) -> int:
-        """Its place among the states, the worst first."""
+        """Index among the states; 0 is the worst."""
         return get_args(StateName).index(self.name)
 
     def __str__(self) -> str:
@@ -36,10 +36,10 @@ class StreamState:
 
 
 def stream_state(health: Health, *, alive: bool | None = None, connected: bool = True) -> StreamState:
-    """Return the state of a stream with this health.
+    """Return the state of a stream with the given health.
 
-    `alive`: whether its publisher's liveliness token is there; None if that is not known.
-    `connected`: whether there is a link to the router.
+    `alive`: True if the publisher's liveliness token is present; None if unknown.
+    `connected`: True if there is a link to the router.
     """
     if not connected:
         return StreamState("disconnected", "no link")
@@ -58,7 +58,7 @@ def stream_state(health: Health, *, alive: bool | None = None, connected: bool =
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
-    """Return the faults of a stream: its state, its flags, and its gaps, order and reboots; "ok" without any."""
+    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
     doubts = describe_flags(health.flags) if health.flags else "ok"
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
     events = [f"{count} {name}" for count, name in counts if count]
@@ -66,7 +66,7 @@ def describe_stream(health: Health, state: StreamState) -> str:
 
 
 def health_of_last(sample: Sample[Message]) -> Health:
-    """Return the health of a stream of which only the last message is known; its age is of the wall clock."""
+    """Return the health of a stream with only its last message known; the age is by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0)
     return stream.snapshot(0 if sample.sent is None else max(0, time.time_ns() - sample.sent))

@@ -1,1 +1,1 @@
-"""The sending side of a session: publishers, their flow control, heartbeats and downsampling, answers to queries."""
+"""The sending side of a session: publishers with flow control, heartbeats and downsampling, replies to queries."""

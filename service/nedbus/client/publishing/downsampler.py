@@ -1,7 +1,7 @@
-"""Downsampled copies of a stream, one for each of RATES, while readers with a maximum rate subscribe to it.
+"""Downsampled copies of a stream, one for each of RATES, published while they have subscribers.
 
-`<key>/@rate/5` has at most 5 messages a second of `<key>`, with sequence numbers and a cache of its own.
-A vehicle that never had such readers costs one declaration; a stream declares more once that one is matched.
+`<key>/@rate/5` carries up to 5 messages per second of `<key>`, with its own sequence numbers and history cache.
+A vehicle without such subscribers costs one declaration; each stream declares more once that one is matched.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from nedbus_msgs import ANY, Address, get_topic
 
 from .writer import Heartbeats, Writer, priority_of
 
-_CACHE: Final = 20  # s of messages that are kept for readers that missed some
-_LINGER: Final = 60_000_000_000  # ns in which readers may come back, and recover missed messages
+_CACHE: Final = 20  # s of messages in the history cache
+_LINGER: Final = 60_000_000_000  # ns that an unmatched writer is kept for readers that reconnect and recover messages
 
 
 class MatchingListener:
-    """Follow the presence of subscribers of a key expression, with a publisher that publishes nothing. Thread-safe."""
+    """Matching status of a key expression, from a publisher that never publishes. Thread-safe."""
 
     def __init__(self, session: Session, key_expr: str) -> None:
         channel: zenoh.handlers.RingChannel[zenoh.MatchingStatus] = zenoh.handlers.RingChannel(1)
         with while_open():
             self._probe = session.declare_publisher(key_expr)
-            self._listener = self._probe.declare_matching_listener(channel)  # begins with how it is now
+            self._listener = self._probe.declare_matching_listener(channel)  # reports the current status first
         self._matched = False
-        self._lock = threading.Lock()  # all publishers of a vehicle share one
+        self._lock = threading.Lock()  # all publishers of a vehicle share one listener
         self._take = self._listener.handler.try_recv
 
     def is_matched(self) -> bool:
-        """Return whether there are subscribers, as far as Zenoh has reported."""
+        """Return True if there are subscribers, by the latest report of Zenoh."""
         with self._lock:
             try:
                 if (status := self._take()) is not None:
@@ -47,14 +47,17 @@ class MatchingListener:
             return self._matched
 
     def close(self) -> None:
-        """Stop following it."""
-        with suppress(zenoh.ZError):  # closed already with the session
+        """Undeclare the listener and its publisher."""
+        with suppress(zenoh.ZError):  # the session is already closed
             self._listener.undeclare()
             self._probe.undeclare()
 
 
 class Downsampler:
-    """Publish one address at lower rates, from one thread; `vehicle` follows all downsampled streams of its vehicle."""
+    """Publisher of the downsampled copies of one address, for one thread.
+
+    `vehicle`: the listener of all downsampled streams of its vehicle.
+    """
 
     def __init__(self, heartbeats: Heartbeats, address: Address, *, prefix: str, vehicle: MatchingListener) -> None:
         self.vehicle, self._heartbeats = vehicle, heartbeats
@@ -64,12 +67,12 @@ class Downsampler:
         self._streams: list[_Stream] = []
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str) -> None:
-        """Publish a message at the rates that are matched and for which it is due; this never waits for a reader."""
+        """Publish a message at all matched rates for which it is due; never waits for a reader."""
         if self._any_rate is None:
             if not self.vehicle.is_matched():
                 return
             self._any_rate = MatchingListener(self._heartbeats.session, self._key(ANY))
-        now = time.monotonic_ns()  # not the message's time: a replay at ten times the speed would fill a link
+        now = time.monotonic_ns()  # not the message's timestamp: a replay at 10 times the speed would exceed the rate
         is_matched = self._any_rate.is_matched()
         if is_matched and not self._streams:
             self._streams = [_Stream(self._heartbeats, self._key(rate), rate, self._priority) for rate in RATES]
@@ -78,7 +81,7 @@ class Downsampler:
                 stream.put(now, payload, stamp, encoding)
 
     def close(self) -> None:
-        """Withdraw all that is declared."""
+        """Undeclare all streams and listeners."""
         for stream in self._streams:
             stream.close()
         if self._any_rate is not None:
@@ -86,7 +89,7 @@ class Downsampler:
 
 
 class _Stream:
-    """The stream of one rate; it has a writer while it is matched, and for a minute after."""
+    """The stream of one rate; its writer exists while it is matched, and for another minute."""
 
     def __init__(self, heartbeats: Heartbeats, key: str, rate: int, priority: zenoh.Priority) -> None:
         self.writer: Writer | None = None
@@ -104,7 +107,7 @@ class _Stream:
             self.writer.close()
             self.writer = None
         if self.writer is not None and self._gate.passes(now):
-            self.writer.put(payload, stamp, encoding)  # without a subscriber this only fills the cache
+            self.writer.put(payload, stamp, encoding)  # if unmatched, this only fills the history cache
 
     def close(self) -> None:
         if self.writer is not None:

@@ -1,4 +1,4 @@
-"""A publisher of one address: validate, encode, put."""
+"""The publisher of one address: validate, encode, put."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 
     from .publisher_registry import PublisherRegistry
 
-FLUSH_TIMEOUT: Final = 600.0  # s that readers have to receive the messages sent to them
+FLUSH_TIMEOUT: Final = 600.0  # s for readers to receive all published messages
 
 
 class Publisher:
-    """Publish the messages of one address; get one from `bus.publisher(...)`.
+    """Publishes the messages of one address; get one from `bus.publisher(...)`.
 
-    Messages are kept for about 20 s for readers that missed some, and the last one for readers that ask.
-    `publish` never waits for a slow reader, unless the publisher is lossless: it then waits while a reader of mode
-    "every" has more than 2,000 messages to read, but sends 10 a second to all others.
-    Usable from one thread at a time; as a context manager it closes itself.
+    A history cache keeps about 20 s of messages for readers that missed some, and the last message for queries.
+    `publish` never waits for slow readers, unless the publisher is lossless: it then waits while a reader of mode
+    "every" has more than 2,000 unread messages, and sends 10 messages per second meanwhile.
+    Not thread-safe. A context manager.
     """
 
     def __init__(
@@ -53,12 +53,12 @@ class Publisher:
         self.last: tuple[bytes, zenoh.Timestamp, str] | None = None
         self._new_timestamp = heartbeats.session.new_timestamp
         self._on_close = partial(registry.forget, address)
-        self._owner = owner  # keeps the bus open as long as a script may publish
+        self._owner = owner  # keeps the bus open
         self.definition = definition
         self._codec = codec_of(definition)
         self._all = definition.all_fields
         self._encoding = encoding_of(definition, source)
-        self._partial: tuple[Set[str], str] = self._all, self._encoding  # the fields of messages, and their encoding
+        self._partial: tuple[Set[str], str] = self._all, self._encoding  # fields of the last message with missing ones
         topic = get_topic(address.topic)
         with while_open():
             self._token = heartbeats.session.liveliness().declare_token(address.alive_key(prefix=prefix))
@@ -69,52 +69,46 @@ class Publisher:
 
     @property
     def published(self) -> int:
-        """Messages published so far."""
+        """The number of messages published."""
         return self._writer.published
 
     def publish(self, message: Message | Mapping[str, object]) -> None:
-        """Validate a message, or the fields of one by name, and publish it.
+        """Publish a message, or validate a dict of fields and publish them as a message.
 
-        A message that exists was validated when it was made; it is not validated again.
-        Readers see which fields it was made without: `sample.missing`.
+        A Message was validated when it was created, and is not validated again.
+        Readers see the fields that were not provided in `sample.missing`.
 
-        Raises InvalidMessageError for invalid fields, EncodeError for a message whose validation was bypassed,
-        ClosedError once the publisher or its bus is closed.
+        Raises TypeError for another type of message, InvalidMessageError for invalid fields, EncodeError for a message
+        that bypassed validation, ClosedError once the publisher or its bus is closed.
         """
-        if isinstance(message, Message):
-            if not isinstance(message, self.definition.model):
-                raise TypeError(f"{self.address} carries {self.definition.name}, not {type(message).__name__}")
+        if isinstance(message, self.definition.model):
             self._put(self._codec.encode(message), message.__pydantic_fields_set__)
+        elif isinstance(message, (dict, Mapping)):  # dict first, which is faster
+            self._put(self._codec.encode_fields(message), message.keys())
         else:
-            try:
-                payload = self._codec.encode_fields(message)
-            except (TypeError, ValueError):
-                if isinstance(message, Mapping):
-                    raise
-                reason = f"expected a {self.definition.name}, or a dict of its fields, not {type(message).__name__}"
-                raise TypeError(reason) from None
-            self._put(payload, message.keys())
+            name, given = self.definition.name, type(message).__name__
+            raise TypeError(f"{self.address} carries {name}: publish one, or a dict of its fields, not {given}")
 
     def publish_row(self, values: Sequence[object] | Message) -> None:
-        """Validate the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples, and publish them.
+        """Validate and publish the values of all fields in PX4's order, `delta_xy` and `delta_vxy` as tuples.
 
-        The same as `publish` with these fields, and faster: no message is made of them.
+        Equivalent to `publish` with these fields, but faster, as no message object is created. Raises the same errors.
         """
         self._put(self._codec.encode_row(cast("Sequence[object]", values)), self._all)
 
     def publish_many(self, messages: MessageArray) -> None:
-        """Validate all messages in a structured array of shape (n,) and dtype DTYPE, then publish them in order.
+        """Validate a structured array of shape (n,) and dtype DTYPE, then publish its messages in order.
 
-        None is published if one is invalid. Where the bus is closed meanwhile, `published` is their number.
+        Nothing is published if any message is invalid. If the bus is closed meanwhile, `published` has the number sent.
 
-        Raises TypeError for another dtype, InvalidMessageError for the first message that is invalid, with its `index`,
+        Raises TypeError for another dtype, InvalidMessageError for the first invalid message, with its `index`,
         ClosedError once the publisher or its bus is closed.
         """
         from nedbus_msgs.arrays import arrays_of
 
         arrays, size = arrays_of(self.definition), self._codec.size
         if getattr(messages, "dtype", None) != arrays.dtype:
-            hint = "nedbus.to_array makes it of messages, and astype of an array with its fields"
+            hint = "convert messages with nedbus.to_array, or an array with the same fields with astype"
             raise TypeError(f"{self.address} needs an array with the dtype of {self.definition.name}: {hint}")
         arrays.require_valid(messages)
         payloads = arrays.encode(messages)
@@ -122,19 +116,19 @@ class Publisher:
             self._put(payloads[start : start + size], self._all)
 
     def flush(self, timeout: float = FLUSH_TIMEOUT) -> bool:
-        """Wait until all readers of mode "every" have all messages; return False if one has not in time.
+        """Wait until all readers of mode "every" have received all messages; return False on timeout.
 
-        Messages in transit to a slow reader when a publisher's process ends are lost, and not counted anywhere.
-        A reader that was disconnected learns the number of missed messages, and recovers those still kept.
+        Without it, messages in transit to a slow reader when the process ends are lost, and not counted as lost.
+        A disconnected reader detects the messages it missed, and recovers those still in the history cache.
 
         Raises ClosedError once the bus is closed.
         """
         return self._flow_control.wait(self.published, timeout=timeout)
 
     def close(self) -> None:
-        """Stop publishing this address: it is no longer listed, and free for another publisher.
+        """Withdraw the address and free it for another publisher. Idempotent.
 
-        A lossless publisher flushes before.
+        A lossless publisher is flushed first.
         """
         if self._writer.closed:
             return
@@ -144,7 +138,7 @@ class Publisher:
         self._writer.close()
         self._on_close()
         self._downsampler.close()
-        with suppress(zenoh.ZError):  # closed already with the session
+        with suppress(zenoh.ZError):  # the session is already closed
             self._token.undeclare()
 
     def __enter__(self) -> Self:
@@ -154,11 +148,11 @@ class Publisher:
         self.close()
 
     def _put(self, payload: bytes, provided: Set[str]) -> None:
-        """Put the payload of a message that was made with these fields."""
+        """Put the payload of a message; `provided` are the names of its fields that were provided."""
         require_unforked()
         encoding, is_whole = self._encoding, len(provided) == len(self._all)
         if not is_whole:
-            if provided != self._partial[0]:  # almost always the same fields are missing
+            if provided != self._partial[0]:  # rare: usually the same fields are missing
                 self._partial = frozenset(provided), encoding_of(self.definition, self.source, frozenset(provided))
             encoding = self._partial[1]
         try:

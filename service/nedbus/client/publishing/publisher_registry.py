@@ -1,4 +1,4 @@
-"""All publishers of a session by address, with answers to queries for their last messages and schemas."""
+"""The publishers of a session, by address, and the replies to queries for their last messages and schemas."""
 
 from __future__ import annotations
 
@@ -28,15 +28,14 @@ from .writer import Heartbeats
 
 _log = logging.getLogger(__name__)
 
-_TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to list its publishers; it takes milliseconds
-_FLUSH_POLL: Final = 2.0  # s until readers are asked again; three round trips over a radio link fit in
+_TOKENS_TIMEOUT: Final = 2.0  # s for a slow router to reply with its tokens; usually milliseconds
+_FLUSH_POLL: Final = 2.0  # s between acknowledgement requests: time for three round trips over a radio link
 
 
 class PublisherRegistry:
-    """Make the publishers of a session, at most one for each address, and answer queries for their last messages.
+    """Creates the publishers of a session, one per address, and replies to queries for their last messages.
 
-    `housekeeping` sends their heartbeats. `is_client`: the session is that of a client, whose readers are behind its
-    router.
+    `housekeeping` sends their heartbeats. `is_client`: the session is a client, and reaches readers through a router.
     """
 
     def __init__(
@@ -46,13 +45,13 @@ class PublisherRegistry:
         self.heartbeats, self.window = Heartbeats(session), SharedWindow()
         self._session, self._queries, self._housekeeping = session, queries, housekeeping
         self._publishers: dict[Address, Publisher] = {}
-        self._answered: set[str] = set()  # keys of schemas and of vehicles, whose queries are answered
-        self._matched: dict[str, MatchingListener] = {}  # by vehicle, for any downsampled stream of it
+        self._answered: set[str] = set()  # key expressions of schemas and of vehicles with a queryable
+        self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._lock = threading.Lock()
 
     @property
     def publishers(self) -> list[Publisher]:
-        """All publishers that are open."""
+        """All open publishers."""
         return list(self._publishers.values())
 
     def publisher(
@@ -64,13 +63,15 @@ class PublisherRegistry:
         source: str | None = None,
         owner: object = None,
     ) -> Publisher:
-        """Return a publisher for an address, which keeps its owner alive; raise AddressInUseError if there is one.
+        """Return a new publisher for an address; it keeps `owner` alive.
 
-        `definition` is needed for a topic whose message has no file: AddressError without.
+        `definition`: required for a topic that is not in BY_TOPIC.
+
+        Raises AddressInUseError if the address has a publisher, AddressError for an unknown topic.
         """
         definition = definition or BY_TOPIC.get(address.topic)
         if definition is None:
-            expected = f"one of {', '.join(BY_TOPIC)}: its message is not known here"
+            expected = f"a topic with a known message: {', '.join(BY_TOPIC)}"
             raise AddressError("topic", address.topic, expected)
         with self._lock:
             if address in self._publishers:
@@ -94,42 +95,43 @@ class PublisherRegistry:
         return publisher
 
     def is_published(self, address: Address) -> bool:
-        """Return whether this address has a publisher here."""
+        """Return True if this registry has a publisher for an address."""
         return address in self._publishers
 
     def reject(self, address: Address, report: Mapping[str, object]) -> None:
-        """Report the rejection of a message of this address; values that JSON cannot hold become text."""
+        """Publish a rejection report for an address; values that JSON cannot represent become text."""
         payload = to_json(report, inf_nan_mode="strings", fallback=repr)
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
     def is_alive(self, address: Address) -> bool:
-        """Return whether this address is published already, by this process or another."""
+        """Return True if an address is published, by this or another process."""
         return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_TOKENS_TIMEOUT))
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
-        """Return whether there is a subscriber for any of these addresses."""
+        """Return True if any of these addresses has a subscriber."""
         with ExitStack() as opened:
             keys = (address.key(prefix=self.prefix) for address in addresses)
             probes = [opened.enter_context(self._session.declare_publisher(key)) for key in keys]
-            # Zenoh's stubs call the status a bool; it is an object, always true.
+            # Zenoh's stubs declare the status as a bool, but it is an object, which is always true.
             return any(cast("zenoh.MatchingStatus", probe.matching_status).matching for probe in probes)
 
     def flush(self, publishers: Iterable[Publisher], *, stop: threading.Event | None = None) -> None:
-        """Wait until readers have all messages of these publishers, or `stop` is set; for 10 minutes at most."""
+        """Wait until readers have received all messages of these publishers, or `stop` is set; at most 10 minutes."""
         end = time.monotonic() + FLUSH_TIMEOUT
         for publisher in publishers:
             address, logged = publisher.address, False
             while not publisher.flush(_FLUSH_POLL):
                 if (stop and stop.is_set()) or time.monotonic() > end:
-                    _log.warning("%s: a reader does not have all of it", address, extra=about("slow-reader", address))
+                    text = "%s: a reader has not received all messages"
+                    _log.warning(text, address, extra=about("slow-reader", address))
                     return
                 if not logged:
                     _log.info("%s: waiting for a slow reader", address, extra=about("slow-reader", address))
                 logged = True
 
     def forget(self, address: Address) -> None:
-        """Free an address whose publisher is closed."""
+        """Free the address of a closed publisher."""
         with self._lock:
             self._publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self._publishers):
@@ -138,13 +140,13 @@ class PublisherRegistry:
     def _reply(self, vehicle: str, query: zenoh.Query) -> None:
         """Reply with the last messages of a vehicle."""
         for publisher in self.publishers:
-            is_asked = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
-            if is_asked and publisher.last is not None:
+            matches = publisher.address.vehicle == vehicle and query.key_expr.intersects(publisher.key)
+            if matches and publisher.last is not None:
                 payload, stamp, encoding = publisher.last
                 query.reply(publisher.key, payload, encoding=encoding, timestamp=stamp, attachment=LIVE)
 
 
 def _weakly(reply: Callable[[str, zenoh.Query], None], vehicle: str) -> Reply:
-    """Return a reply that does not keep the registry, its publishers and their bus alive."""
+    """Return a reply function with a weak reference, so that it does not keep the registry and its bus alive."""
     method = weakref.WeakMethod(reply)
     return lambda query: alive(vehicle, query) if (alive := method()) is not None else None

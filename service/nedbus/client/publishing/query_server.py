@@ -1,4 +1,4 @@
-"""Answers to Zenoh queries, from a thread of its own."""
+"""A server for Zenoh queries, with its own thread."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from nedbus.transport import Session, while_open
 
 _log = logging.getLogger(__name__)
 
-_MAX_PENDING: Final = 1000  # queries that wait for an answer, on each key expression; the oldest are not answered
-_MAX_TURN: Final = 64  # queries on one key expression until others have their turn
-_POLL: Final = 0.01  # s between two polls for queries
-_IDLE_POLL: Final = 0.05  # s, when none has come for a second
-_BUSY: Final = 1.0  # s
+_MAX_PENDING: Final = 1000  # queued queries per key expression; beyond that the oldest are dropped
+_MAX_TURN: Final = 64  # queries per key expression in one poll, so that others get their turn
+_POLL: Final = 0.01  # s between polls
+_IDLE_POLL: Final = 0.05  # s between polls without a query for _BUSY seconds
+_BUSY: Final = 1.0
 JSON: Final = "application/json"
 
 
 Reply = Callable[[zenoh.Query], object]
-"""Reply to a query; it must not refer to the owner of the server, which may be dropped without a close."""
+"""Replies to a query. It must not reference the owner of the server, which may be garbage-collected without a close."""
 
 
 class QueryServer:
-    """Answer queries on the key expressions of a session; its maker closes it before the session."""
+    """Replies to queries on key expressions of a session; close it before the session."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -37,7 +37,7 @@ class QueryServer:
         self._thread = Housekeeping(name="nedbus-queries")
 
     def answer(self, key_expr: str, reply: Reply) -> None:
-        """Call `reply` for each query on a key expression; raise ClosedError once it is closed."""
+        """Call `reply` for each query on a key expression; raise ClosedError if the session is closed."""
         channel: zenoh.handlers.RingChannel[zenoh.Query] = zenoh.handlers.RingChannel(_MAX_PENDING)
         with while_open():
             queryable = self._session.declare_queryable(key_expr, channel)
@@ -57,11 +57,11 @@ class QueryServer:
         self._thread.add(poll)
 
     def answer_json(self, key: str, content: Callable[[Callable[[str], str | None]], Mapping[str, object]]) -> None:
-        """Answer queries on a key with a JSON document, made for each; `content` gets its parameters by name."""
+        """Reply to queries on a key with JSON; `content` is called with a getter of the query's parameters."""
         self.answer(key, lambda query: query.reply(key, json.dumps(content(query.parameters.get)), encoding=JSON))
 
     def close(self) -> None:
-        """Stop answering."""
+        """Stop the thread and undeclare all queryables."""
         self._thread.close()
         for queryable in self._queryables:
             with suppress(zenoh.ZError):
@@ -69,11 +69,11 @@ class QueryServer:
 
 
 def _answer(query: zenoh.Query, reply: Reply) -> None:
-    key_expr = str(query.key_expr)  # a query that has ended does not tell it any more
+    key_expr = str(query.key_expr)  # not available after the query has ended
     try:
         with query:
             reply(query)
     except zenoh.ZError as exc:
-        _log.debug("a query on %s could not be answered: %s", key_expr, exc)
-    except Exception:  # noqa: BLE001 - a fault in one answer must not leave all others without
-        _log.exception("a query on %s is not answered", key_expr, extra=about("bug"))
+        _log.debug("%s: cannot reply to a query: %s", key_expr, exc)
+    except Exception:  # noqa: BLE001 - a fault in one reply must not end the server
+        _log.exception("%s: failed to reply to a query", key_expr, extra=about("bug"))

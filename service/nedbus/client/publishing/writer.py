@@ -1,4 +1,4 @@
-"""A writer: one advanced publisher of Zenoh's, with its history cache, its sequence numbers and its heartbeats."""
+"""Writers: advanced publishers of Zenoh with history cache, sequence numbers and heartbeats."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from nedbus.errors import ClosedError
 from nedbus.transport import Session, entity_name, heartbeat_key, heartbeat_payload, while_open
 from nedbus_msgs import Topic
 
-_PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and before those that follow it
-_POLL, _IDLE = 0.1, 0.5  # s between two polls: while messages are published, and otherwise
-_TURN: Final = 256  # heartbeats at once, as a job of housekeeping must not hold up the others
+_PAUSES: Final = (0.4, 0.5, 1.0, 2.0, 4.0)  # s of silence before the first heartbeat, and between the following ones
+_POLL, _IDLE = 0.1, 0.5  # s between polls: while messages are published, and otherwise
+_TURN: Final = 256  # heartbeats per call, so that other housekeeping jobs are not delayed
 HEARTBEAT: Final = _PAUSES[0] + _POLL
-"""Seconds after which a reader learns that it missed the newest message, of a stream that went on until then."""
+"""Maximum delay of the first heartbeat after the last message [s]; readers then detect that they missed it."""
 
 
 class Writer:
-    """Put payloads on one key; `cache` messages are kept for readers that missed some."""
+    """Puts payloads on one key, with a history cache of `cache` messages."""
 
     def __init__(
         self, heartbeats: Heartbeats, key: str, *, priority: Priority, cache: int, encoding: str | None = None
@@ -30,7 +30,7 @@ class Writer:
         self.session, self.key, self.priority, self.published = heartbeats.session, key, priority, 0
         self._heartbeats = heartbeats
         with while_open():
-            # Joined routers look up the way of each message anew, unless something is declared on its very key.
+            # Interconnected routers cache the route of a message only if something is declared on its exact key.
             self._token = self.session.liveliness().declare_token(key)
             self._publisher: zenoh.ext.AdvancedPublisher | None = zenoh.ext.declare_advanced_publisher(
                 self.session,
@@ -45,7 +45,7 @@ class Writer:
             heartbeats.add(self)
 
     def put(self, payload: bytes, stamp: zenoh.Timestamp, encoding: str | None = None) -> None:
-        """Put a payload, with an encoding in place of the writer's if one is given; never wait for a reader."""
+        """Put a payload without waiting for readers; `encoding` overrides that of the writer."""
         if self._publisher is None:
             raise ClosedError
         self._publisher.put(payload, timestamp=stamp, encoding=encoding)
@@ -53,47 +53,47 @@ class Writer:
 
     @property
     def closed(self) -> bool:
-        """True once nothing can be put any more."""
+        """True once the writer is closed."""
         return self._publisher is None
 
     def close(self) -> None:
-        """Withdraw the key and the cache; a second call does nothing."""
+        """Withdraw the key and the history cache. Idempotent."""
         self._heartbeats.remove(self)
-        # Dropped, as nothing else refers to it: undeclare() would wait for Zenoh while it holds the interpreter's lock.
+        # This drops the only reference: undeclare() would wait for Zenoh while holding the interpreter's lock.
         self._publisher = None
-        with suppress(zenoh.ZError):  # closed already with the session
+        with suppress(zenoh.ZError):  # the session is already closed
             self._token.undeclare()
 
 
 @dataclass(slots=True)
 class _Silence:
-    """The silence of a writer since its last message, of the number `published`; it begins with the first."""
+    """The silence of a writer since message number `published`, the last one; none before the first message."""
 
     publisher: zenoh.Publisher
     published: int = 0
-    sent: int = 1  # heartbeats in this silence
-    due: float = math.inf  # s, the next one
+    sent: int = 1  # heartbeats during this silence
+    due: float = math.inf  # monotonic time of the next heartbeat [s]
 
 
 class Heartbeats:
-    """Send the heartbeats of all writers of a session; `send_due` is a job of its housekeeping."""
+    """Sends the heartbeats of all writers of a session; `send_due` is a housekeeping job."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
         self._silences: dict[Writer, _Silence] = {}
 
     def add(self, writer: Writer) -> None:
-        """Send heartbeats from the writer's first message on; they are declared, so that only readers cost one."""
+        """Send heartbeats of a writer, from its first message on; without readers they cost no traffic."""
         key, drop = heartbeat_key(writer.key, writer.name), zenoh.CongestionControl.DROP
         publisher = self.session.declare_publisher(key, congestion_control=drop, priority=writer.priority)
         self._silences[writer] = _Silence(publisher)
 
     def remove(self, writer: Writer) -> None:
-        """Send no more heartbeats of a writer, if it has any."""
+        """Stop the heartbeats of a writer. Idempotent."""
         self._silences.pop(writer, None)
 
     def send_due(self, now: float) -> float:
-        """Send the heartbeats that are due at this monotonic time [s]; return the seconds until the next call."""
+        """Send all heartbeats due at monotonic time `now` [s]; return the seconds until the next call."""
         pause, left = _IDLE, _TURN
         for writer, silence in tuple(self._silences.items()):
             if silence.published != writer.published:
@@ -109,5 +109,5 @@ class Heartbeats:
 
 
 def priority_of(topic: Topic) -> Priority:
-    """Return Zenoh's priority of the messages of a topic."""
+    """Return the Zenoh priority for messages of a topic."""
     return Priority.DATA_HIGH if topic.priority == "data_high" else Priority.DATA

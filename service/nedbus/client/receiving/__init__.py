@@ -1,4 +1,4 @@
-"""Receiving: from Zenoh's ring to the reader, with one account of what became of each message."""
+"""Receiving: from Zenoh's ring to the application, with every message accounted for."""
 
 from .decoder import Decoder
 from .layout_lookup import LayoutLookup

@@ -1,4 +1,4 @@
-"""A batch: what arrived as one NumPy array of messages, with the address, time and sequence number of each."""
+"""Batch: a NumPy array of messages with the address, time and sequence number of each."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ from .decoder import Arrival, Decoder
 
 @dataclass(eq=False)
 class Batch:
-    """Valid messages of one kind that arrived together, in that order; get one from `subscription.batches()`.
+    """Valid messages of one type, in order of arrival; `subscription.batches()` yields them.
 
-    `messages`: structured array of shape (n,), a column for each field: `messages["x"]`; `message`: what they are.
-    `addresses`: the addresses that occur; `address_index`: for each message, the index of its address among them.
-    `received`: when they were read here, ns since the epoch.
-    `lost`: messages that were lost in transit before these, all addresses together.
+    `messages`: structured array of shape (n,), one column per field: `messages["x"]`.
+    `message`: type of the messages.
+    `addresses`: distinct addresses. `address_index`: index into `addresses` for each message.
+    `received`: time of reading, ns since the epoch.
+    `lost`: messages lost in transit before these, over all addresses.
     """
 
     messages: MessageArray
@@ -46,29 +47,29 @@ class Batch:
 
     @cached_property
     def sent(self) -> npt.NDArray[np.int64]:
-        """When each was sent, ns since the epoch by its publisher's clock; 0 without a timestamp."""
+        """Time of sending of each message, ns since the epoch by the publisher's clock; 0 without a timestamp."""
         stamps = (raw.timestamp for _, _, raw, _ in self._arrivals)
         return np.array([stamp.get_time_as_ntp64().as_nanos() if stamp else 0 for stamp in stamps], np.int64)
 
     @cached_property
     def sequence(self) -> npt.NDArray[np.int64]:
-        """The sequence number of each, as its publisher counts; -1 without one."""
+        """Publisher's sequence number of each message; -1 without one."""
         infos = (raw.source_info for _, _, raw, _ in self._arrivals)
         return np.array([info.source_sn if info else -1 for info in infos], np.int64)
 
     @cached_property
     def provenances(self) -> list[Provenance]:
-        """The source of each, and the fields that it did not provide."""
+        """Provenance of each message: its source and the fields that the source did not provide."""
         return list(map(self._decoder.provenance, self._arrivals))
 
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
-    """Return the batch of what arrived; what is invalid is counted by the decoder, and left out."""
+    """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
     received = time.time_ns()
-    codec = decoder.resolve(arrivals[0][0])  # which waits for an answer that is on its way
+    codec = decoder.resolve(arrivals[0][0])  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
-    blank = bytes(codec_of(definition).size)  # in the place of another layout, invalid, so that it is decoded by itself
-    own = arrivals[0][0].size  # -1 while it is not known what these are
+    blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below
+    own = arrivals[0][0].size  # -1 while their type is unknown
     payloads = [payload if len(payload) == own else blank for _, payload, _, _ in arrivals]
     messages, valid = arrays_of(definition).decode(b"".join(payloads))
     if not valid.all():

@@ -1,4 +1,4 @@
-"""From Zenoh's samples to ours: the address of a key, the message of a payload, the provenance of an encoding."""
+"""Decoder: turns Zenoh samples into nedbus samples (key to address, payload to message, encoding to provenance)."""
 
 from __future__ import annotations
 
@@ -36,87 +36,87 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-MAX_KEYS: Final = 10_000  # that a reader remembers; no peer can make it remember more
-WAKE_UP: Final = "nedbus/wake-up"  # encoding of what a session sends to itself so that its reader looks again
-_MAX_WARNED: Final = 100  # keys whose invalid messages are logged
-_MAX_TEXT: Final = 300  # characters of a key, and of a reason, that are logged
+MAX_KEYS: Final = 10_000  # tracked per reader, a bound on memory that no peer can exceed
+WAKE_UP: Final = "nedbus/wake-up"  # encoding of a session-local sample that wakes a reader blocked on the ring
+_MAX_WARNED: Final = 100  # keys with a logged warning about invalid messages
+_MAX_TEXT: Final = 300  # logged characters of a key and of a reason
 
 
 @dataclass(slots=True, eq=False)
 class KeyState:
-    """State of a key: its address, codec and publishers, and the losses to be reported of it.
+    """State of a key: address, codec, writer proxies and losses not yet reported.
 
-    `key`: that of the stream at full rate; `heard`: that on which messages come, perhaps downsampled.
-    `codec`: that of its messages, None while nothing defines `message`; `size`: bytes of a payload of ours.
-    `writers`: its publishers, by name; `writer` is that of the last message.
-    `gap`: messages that were lost before the next one that is delivered. `unreported`: those lost before one that was
-    dropped or invalid; they are reported with the next sample that is read.
+    `key`: key of the full-rate stream. `wire_key`: key on which messages arrive, perhaps downsampled.
+    `codec`: None while the definition of `message` is unknown. `size`: payload size in bytes of the known layout.
+    `writers`: writer proxies by name. `writer`: the one of the last message.
+    `gap`: messages lost before the next delivery. `unreported`: messages lost before one that was dropped or invalid;
+    the next sample read reports them.
     """
 
     key: str
-    heard: str
+    wire_key: str
     address: Address
     codec: Codec[Any] | None = None
     size: int = -1
     message: str = ""
-    last: tuple[zenoh.Encoding | None, Provenance] = None, Provenance()  # in one piece: two threads look and change it
+    last: tuple[zenoh.Encoding | None, Provenance] = None, Provenance()  # one tuple, as two threads access it
     writers: dict[str, WriterProxy] = field(default_factory=dict)
     writer: WriterProxy | None = None
     gap: int = 0
     unreported: int = 0
 
-    def carry(self, codec: Codec[Any]) -> None:
-        """Note the codec of these messages."""
+    def set_codec(self, codec: Codec[Any]) -> None:
+        """Set the codec and the values derived from it."""
         self.codec, self.size, self.message = codec, codec.size, codec.definition.name
 
 
-class Kept(NamedTuple):
-    """The parts of a sample that waits for long: the sample itself keeps the buffer in which Zenoh received it."""
+class DetachedSample(NamedTuple):
+    """Metadata of a sample, detached from Zenoh's receive buffer, which a waiting sample would keep in memory."""
 
     timestamp: zenoh.Timestamp | None
     source_info: zenoh.SourceInfo | None
     provenance: Provenance
 
 
-Arrival = tuple[KeyState, bytes, RawSample | Kept, int]  # the last: number of messages lost before it
+Arrival = tuple[KeyState, bytes, RawSample | DetachedSample, int]  # the last item: messages lost before this one
 
 
 class Decoder:
-    """Decode what arrives, and count what is invalid; its reason is logged once for each of the first 100 keys."""
+    """Decode samples and count invalid ones; the reason is logged once per key, for the first 100 keys."""
 
     def __init__(self, layouts: LayoutLookup, *, prefix: str) -> None:
         self.invalid = 0
         self._layouts = layouts
         self._prefix = prefix
         self._streams: dict[str, KeyState] = {}
-        self._warned: set[int] = set()  # hashes of keys, which may be long
-        self._counting = threading.Lock()  # the receiving and the reading thread both reject
+        self._warned: set[int] = set()  # hashes, as keys may be long
+        self._counting = threading.Lock()  # guards `invalid` and `_warned`: receiving and reading threads reject
 
     def stream(self, key: str) -> KeyState:
-        """Return the state of a key; raise AddressError for one without an address."""
+        """Return the state of a key; raise AddressError if the key has no address."""
         stream = self._streams.get(key)
         if stream is None:
-            from_key = Address.from_rate_key if "/@" in key else Address.from_key  # only with a max_rate
+            from_key = Address.from_rate_key if "/@" in key else Address.from_key  # with max_rate only
             address = from_key(key, prefix=self._prefix)
             stream = KeyState(address.key(prefix=self._prefix), key, address)
             if address.topic in BY_TOPIC:
-                stream.carry(codec_of(BY_TOPIC[address.topic]))
+                stream.set_codec(codec_of(BY_TOPIC[address.topic]))
             if len(self._streams) < MAX_KEYS:
-                stream = self._streams.setdefault(key, stream)  # another thread may have met it meanwhile
+                stream = self._streams.setdefault(key, stream)  # another thread may have added it
         return stream
 
     def learn(self, batch: Iterable[RawSample]) -> None:
-        """Ask for unknown messages and layouts of these, and wait for the answer: not for a thread that receives."""
+        """Look up the unknown messages and layouts of a batch; blocks, so never call it on a receiving thread."""
         for raw in batch:
             with suppress(AddressError, DecodeError):
                 self._inspect(self.stream(str(raw.key_expr)), raw.payload.to_bytes(), raw)
         self._layouts.wait()
 
     def admit(self, batch: Iterable[RawSample]) -> list[Arrival]:
-        """Return arrivals to queue, with no losses so far; rejected ones without a payload, for their number.
+        """Return arrivals to queue, with 0 losses each; rejected ones keep their sequence number but lose the payload.
 
-        A payload of the size that `encode` writes is decoded when it is read; any other already here, as it must
-        neither displace a valid sample nor take up much memory.
+        A payload of the expected size is decoded when it is read. Any other size is checked here, so that it can
+        neither displace a valid sample nor use much memory.
         """
         admitted: list[Arrival] = []
         known = self._streams.get
@@ -140,34 +140,34 @@ class Decoder:
         return admitted
 
     @classmethod
-    def keep(cls, arrival: Arrival) -> Arrival:
-        """Return an arrival that takes up no more memory than it needs."""
+    def detach(cls, arrival: Arrival) -> Arrival:
+        """Return an arrival without a reference to Zenoh's receive buffer."""
         stream, payload, raw, lost = arrival
-        if isinstance(raw, Kept):
+        if isinstance(raw, DetachedSample):
             return arrival
-        return stream, payload, Kept(raw.timestamp, raw.source_info, cls.provenance(arrival)), lost
+        return stream, payload, DetachedSample(raw.timestamp, raw.source_info, cls.provenance(arrival)), lost
 
     @staticmethod
     def provenance(arrival: Arrival) -> Provenance:
         """Return the provenance of an arrival."""
         stream, _, raw, _ = arrival
-        if isinstance(raw, Kept):
+        if isinstance(raw, DetachedSample):
             return raw.provenance
         encoding = raw.encoding
         known, provenance = stream.last
-        if encoding != known and stream.codec:  # almost always it is the same: comparing is all that it costs
+        if encoding != known and stream.codec:  # rarely changes, so the last one is cached
             provenance = provenance_of(stream.codec.definition, str(encoding))
             stream.last = encoding, provenance
         return provenance
 
     def decode(self, arrival: Arrival, *, rows: bool, lost: int = 0) -> Sample[Any] | None:
-        """Return the sample of what arrived, with a Row as its message if `rows`; None if it is invalid."""
+        """Decode an arrival to a sample, with a Row as its message if `rows`; None if it is invalid."""
         stream, payload, raw, _ = arrival
         if not payload:
             return None
         codec = stream.codec or self.resolve(stream)
         if codec is None:
-            self.reject(stream.key, DecodeError("no publisher has described it", stream.message))
+            self.reject(stream.key, DecodeError("no publisher has described its layout", stream.message))
             return None
         decode = codec.decode_row if rows else codec.decode
         try:
@@ -181,25 +181,25 @@ class Decoder:
         return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
 
     def resolve(self, stream: KeyState) -> Codec[Any] | None:
-        """Return the codec of a stream whose message has no file here, None if no publisher describes it.
+        """Return the codec of a key, looked up if its message is unknown; None if no publisher describes the message.
 
-        A script that reads waits for an answer that is on its way, once; a thread that receives does not.
+        Waits once for a lookup in progress, so never call it on a receiving thread.
         """
         if stream.codec is None and stream.message:
             for _ in range(2):
                 with suppress(DecodeError):
-                    stream.carry(codec_of(self._layouts.definition(stream.message)))
+                    stream.set_codec(codec_of(self._layouts.definition(stream.message)))
                     break
                 self._layouts.wait()
         return stream.codec
 
     def count_invalid(self, count: int) -> None:
-        """Count invalid samples."""
+        """Add to the count of invalid samples."""
         with self._counting:
             self.invalid += count
 
     def reject(self, key: str, error: Exception) -> None:
-        """Count an invalid sample, and log why, once for each of the first 100 keys: a peer may have any number."""
+        """Count an invalid sample and log the reason once per key, for the first 100 keys only."""
         with self._counting:
             self.invalid += 1
             if len(self._warned) >= _MAX_WARNED or hash(key) in self._warned:
@@ -215,12 +215,12 @@ class Decoder:
         if len(payload) > PAYLOAD_LIMIT:
             raise DecodeError(f"{len(payload)} bytes, more than the {PAYLOAD_LIMIT} that a message can have")
         if raw.kind == zenoh.SampleKind.DELETE:
-            raise DecodeError("a delete, which no publisher of nedbus sends")
+            raise DecodeError("a delete sample, which nedbus publishers never send")
         if stream.codec is None:
             stream.message = message_name_of(str(raw.encoding)) or ""
             if not stream.message:
-                raise DecodeError(f"it does not name its message: its encoding is {str(raw.encoding)!r:.100}")
-            with suppress(DecodeError):  # it is decoded when it is read: by then it may be known
-                stream.carry(codec_of(self._layouts.definition(stream.message)))
+                raise DecodeError(f"unknown message type: the encoding {str(raw.encoding)!r:.100} names none")
+            with suppress(DecodeError):  # decoded on read; the lookup may be done by then
+                stream.set_codec(codec_of(self._layouts.definition(stream.message)))
         if len(payload) != stream.size and stream.codec:
             self._layouts.check(stream.codec, payload)

@@ -1,7 +1,7 @@
-"""The queue between receiving and the reader: every sample in order, or the newest of each key. No I/O.
+"""Pending queue between receiving and reading: every sample in order, or the newest per key; no I/O.
 
-A slow reader: `latest` supersedes what was not read yet; `every` keeps 65,536 samples, and drops the oldest beyond.
-Both are counted, and hold up no publisher and no other reader.
+If the reader is slow, mode `latest` replaces unread samples, and mode `every` queues 65,536 and then drops the oldest.
+Either way drops are counted, and no publisher or other reader is delayed.
 """
 
 from __future__ import annotations
@@ -30,20 +30,21 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 CAPACITY: Final = 65_536
-"""Samples that are kept for a reader of mode `every`, some 45 MB; beyond, the oldest are dropped."""
+"""Samples queued in mode `every`, about 45 MB; beyond, the oldest are dropped."""
 
 MAX_ACK_REQUESTS: Final = 1000
-"""Acknowledgement requests that wait for an answer; an honest publisher has one for each key at a time."""
+"""Pending acknowledgement requests; a well-behaved publisher has one per key."""
 
-_MAX_BATCH: Final = 4096  # messages of a batch
-_MAX_FRESH: Final = 1024  # samples that are queued with Zenoh's buffer; further ones are going to wait
+_MAX_BATCH: Final = 4096  # messages per batch
+_MAX_FRESH: Final = 1024  # samples queued along with Zenoh's receive buffer; later ones are detached from it
 
 
 @dataclass(slots=True, eq=False)
 class AckRequest:
-    """A publisher's request to acknowledge that message `number` has arrived or, with `read`, was read by the script.
+    """Request to acknowledge that message `number` has arrived or, with `read`, that the application has read it.
 
-    `reply` answers it, and is called once. `until`: the samples that must have been read, once the message has arrived.
+    `reply` answers it and is called once.
+    `read_target`: number of samples to be read before answering; None until the message has arrived.
     """
 
     key: str
@@ -51,13 +52,13 @@ class AckRequest:
     number: int
     read: bool
     reply: Callable[[], object]
-    until: int | None = None
+    read_target: int | None = None
 
 
 class PendingQueue:
-    """Queue what can be delivered, decode it when it is read, and count losses and drops; `name` is for the log.
+    """Queue delivered messages, decode them on read, and count losses and drops.
 
-    `on_gap` is called, in any thread, when something is missing that publishers may still have.
+    `name` appears in the log. `on_gap` is called, on any thread, when a new gap may be filled by retransmission.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class PendingQueue:
         self.ended = False
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
-        """Called, in any thread, when there may be something to read: an event loop wakes its reader with it."""
+        """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
         self._name = name
         self._warned = False
         self._decoder = decoder
@@ -79,7 +80,7 @@ class PendingQueue:
         self._newest: dict[str, Arrival] = {}
         self._reader = StatefulReader(decoder, recovers=not self.newest_only, clock=clock)
         self.account = self._reader.account
-        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest is not answered
+        self._ack_requests: deque[AckRequest] = deque(maxlen=MAX_ACK_REQUESTS)  # beyond, the oldest go unanswered
         self._arrived = self._dropped = self._received = 0
 
     @property
@@ -91,17 +92,17 @@ class PendingQueue:
 
     @property
     def waiting(self) -> int:
-        """Messages that wait to be read."""
+        """Number of unread messages."""
         return len(self._every) or len(self._newest)
 
     def count_invalid(self, count: int) -> None:
-        """Count samples that could not be queued."""
+        """Count samples that could not be queued as invalid."""
         self._decoder.count_invalid(count)
 
     def put(self, batch: Sequence[RawSample], *, overflowed: bool = False) -> None:
-        """Queue all that has arrived, in its order, wake the reader, and reject what is invalid.
+        """Queue a batch in order of arrival, reject invalid samples and wake the reader.
 
-        `overflowed`: it comes from a full ring, which perhaps dropped some: none of these are requested.
+        `overflowed`: the ring was full; gaps in this batch count as dropped and are not requested again.
         """
         arrivals = self._decoder.admit(batch)
         with self._lock:
@@ -120,24 +121,24 @@ class PendingQueue:
             self.acknowledge(drained=True)
 
     def on_link(self) -> None:
-        """Note that a link broke or came back."""
+        """Handle a link that broke or came back."""
         with self._lock:
             self._reader.on_link()
 
     def on_heartbeat(self, key: str, publisher: str, number: int) -> None:
-        """Note that a publisher has sent a message that should have arrived by now."""
+        """Handle a heartbeat: the publisher has sent `number`, which should have arrived by now."""
         with self._lock:
             self._reader.on_heartbeat(key, publisher, number)
 
     def next_request(self, writer: WriterProxy, now: float) -> range | None:
-        """Return the numbers to ask a publisher for now; None if nothing is due."""
+        """Return the numbers to request from a publisher now; None if no request is due."""
         with self._lock:
             return writer.next_request(now)
 
     def on_retransmission(
         self, writer: WriterProxy, found: Mapping[int, RawSample], *, ended: bool, now: float
     ) -> bool:
-        """Queue what was recovered, and what waited for it; return whether there is any."""
+        """Queue recovered messages and those held back behind them; return True if there are any."""
         arrivals = {number: arrival for number, raw in found.items() for arrival in self._decoder.admit([raw])}
         with self._lock:
             delivered = writer.on_retransmission(arrivals, ended=ended, now=now)
@@ -145,20 +146,20 @@ class PendingQueue:
         return bool(delivered)
 
     def give_up(self) -> None:
-        """Count all missing messages as lost."""
+        """Count all gaps as lost and queue the messages held back."""
         with self._lock:
             self._queue(self._reader.give_up(-1))
 
     def add(self, request: AckRequest, *, drained: bool) -> None:
-        """Answer a publisher's request as soon as it can be answered."""
+        """Add an acknowledgement request, to be answered as soon as possible."""
         with self._lock:
             self._ack_requests.append(request)
         self.acknowledge(drained=drained)
 
     def acknowledge(self, *, drained: bool) -> None:
-        """Answer the requests that can be answered now.
+        """Answer the acknowledgement requests that are ready.
 
-        `drained`: all that came before them is queued, so that an unknown publisher has sent nothing to this reader.
+        `drained`: the ring is empty, so an unknown publisher has sent nothing to this reader.
         """
         with self._lock:
             ready = [request for request in self._ack_requests if self._can_answer(request, drained=drained)]
@@ -168,33 +169,33 @@ class PendingQueue:
             request.reply()
 
     def end(self) -> None:
-        """Tell readers that nothing more comes, and publishers that there is no reader any more."""
+        """End the queue: readers get ClosedError, and all acknowledgement requests are answered."""
         self.ended = True
         self.acknowledge(drained=True)
         self.wake()
 
     def wake(self) -> None:
-        """Wake a thread that waits, or the one that waits next, and an event loop."""
+        """Wake one waiting thread, or the next one to wait, and the event loop."""
         if self._tokens.empty():
             self._tokens.put(None)
         if self.on_wake is not None:
             self.on_wake()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until there may be something to read, or the queue has ended; return False after `timeout` seconds."""
+        """Wait until a sample may be ready or the queue has ended; return False after `timeout` seconds."""
         if not (self.waiting or self.ended):
             try:
                 self._tokens.get(timeout=timeout)
             except queue.Empty:
                 return False
         if self.ended or self.waiting > 1:
-            self.wake()  # another thread that waits: of all that is put at once only one is woken
+            self.wake()  # pass it on: `put` wakes a single thread per batch
         return True
 
     def pop(self, *, rows: bool = False) -> Sample[Any] | None:
-        """Return the next sample, None when nothing is left; what is invalid is counted and left out."""
+        """Return the next sample, None if the queue is empty; invalid ones are counted and skipped."""
         while True:
-            with self._lock:  # several threads may take
+            with self._lock:  # several threads may read
                 if self._every:
                     arrival = self._every.popleft()
                 elif self._newest:
@@ -213,7 +214,7 @@ class PendingQueue:
             stream.unreported += lost
 
     def pop_batch(self) -> Batch | None:
-        """Return all messages of one kind that are queued, up to 4096, None if there are none; count the invalid."""
+        """Return the queued messages of one type, up to 4096, None if there are none; invalid ones are counted."""
         from .batch import make_batch
 
         while True:
@@ -233,7 +234,7 @@ class PendingQueue:
             taken[0][0].unreported += lost
 
     def _take_batch(self) -> list[Arrival]:
-        """Take the messages that are of the kind of the first one; the others still wait, in order."""
+        """Remove the messages of the same type as the first one; the rest stay queued in order."""
         every, newest = self._every, self._newest
         waiting = list(newest.values()) or [every.popleft() for _ in range(min(len(every), _MAX_BATCH))]
         taken = [arrival for arrival in waiting if arrival[0].message == waiting[0][0].message]
@@ -245,21 +246,21 @@ class PendingQueue:
         return taken
 
     def _can_answer(self, request: AckRequest, *, drained: bool) -> bool:
-        if request.until is None:
+        if request.read_target is None:
             has = self._reader.has(request.key, request.publisher, request.number)
-            if has or (has is None and drained and not self._reader.unsettled):
-                request.until = self._arrived if request.read else 0
-        return self.ended or (request.until is not None and self._arrived - self.waiting >= request.until)
+            if has or (has is None and drained and not self._reader.settling):
+                request.read_target = self._arrived if request.read else 0
+        return self.ended or (request.read_target is not None and self._arrived - self.waiting >= request.read_target)
 
     def _queue(self, arrivals: Sequence[Arrival]) -> None:
-        """Queue all; the oldest beyond the capacity are dropped, and those that are superseded."""
+        """Queue arrivals, dropping superseded ones and the oldest beyond the capacity."""
         self._arrived += len(arrivals)
         if self.newest_only:
             for arrival in arrivals:
                 self._supersede(arrival)
             return
         every = self._every
-        every.extend(map(self._decoder.keep, arrivals) if len(every) > _MAX_FRESH else arrivals)
+        every.extend(map(self._decoder.detach, arrivals) if len(every) > _MAX_FRESH else arrivals)
         while len(every) > CAPACITY:
             stream, _, _, lost = every.popleft()
             stream.unreported += lost

@@ -1,8 +1,8 @@
-"""Zenoh's side of a subscription: the advanced subscriber, its ring, and the threads that empty it.
+"""Receiver: the advanced subscriber, its ring buffer, and the threads that drain the ring.
 
-The ring lies in Rust: Zenoh never waits for it, so that no reader holds up its session or other readers.
-A reader that waits without a timeout empties it in its own thread. From the first wait with a timeout on, or in
-asyncio, the pump does, a thread of its own. While the reader does something else, housekeeping does.
+The ring lives in Rust and never blocks Zenoh, so a slow reader delays neither its session nor other readers.
+A reader that waits without a timeout drains the ring on its own thread. The first wait with a timeout, or from asyncio,
+starts a pump thread that takes over. While no reader waits, the housekeeping thread drains the ring.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from .retransmission import Retransmission
 _log = logging.getLogger(__name__)
 
 RING_CAPACITY: Final = 16_384
-"""Samples that may arrive until the next poll; more than 0.2 s of the largest fleet."""
+"""Samples that fit between two polls; more than 0.2 s of traffic of the largest fleet."""
 
-_POLL: Final = 0.1  # s between two polls of the ring by housekeeping, and of heartbeats
-_ACK_POLL: Final = 0.005  # s between them while publishers request acknowledgements,
-_ACK_POLL_AFTER: Final = 1.0  # s from the last such request on
-_MIN_BUSY_BATCH: Final = 64  # samples at once after which a pause pays: the next wait then takes many
+_POLL: Final = 0.1  # s between polls by housekeeping
+_ACK_POLL: Final = 0.005  # s between polls while publishers request acknowledgements
+_ACK_POLL_AFTER: Final = 1.0  # s after the last such request until polling slows down again
+_MIN_BUSY_BATCH: Final = 64  # samples; after such a batch a short pause makes the next one larger and cheaper
 _BUSY_PAUSE: Final = 0.001  # s
-_JOIN_TIMEOUT: Final = 3.0  # s that a busy machine has to end a thread
+_JOIN_TIMEOUT: Final = 3.0  # s, enough for a busy machine
 _T = TypeVar("_T")
 
 
 class Receiver:
-    """Declare an advanced subscriber, and put what it receives into a PendingQueue until it is closed.
+    """Declare an advanced subscriber and put its samples into a PendingQueue until closed.
 
-    A subscriber of mode `every` requests retransmissions of publishers, and acknowledges their messages on request.
-    With `history` it begins with the last message of each publisher.
+    In mode `every` it also requests retransmissions and answers acknowledgement requests.
+    With `history` the first samples are the last message of each publisher.
     """
 
     def __init__(
@@ -62,28 +62,28 @@ class Receiver:
         self._name = key_expr
         self._changing = threading.Lock()
         self._closed = False
-        self._receiving = threading.RLock()  # its holder empties the ring; a reader may keep it by a Ctrl-C
-        self._idle = False  # its holder waits for the ring, in which nothing is left
+        self._receiving = threading.RLock()  # held by the thread that drains the ring; a Ctrl-C may leave it held
+        self._idle = False  # the holder is blocked on an empty ring
         self._busy = False
         self._pump: threading.Thread | None = None
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(RING_CAPACITY)
-        # No late-publisher detection: after a router's restart it would ask for what retransmission asks for.
+        # No late-publisher detection: after a router restart it would duplicate our retransmission requests.
         last = zenoh.ext.HistoryConfig(max_samples=1) if history else None
         with while_open():
             subscriber = zenoh.ext.declare_advanced_subscriber(session, key_expr, ring, history=last)
-        # Receiving on the handler: a receive on the subscriber would keep it from being undeclared.
+        # Receive on the handler: a blocking receive on the subscriber prevents undeclaring it.
         self._handler: zenoh.Handler[zenoh.Sample] = subscriber.handler
         self._undeclares: list[Callable[[], object]] = [subscriber.undeclare]
-        self._take_query: Callable[[], zenoh.Query | None] | None = None  # these three in mode `every`
+        self._take_query: Callable[[], zenoh.Query | None] | None = None  # this and the next two: mode `every` only
         self._take_link: Callable[[], zenoh.TransportEvent | None] | None = None
         self._retransmission: Retransmission | None = None
         self._ack_poll_until = 0.0
         if not pending_queue.newest_only:
             self._declare_every(housekeeping)
-        self._end_job = housekeeping.add(self._keep_house)
+        self._end_job = housekeeping.add(self._poll)
 
     def receive(self) -> bool:
-        """Queue what has arrived by now; return False, at once, if another thread does so already."""
+        """Drain the ring into the queue; return False at once if another thread is receiving."""
         if not self._receiving.acquire(blocking=False):
             return False
         try:
@@ -94,13 +94,13 @@ class Receiver:
         return True
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until there may be something in the queue; return False after `timeout` seconds."""
+        """Wait until the queue may have a sample; return False after `timeout` seconds."""
         if timeout is not None or self._pump is not None:
             self.pump()
             return self._queue.wait(timeout)
         if self._busy:
             time.sleep(_BUSY_PAUSE)
-        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # housekeeping has it for less
+        if not self._receiving.acquire(timeout=_BUSY_PAUSE):  # housekeeping holds it for less
             return self._queue.wait(None)
         try:
             self._receive(if_empty=True)
@@ -109,7 +109,7 @@ class Receiver:
         return True
 
     def pump(self) -> None:
-        """Let a thread empty the ring from now on."""
+        """Start the pump thread, which drains the ring from now on; a second call does nothing."""
         with self._changing:
             if self._pump is None and not self._closed:
                 self._pump = threading.Thread(target=self._run, name="nedbus-pump", daemon=True)
@@ -127,11 +127,11 @@ class Receiver:
             self._retransmission.close()
         self._queue.give_up()
         for undeclare in self._undeclares:
-            with suppress(zenoh.ZError):  # closed already with the session
+            with suppress(zenoh.ZError):  # the session is already closed
                 undeclare()
-        if self._pump is not None:  # one that is inside Zenoh when the interpreter ends aborts the process
+        if self._pump is not None:  # a thread still in Zenoh at interpreter exit aborts the process
             self._pump.join(_JOIN_TIMEOUT)
-        if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # nor may a reader be
+        if self._receiving.acquire(timeout=_JOIN_TIMEOUT):  # a reader may be in Zenoh as well
             self._receiving.release()
 
     def _declare_every(self, housekeeping: Housekeeping) -> None:
@@ -153,15 +153,15 @@ class Receiver:
                 with self._receiving:
                     self._receive()
         except BaseException:
-            _log.exception("%s: the subscription ends after an unexpected error", self._name, extra=about("error"))
+            _log.exception("%s: unexpected error, subscription ended", self._name, extra=about("error"))
             raise
         finally:
-            self._queue.end()  # a reader must not wait for a pump that has ended
+            self._queue.end()  # readers must not wait for a dead pump
 
     def _receive(self, *, if_empty: bool = False) -> None:
-        """Wait for a sample, and queue all that have arrived; the queue ends with the subscriber.
+        """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
 
-        `if_empty`: return at once if there is something in the queue already; later `_wake` ends the wait.
+        With `if_empty`, return at once if the queue already has a sample; if one is added later, `_wake` ends the wait.
         """
         handler = self._handler
         self._idle = True
@@ -187,28 +187,28 @@ class Receiver:
         self._take_events()
         try:
             self._queue.put(batch, overflowed=len(batch) >= RING_CAPACITY)
-        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
+        except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
             extra = about("bug")
-            _log.exception("%s: %d samples are left out after an unexpected error", self._name, len(batch), extra=extra)
+            _log.exception("%s: unexpected error, %d samples discarded", self._name, len(batch), extra=extra)
             self._queue.count_invalid(len(batch))
 
-    def _keep_house(self, now: float) -> float:
-        """Do what is due beside receiving; return the seconds until the next time."""
+    def _poll(self, now: float) -> float:
+        """Housekeeping job: drain the ring, acknowledge and recover; return the seconds until the next call."""
         self._take_events()
         drained = self.receive() or self._idle
         if self._retransmission is None:
             return _POLL
         if drained:
             self._queue.acknowledge(drained=True)
-        filled, pause = self._retransmission.turn(now, drained=drained)
-        if filled:
-            self._wake(filled)
+        recovered_key, pause = self._retransmission.poll(now, drained=drained)
+        if recovered_key:
+            self._wake(recovered_key)
         return min(pause, _ACK_POLL if now < self._ack_poll_until else _POLL)
 
     def _wake(self, key: str) -> None:
-        """Wake the reader, even one that waits for the ring, by a sample on one of its keys.
+        """Wake the reader; if it is blocked on the ring, put a session-local sample on one of its keys.
 
-        Nothing else ends a wait for Zenoh's ring; only this session gets it, and no reader sees it.
+        Nothing else ends a blocking receive from Zenoh's ring. The decoder discards the sample.
         """
         self._queue.wake()
         if self._idle:
@@ -217,7 +217,7 @@ class Receiver:
                 self._session.put(key, b"", encoding=WAKE_UP, allowed_destination=here)
 
     def _take_events(self) -> None:
-        """Note that links broke or came back, before what arrived since is queued; take acknowledgement requests."""
+        """Handle link changes, which must precede the samples received since, and acknowledgement requests."""
         if self._take_link is None or self._take_query is None:
             return
         try:
@@ -231,18 +231,18 @@ class Receiver:
     def _take_request(self, query: zenoh.Query) -> None:
         self._ack_poll_until = time.monotonic() + _ACK_POLL_AFTER
         parameters = read_parameters(query.parameters.get)
-        if parameters is not None:  # else it is dropped, and so answered: from a publisher that asks in another way
+        if parameters is not None:  # otherwise malformed: dropping the query ends it
             key = str(query.key_expr)
             request = AckRequest(key.removesuffix(ack_key("")), *parameters, partial(_reply, query, key, self._queue))
             self._queue.add(request, drained=self._idle)
 
 
 def drain(handler: zenoh.Handler[_T], batch: list[_T]) -> list[_T]:
-    """Add all that has arrived to a batch, up to a full ring, and return it."""
+    """Append all received items to `batch`, up to the capacity of the ring, and return it."""
     try:
         while len(batch) < RING_CAPACITY and (item := handler.try_recv()) is not None:
             batch.append(item)
-    except zenoh.ZError:  # undeclared: the next wait notices
+    except zenoh.ZError:  # undeclared; the next blocking receive raises as well
         pass
     return batch
 
@@ -251,5 +251,5 @@ def _reply(query: zenoh.Query, key: str, pending_queue: PendingQueue) -> None:
     try:
         with query:
             query.reply(key, CLOSED if pending_queue.ended else b"")
-    except zenoh.ZError as exc:  # it asked with a timeout, or is gone
-        _log.debug("%s: an acknowledgement request could not be answered: %s", key, exc)
+    except zenoh.ZError as exc:  # the query timed out, or the publisher is gone
+        _log.debug("%s: cannot answer an acknowledgement request: %s", key, exc)

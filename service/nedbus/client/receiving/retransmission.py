@@ -1,8 +1,8 @@
-"""Retransmission requests of a subscription of mode `every`: to each publisher by its exact key, repeated for 20 s.
+"""Retransmission requests of mode `every`, sent to each publisher by its exact key and repeated for 20 s.
 
-Zenoh's own recovery asks once, with the key expression of the subscription, which a router compares with the caches of
-all publishers: the restart of a router with 1,000 of them became a storm in which requests went unanswered. Here at
-most 64 requests are open, and only later messages of the same publisher wait for the answer.
+Zenoh's own recovery sends one query with the subscription's key expression, which routers match against every
+publisher's cache: with 1,000 publishers a router restart caused a query storm that left gaps unfilled.
+Here at most 64 requests are open, and a gap holds back only later messages of the same publisher.
 """
 
 from __future__ import annotations
@@ -23,78 +23,79 @@ from .writer_proxy import WriterProxy
 
 _log = logging.getLogger(__name__)
 
-_MAX_OPEN: Final = 64  # requests at a time,
-_MAX_OPEN_UNCERTAIN: Final = 16  # and of these for what a publisher sent before it was heard
-_MAX_OPEN_OF_KEY: Final = 4  # and for one key, whose publishers may leave them unanswered
-_MAX_WAITING: Final = CAPACITY // 2  # messages to be read beyond which nothing is asked for: it would push out others
-_REQUEST_TIMEOUT: Final = 3.0  # s until a request is given up
-_POLL: Final = 0.1  # s between two polls of heartbeats, and of requests that are due
-_ANSWER_POLL: Final = 0.005  # s between two polls for answers
+_MAX_OPEN: Final = 64  # requests in flight
+_MAX_OPEN_HISTORY: Final = 16  # of these, requests to publishers that have delivered no message yet
+_MAX_OPEN_OF_KEY: Final = 4  # of these, requests on one key, whose publishers may never answer
+_MAX_WAITING: Final = CAPACITY // 2  # unread messages; beyond, answers would push out others, and requests pause
+_REQUEST_TIMEOUT: Final = 3.0  # s
+_POLL: Final = 0.1  # s between polls of heartbeats and due requests
+_ANSWER_POLL: Final = 0.005  # s between polls for answers
 
 
 class Retransmission:
-    """Send the requests for a queue's publishers, and pass on their answers; a job of Housekeeping's thread."""
+    """Send a queue's retransmission requests and collect the answers; a job of the housekeeping thread."""
 
     def __init__(self, session: Session, key_expr: str, pending_queue: PendingQueue) -> None:
         self._session = session
         self._queue = pending_queue
         self._open: dict[WriterProxy, RetransmitRequest] = {}
         self._take_heartbeats, self._undeclare = follow_heartbeats(session, key_expr)
-        self._heartbeats: Heartbeats = {}  # of the last poll
+        self._heartbeats: Heartbeats = {}  # from the previous poll
         self._next_heartbeat_poll = 0.0
 
-    def turn(self, now: float, *, drained: bool) -> tuple[str, float]:
-        """Do what is due; return a key of which something can be read now, or "", and seconds until the next turn.
+    def poll(self, now: float, *, drained: bool) -> tuple[str, float]:
+        """Poll heartbeats and answers, and send due requests.
 
-        `drained`: all that had arrived before this turn is queued.
+        Return a key with newly readable messages, or "", and the seconds until the next poll.
+        `drained`: the queue holds everything that had arrived before this call.
         """
-        if drained and now >= self._next_heartbeat_poll:  # else what the last ones tell of may be in the ring still
+        if drained and now >= self._next_heartbeat_poll:  # else the messages they announce may still be in the ring
             self._next_heartbeat_poll = now + _POLL
             for (key, publisher), number in self._heartbeats.items():
                 self._queue.on_heartbeat(key, publisher, number)
             self._heartbeats = self._take_heartbeats()
-        filled = ""
+        recovered_key = ""
         for writer, answers in list(self._open.items()):
-            filled = self._take(writer, answers, now) or filled
+            recovered_key = self._take_answers(writer, answers, now) or recovered_key
         if self._queue.waiting <= _MAX_WAITING:
-            for writer in list(self._queue.account.requesting):  # a copy: other threads add to it
+            for writer in list(self._queue.account.requesting):  # copied: other threads add to it
                 if len(self._open) >= _MAX_OPEN:
                     break
                 if writer not in self._open and self._has_room(writer):
-                    self._ask(writer, now)
-        return filled, _ANSWER_POLL if self._open else _POLL
+                    self._send_request(writer, now)
+        return recovered_key, _ANSWER_POLL if self._open else _POLL
 
     def close(self) -> None:
-        """Drop all requests: a channel of answers that is not emptied would hold up the session."""
+        """Drop all requests: an answer channel left full would block the session."""
         self._open.clear()
-        with suppress(zenoh.ZError):  # closed already with the session
+        with suppress(zenoh.ZError):  # the session is already closed
             self._undeclare()
 
-    def _take(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
+    def _take_answers(self, writer: WriterProxy, answers: RetransmitRequest, now: float) -> str:
         found = {number: raw for number, raw in answers.take().items() if len(raw.payload) <= PAYLOAD_LIMIT}
-        ended, key = answers.ended, writer.stream.heard
+        ended, key = answers.ended, writer.stream.wire_key
         if ended:
             del self._open[writer]
         elif not found:
             return ""
         try:
             recovered = self._queue.on_retransmission(writer, found, ended=ended, now=now)
-        except Exception:  # noqa: BLE001 - what one sample causes must not keep all others from the reader
-            _log.exception("%s: what was recovered is left out after an unexpected error", key, extra=about("bug"))
+        except Exception:  # noqa: BLE001 - one bad sample must not stop delivery
+            _log.exception("%s: unexpected error, recovered messages discarded", key, extra=about("bug"))
             self._open.pop(writer, None)
             recovered = self._queue.on_retransmission(writer, {}, ended=True, now=float("inf"))
         return key if recovered else ""
 
     def _has_room(self, writer: WriterProxy) -> bool:
-        share = [each for each in self._open if bool(each.uncertain) == bool(writer.uncertain)]
-        if writer.uncertain:
-            return len(share) < _MAX_OPEN_UNCERTAIN
+        share = [each for each in self._open if bool(each.history_end) == bool(writer.history_end)]
+        if writer.history_end:
+            return len(share) < _MAX_OPEN_HISTORY
         return sum(each.stream is writer.stream for each in share) < _MAX_OPEN_OF_KEY
 
-    def _ask(self, writer: WriterProxy, now: float) -> None:
+    def _send_request(self, writer: WriterProxy, now: float) -> None:
         numbers = self._queue.next_request(writer, now)
         if numbers is None:
             return
         with suppress(NedbusError):  # the session is closed
-            key = writer.stream.heard
+            key = writer.stream.wire_key
             self._open[writer] = request_samples(self._session, key, writer.name, numbers, timeout=_REQUEST_TIMEOUT)

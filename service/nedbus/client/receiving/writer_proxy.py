@@ -1,6 +1,6 @@
-"""A remote publisher as one reader knows it: the next number, messages held back, the open request. Pure.
+"""Writer proxy: expected number, reorder buffer and open request of one remote publisher; no I/O.
 
-The name is that of RTPS, and so is the idea: all that a reader knows of one publisher lies in one object.
+Name and design are those of RTPS: one object holds the state that a reader keeps about one publisher.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ NUMBERS: Final = 2**32
 """Zenoh's sequence numbers wrap here."""
 
 MAX_GAP: Final = 2**30
-"""A step of more messages is not a gap: the publisher started again, or the message is late."""
+"""Largest gap; a larger step means that the publisher restarted or the message is late."""
 
-_LAST_NUMBER: Final = NUMBERS - 1  # across the wrap nothing is asked for
-_MAX_REORDERED: Final = 2**16  # a number that is lower by less is late or a duplicate; by more it is a restart
-RETRANSMIT_TIMEOUT: Final = 20.0  # s of requests after which what is missing is lost: publishers keep it as long
-_RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s before asking again; then the last one
+_LAST_NUMBER: Final = NUMBERS - 1  # no retransmission across the wrap
+_MAX_REORDERED: Final = 2**16  # a number lower by up to this is late or a duplicate; beyond, the publisher restarted
+RETRANSMIT_TIMEOUT: Final = 20.0  # s until a gap counts as lost; publishers cache as long
+_RETRY_PAUSES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)  # s between attempts; the last one repeats
 
 
 @dataclass(slots=True, eq=False)
 class Account:
-    """The messages of all publishers of a reader that it did not receive.
+    """Loss counters and open gaps, shared by all writer proxies of a reader.
 
-    `dropped`: by a ring that overflowed. `held`: that wait for those before them. `discarded`: duplicates, and late.
-    `requesting`: the publishers of which something is missing; the one that was asked last comes last.
+    `dropped`: by a ring overflow. `discarded`: duplicates and late messages. `held`: messages held back behind gaps.
+    `requesting`: writers with a gap, least recently requested first.
     """
 
     lost: int = 0
@@ -42,32 +42,32 @@ class Account:
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """The retransmission request for what is missing of one publisher; times in monotonic seconds.
+    """Retransmission request to one publisher; times in monotonic seconds.
 
-    `stop`: one more than the newest number that is known to be sent. `asked`: the numbers of the open query.
-    `until`: when it is given up, unless something is delivered meanwhile. `kept_from`: the lowest number that was
-    answered; a publisher keeps all from there on. `answered`: the last of the numbers was answered. `witness`: the
-    number that it has to answer once more, to prove that `confirmed` is the lowest that it keeps.
+    `stop`: one past the highest number known to be sent. `requested`: numbers of the open query. `deadline`: the gap is
+    lost then; each delivery resets it. `first_available`: lowest number answered; the publisher caches everything from
+    there on. `last_answered`: the highest requested number was answered. `probe`: number to request again; an answer
+    proves that `candidate` is the lowest number in the publisher's cache.
     """
 
     stop: int
     due: float = 0.0
-    until: float | None = None
-    tries: int = 0
-    asked: range | None = None
-    kept_from: int | None = None
-    answered: bool = False
-    witness: int | None = None
-    confirmed: int | None = None
+    deadline: float | None = None
+    attempts: int = 0
+    requested: range | None = None
+    first_available: int | None = None
+    last_answered: bool = False
+    probe: int | None = None
+    candidate: int | None = None
 
 
 @dataclass(slots=True, eq=False)
 class WriterProxy:
-    """One publisher on one key. Each `on_` method returns what can be delivered now, in order.
+    """One publisher on one key; not thread-safe.
 
-    `name`: `zid` and `eid` in one, which are known from its first message on. `expected`: the next number.
-    `uncertain`: until one is delivered, numbers below this were perhaps sent before this reader subscribed. `silent`:
-    it has not answered a request; it is asked only once from then on. Not thread-safe.
+    `name`: `zid` and `eid` combined; these two are set by the first message. `expected`: the next number.
+    `history_end`: lower numbers may predate the subscription and do not count as lost; 0 after the first delivery.
+    `unresponsive`: it left a request unanswered; later gaps get a single attempt.
     """
 
     stream: KeyState
@@ -76,15 +76,16 @@ class WriterProxy:
     account: Account
     zid: object = None
     eid: int | None = None
-    uncertain: int = 0
-    silent: bool = False
+    history_end: int = 0
+    unresponsive: bool = False
     request: Request | None = None
     held: dict[int, Arrival] = field(default_factory=dict)
 
     def on_sample(self, number: int, arrival: Arrival, *, recovers: bool, overflowed: bool = False) -> list[Arrival]:
-        """Take a message; with `recovers` those that come after a gap are held back until it is filled.
+        """Accept a message and return the messages to deliver, in order.
 
-        `overflowed`: it comes from a ring that was full: what is absent was dropped there.
+        With `recovers`, messages behind a gap are held back until it is filled.
+        With `overflowed`, the ring was full, and the gap counts as dropped.
         """
         step = (number - self.expected) % NUMBERS
         if step > MAX_GAP:
@@ -99,83 +100,86 @@ class WriterProxy:
             return []
         else:
             delivered = self.give_up() if step and self.request is not None else []
-            self._count_missing(number, overflowed=overflowed)
+            self._count_gap(number, overflowed=overflowed)
         self._deliver(arrival, delivered)
         return self._release(delivered)
 
     def on_heartbeat(self, number: int) -> None:
-        """Note that a message was sent that should have arrived by now."""
+        """Open a gap up to a message that should have arrived by now."""
         if self.expected <= number < min(self.expected + MAX_GAP, _LAST_NUMBER):
             self._extend_request(number + 1)
 
     def next_request(self, now: float) -> range | None:
-        """Return the numbers to ask for now, None if nothing is due: all that is missing, up to the last of it."""
+        """Return the numbers to request now, up to the end of the last gap; None if no request is due."""
         request = self.request
-        if request is None or request.asked is not None or now < request.due:
+        if request is None or request.requested is not None or now < request.due:
             return None
-        if request.kept_from is not None and request.kept_from < self.expected:
-            request.kept_from = request.witness = request.confirmed = None
-        last = request.stop - 1 if request.witness is None else request.witness
-        while request.witness is None and last in self.held:
+        if request.first_available is not None and request.first_available < self.expected:
+            request.first_available = request.probe = request.candidate = None
+        last = request.stop - 1 if request.probe is None else request.probe
+        while request.probe is None and last in self.held:
             last -= 1
-        if request.until is None:
-            request.until = now if self.silent else now + RETRANSMIT_TIMEOUT
-        request.tries += 1
+        if request.deadline is None:
+            request.deadline = now if self.unresponsive else now + RETRANSMIT_TIMEOUT
+        request.attempts += 1
         self.account.requesting[self] = self.account.requesting.pop(self)
-        request.asked = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
-        return request.asked
+        request.requested = range(max(self.expected, last - MAX_ANSWERS + 1), last + 1)
+        return request.requested
 
     def on_retransmission(self, found: Mapping[int, Arrival], *, ended: bool, now: float) -> list[Arrival]:
-        """Take what was answered to the request that is open; `ended`: nothing more will be."""
+        """Accept answers to the open request and return the messages to deliver; `ended`: these were the last."""
         request, delivered = self.request, list[Arrival]()
         if request is None:
             return delivered
         for number, arrival in found.items():
             if self.expected <= number < request.stop and number not in self.held:
                 self._hold(number, arrival)
-            request.kept_from = number if request.kept_from is None else min(number, request.kept_from)
-            request.answered |= request.asked is not None and number == request.asked[-1]
-        if self.uncertain <= self.expected:  # else the lowest that is kept comes first, and is known at the end
+        if found:
+            lowest = request.first_available
+            request.first_available = min(found) if lowest is None else min(lowest, *found)
+            request.last_answered |= request.requested is not None and request.requested[-1] in found
+        if self.history_end <= self.expected:  # else wait for the end, which tells the lowest number available
             self._release(delivered)
-        if ended and request.asked is not None:
-            last, request.asked, over = request.asked[-1], None, request.until is not None and now >= request.until
-            if request.answered:
-                self.silent = False
+        if ended and request.requested is not None:
+            last, request.requested = request.requested[-1], None
+            over = request.deadline is not None and now >= request.deadline
+            if request.last_answered:
+                self.unresponsive = False
                 self._confirm_lowest(request, delivered, over=over)
-            elif request.witness is not None:
-                request.witness = request.stop - 1  # the other one is perhaps not kept any more
+            elif request.probe is not None:
+                request.probe = request.stop - 1  # the probe may have left the cache
             self._release(delivered)
             if over:
-                self.silent = request.kept_from is None
+                self.unresponsive = request.first_available is None
                 self._give_up(last, delivered)
-            request.answered = False
-            request.due = now + _RETRY_PAUSES[min(request.tries, len(_RETRY_PAUSES) - 1)]
+            request.last_answered = False
+            request.due = now + _RETRY_PAUSES[min(request.attempts, len(_RETRY_PAUSES) - 1)]
         return delivered
 
     def give_up(self) -> list[Arrival]:
-        """Return all that is held back: what is still missing is lost."""
+        """Count all gaps as lost and return the messages that were held back."""
         return [] if self.request is None else self._give_up(self.request.stop, [])
 
     def has(self, number: int) -> bool:
-        """Return whether this message has arrived, or is known to be lost."""
+        """Return True if this message has arrived or counts as lost."""
         return (self.expected - 1 - number) % NUMBERS <= MAX_GAP
 
     def _confirm_lowest(self, request: Request, delivered: list[Arrival], *, over: bool) -> None:
-        """Give up numbers below the lowest that was answered, once it is confirmed: answers may be lost too."""
-        lowest = request.kept_from
+        """Give up numbers below the lowest one answered, after a probe: lower ones may have been answered but lost."""
+        lowest = request.first_available
         if lowest is None or lowest <= self.expected:
             return
-        if lowest != request.confirmed and not over:
-            request.witness = request.confirmed = lowest
+        if lowest != request.candidate and not over:
+            request.probe = request.candidate = lowest
         else:
-            request.witness = None
+            request.probe = None
             self._give_up(lowest - 1, delivered)
 
     def _hold(self, number: int, arrival: Arrival) -> None:
         if number in self.held:
             self.account.discarded += 1
         else:
-            self.held[number] = Decoder.keep(arrival)
+            self.held[number] = Decoder.detach(arrival)
             self.account.held += 1
 
     def _extend_request(self, stop: int) -> None:
@@ -184,9 +188,9 @@ class WriterProxy:
             self.account.requesting[self] = None
         self.request.stop = max(self.request.stop, stop)
 
-    def _count_missing(self, number: int, *, overflowed: bool = False) -> None:
-        """Count the gap before a number, which comes next."""
-        certain = max(self.expected, min(self.uncertain, number))
+    def _count_gap(self, number: int, *, overflowed: bool = False) -> None:
+        """Count the gap before `number`, the next one to deliver."""
+        certain = max(self.expected, min(self.history_end, number))
         lost = (number - certain) % NUMBERS
         if overflowed:
             self.account.dropped += lost
@@ -197,27 +201,27 @@ class WriterProxy:
 
     def _give_up(self, last: int, delivered: list[Arrival]) -> list[Arrival]:
         while self.request is not None and self.expected <= last:
-            self._count_missing(min(self.held, default=self.request.stop))
+            self._count_gap(min(self.held, default=self.request.stop))
             self._release(delivered)
         return delivered
 
     def _deliver(self, arrival: Arrival, delivered: list[Arrival]) -> None:
         self.expected = (self.expected + 1) % NUMBERS
-        self.uncertain = 0
+        self.history_end = 0
         stream, payload, raw, _ = arrival
         if payload:
             delivered.append((stream, payload, raw, stream.gap))
             stream.gap = 0
 
     def _release(self, delivered: list[Arrival]) -> list[Arrival]:
-        """Deliver messages that were held back, up to the next gap."""
+        """Deliver messages held back, up to the next gap."""
         request = self.request
         if request is None:
             return delivered
         while (arrival := self.held.pop(self.expected, None)) is not None:
             self.account.held -= 1
             self._deliver(arrival, delivered)
-            request.until, request.tries = None, 0
+            request.deadline, request.attempts = None, 0
         if self.expected >= request.stop:
             self.request = None
             del self.account.requesting[self]

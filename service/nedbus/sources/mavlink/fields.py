@@ -1,4 +1,4 @@
-"""The fields of PX4's messages that single MAVLink messages hold, without those that are unknown."""
+"""Conversion of single MAVLink messages to fields of PX4's messages, without unknown values."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, Final
 
 from nedbus_msgs import MESSAGES, euler_to_quaternion, quaternion_to_euler
 
-_U16: Final = 2**16 - 1  # "not known" of most fields of that type
-_WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # of MAV_BATTERY_CHARGE_STATE
-_FAILSAFE: Final = {3: False, 4: False, 5: True}  # of MAV_STATE: standby, active, critical
-_POSE_FRAMES: Final = {1: 1, 20: 2}  # of MAV_FRAME: local NED, local FRD
+_U16: Final = 2**16 - 1  # "unknown" in most fields of this type
+_WARNINGS: Final = {1: 0, 2: 1, 3: 2, 4: 3, 5: 4, 6: 6, 7: 7}  # MAV_BATTERY_CHARGE_STATE to `warning`
+_FAILSAFE: Final = {3: False, 4: False, 5: True}  # MAV_STATE to `failsafe`: standby, active, critical
+_POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, local FRD
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
 _SENSORS: Final = [f"onboard_control_sensors_{each}" for each in ("present", "enabled", "health")]
@@ -30,7 +30,7 @@ def _global_position(message: Any) -> dict[str, object]:
 
 
 def _home(message: Any) -> dict[str, object]:
-    """Return home; its global position is valid whenever it is sent."""
+    """Return the home position, which is sent only with a valid global position."""
     angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
     return {
         "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": message.altitude / 1e3,
@@ -41,7 +41,7 @@ def _home(message: Any) -> dict[str, object]:
 
 def _gps(message: Any) -> dict[str, object]:
     if message.satellites_visible == 255 and message.fix_type < 2:
-        return {"fix_type": message.fix_type}  # there is no receiver, or it is silent
+        return {"fix_type": message.fix_type}  # no receiver, or a silent one
     course = _number(message.cog, 100, _U16)
     heading = _number(message.yaw, 100, 0, _U16)
     return {
@@ -58,7 +58,7 @@ def _gps(message: Any) -> dict[str, object]:
 
 
 def _status(message: Any) -> dict[str, object]:
-    """Return the state in a heartbeat; its custom mode is not PX4's nav_state."""
+    """Return the state in a heartbeat, without nav_state: custom_mode is not the same."""
     model = MESSAGES["VehicleStatus"].model
     is_armed = message.base_mode & _ARMED
     return {
@@ -70,12 +70,12 @@ def _status(message: Any) -> dict[str, object]:
 
 
 def sensors_of(message: Any) -> dict[str, object]:
-    """Return the fields of VehicleStatus in SYS_STATUS."""
+    """Return the VehicleStatus fields in a SYS_STATUS."""
     return {name: getattr(message, name) for name in _SENSORS}
 
 
 def _battery(message: Any) -> dict[str, object]:
-    """Return its voltage, but none of cells: where they are not measured, the first one is the whole battery."""
+    """Return the state of a battery without its cells: if they are not measured, the first one holds the total."""
     cells = [each for each in message.voltages if each != _U16] + [each for each in message.voltages_ext if each]
     return {
         "voltage_v": sum(cells) / 1e3 if cells else None, "current_a": _number(message.current_battery, 100, -1),
@@ -87,7 +87,7 @@ def _battery(message: Any) -> dict[str, object]:
 
 
 def _odometry(message: Any) -> dict[str, object]:
-    """Return pose and velocity if PX4 has their frames."""
+    """Return the pose and the velocity, each only if PX4 has its frame."""
     pose, velocity = _POSE_FRAMES.get(message.frame_id), _VELOCITY_FRAMES.get(message.child_frame_id)
     of_pose = {
         "pose_frame": pose, "position": (message.x, message.y, message.z), "q": tuple(message.q),
@@ -120,4 +120,4 @@ CONVERSIONS: Final[Mapping[str, tuple[str, Callable[[Any], dict[str, object]]]]]
     "HEARTBEAT": ("vehicle_status", _status),
     "BATTERY_STATUS": ("battery_status", _battery),
 }
-"""By MAVLink message: the topic, and a function that returns its fields; None stands for unknown."""
+"""Topic and conversion function of each MAVLink message; None in the returned fields means unknown."""

@@ -1,4 +1,4 @@
-"""The links to a MAVLink vehicle: UDP, TCP, or a serial port; bytes in with their sender, bytes out."""
+"""Links to MAVLink vehicles: UDP, TCP or a serial port; they read bytes with their sender, and send bytes."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any, Final
 
 from nedbus.errors import ConfigError, SourceError
 
-_MAX_DATAGRAMS: Final = 100  # that one read returns
+_MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
 
-Peer = Any  # the address of the other side, in the form that its socket uses
+Peer = Any  # address of the other side, as its socket has it
 
 
 class _UdpLink:
-    """A UDP socket; `peer` is None where the other side must send first."""
+    """A UDP socket; `peer` is None if the other side has to send first."""
 
     stream = False
 
@@ -40,21 +40,21 @@ class _UdpLink:
                 raise
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield the datagrams that have arrived and their senders; wait up to `timeout` seconds for the first."""
+        """Yield received datagrams with their senders; wait up to `timeout` seconds for the first."""
         if not _is_ready(self._socket, timeout):
             return
-        with suppress(BlockingIOError, ConnectionError):  # the other side does not listen yet
+        with suppress(BlockingIOError, ConnectionError):  # the other side is not listening yet
             for _ in range(_MAX_DATAGRAMS):
                 yield self._socket.recvfrom(_MAX_READ)
 
     def send(self, data: bytes, peer: Peer) -> None:
-        """Send now, or drop it if that is not possible."""
-        with suppress(OSError):  # a missing route comes back, or the vehicle times out
+        """Send without blocking; drop the data if that fails."""
+        with suppress(OSError):  # a lost route comes back, or the vehicle times out
             self._socket.sendto(data, peer)
 
 
 class _StreamLink:
-    """A TCP connection or a serial port: messages may arrive in pieces."""
+    """A TCP connection or a serial port; messages may arrive in pieces."""
 
     stream = True
 
@@ -64,7 +64,7 @@ class _StreamLink:
         self._file = file
 
     def read(self, timeout: float) -> Iterator[tuple[bytes, Peer]]:
-        """Yield the bytes that have arrived and their sender; wait up to `timeout` seconds for them."""
+        """Yield received bytes with their sender; wait up to `timeout` seconds for them."""
         if _is_ready(self._file, timeout):
             data = self._file.read(_MAX_READ)
             if not data:
@@ -81,7 +81,7 @@ Link = _UdpLink | _StreamLink
 
 
 def parse_link(text: str) -> tuple[str, str, int]:
-    """Return the kind of a link, its host or device, and its port; raise ConfigError for an invalid link."""
+    """Split a link into kind, host or device, and port; raise ConfigError if it is invalid."""
     found = _LINK.fullmatch(text)
     if found is None or (found[3] and not 0 < int(found[3]) < 2**16):
         raise ConfigError(f"source 'mavlink:{text}'", f"{text!r} is not a link: write {_FORMS}")
@@ -89,7 +89,7 @@ def parse_link(text: str) -> tuple[str, str, int]:
 
 
 def open_link(text: str, *, baud: int) -> Link:
-    """Open a link; raise SourceError when that fails, ConfigError for an invalid one."""
+    """Open a link; raise SourceError if that fails, ConfigError if the link is invalid."""
     kind, host, port = parse_link(text)
     try:
         if kind == "serial":
@@ -98,7 +98,7 @@ def open_link(text: str, *, baud: int) -> Link:
             return _StreamLink(Serial(host, baud, timeout=0, write_timeout=1.0), host)
         if kind == "tcp":
             with socket.create_connection((host, port), timeout=_CONNECT_TIMEOUT) as connection:
-                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # it stays open with this
+                return _StreamLink(connection.makefile("rwb", buffering=0), (host, port))  # keeps it open
         return _UdpLink(host, port, listens=kind == "udpin")
     except (OSError, UnicodeError) as exc:
         number = exc.errno if isinstance(exc, OSError) else None
@@ -107,7 +107,7 @@ def open_link(text: str, *, baud: int) -> Link:
 
 
 def _is_ready(file: Any, timeout: float) -> bool:
-    """Wait until there is data or the other side has closed; unlike select, with any number of open files."""
+    """Wait for data or the end of the stream; unlike select(), poll() has no limit on file descriptors."""
     poll = select.poll()
     poll.register(file, select.POLLIN)
     return bool(poll.poll(timeout * 1000))

@@ -1,4 +1,4 @@
-"""Receive from vehicles that speak MAVLink: every system id on a link is a vehicle."""
+"""Receive from MAVLink vehicles; every system id on a link is a vehicle."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
-_MAX_BUFFER: Final = 2**16  # bytes that a stream's parser may keep
-# Ours: a companion computer, as losing one triggers no failsafe, which losing a ground station does.
+_MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
+# Of a companion computer: unlike a ground station, its loss triggers no failsafe.
 _SYSTEM: Final = 245
-_AUTOPILOT: Final = 1  # the component; cameras, gimbals and ground stations are others
+_AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
 
 
 class MavlinkSource:
-    """A link with one or many vehicles.
+    """A link to one or several vehicles.
 
-    Fields that MAVLink does not transmit are not provided: resets, variances of heading and tilt, accelerations and
-    limits of a position; the mode of the state. Nothing is derived.
-    Validity is an approximation from ESTIMATOR_STATUS: LOCAL_POSITION_NED itself is sent whether valid or not.
+    Fields that MAVLink does not transmit are not provided, and not derived from others: resets, variances of heading
+    and tilt, accelerations and limits of VehicleLocalPosition, and the mode of VehicleStatus.
+    Validity is approximated from ESTIMATOR_STATUS, as LOCAL_POSITION_NED is sent even while it is invalid.
     """
 
     def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         parse_link(link)
         known = {topic for topic, _ in CONVERSIONS.values()}
         if known.isdisjoint(options.chosen_topics or known):
-            reason = f"MAVLink has none of these topics, but {', '.join(sorted(known))}"
+            reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
 
     def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | None]:
-        """Receive; raise SourceError when the link cannot be opened, or breaks."""
+        """Receive; raise SourceError if the link cannot be opened or breaks."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
                 yield from _LinkSession(link, self._options, name=self._link).run()
@@ -97,7 +97,7 @@ class _LinkSession:
         raw = bytes(message.get_msgbuf())
         if message.get_type() == "BAD_DATA":
             return Rejection(self._name, f"{len(raw)} bytes that are not MAVLink")
-        # Of a message that is not in the dialect only the header can be parsed.
+        # If the dialect does not have the message, only its header can be parsed.
         sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
         if not system or component != _AUTOPILOT:
             return None
@@ -128,7 +128,7 @@ class _LinkSession:
                 self._send(message, self._peers[system])
 
     def _send_heartbeat(self) -> None:
-        """Announce this component: routers and vehicles send nothing to one that they do not know."""
+        """Announce this component: routers and vehicles send only to components that they know."""
         heartbeat = dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, dialect.MAV_STATE_ACTIVE, 3
         )

@@ -1,6 +1,6 @@
-"""The state of one MAVLink vehicle: messages in, those of PX4 and the next requests out; no I/O, no clock.
+"""State of one MAVLink vehicle: takes MAVLink messages, returns PX4 messages and requests; no I/O, no clock.
 
-Times are monotonic seconds of the caller's clock, if not stated otherwise.
+Times are monotonic seconds of the caller's clock unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from .fields import CONVERSIONS, sensors_of
 
 _log = logging.getLogger(__name__)
 
-_MAX_DELAY: Final = 1000  # ms that a datagram may be late; further back is a reboot
-_VALUE_TIMEOUT: Final = 2.0  # s after which a value is no longer part of the estimate
-_STATUS_TIMEOUT: Final = 5.0  # s, as PX4 sends ESTIMATOR_STATUS once a second without a request
-_SILENCE_TIMEOUT: Final = 3.0  # s after which all state is reset
-_FIRST_ROUNDS: Final = 3  # of all requests: a link loses some
-_REQUEST_INTERVAL: Final = 5.0  # s between two rounds of requests for messages that do not arrive
-_FULL_TURN: Final = 36000  # 0.01 deg, of `hdg`
-_LONG_AGO: Final = 2**48  # us, 9 years: a later time is Unix time, not the time since boot
+_MAX_DELAY: Final = 1000  # ms that a datagram may be late; an older one means a reboot
+_VALUE_TIMEOUT: Final = 2.0  # s for which a received value is part of the estimate
+_STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
+_SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
+_FIRST_ROUNDS: Final = 3  # times that each request is sent at first, as links lose some
+_REQUEST_INTERVAL: Final = 5.0  # s between rounds of requests for messages that do not arrive
+_FULL_TURN: Final = 36000  # 0.01 deg, the unit of `hdg`
+_LONG_AGO: Final = 2**48  # us, 9 years; a later time is Unix time, not time since boot
 _UNKNOWN_HEADING: Final = 65535
 
 ORIGIN: Final = 49  # GPS_GLOBAL_ORIGIN
@@ -47,17 +47,17 @@ STREAMS: Final = {
     242: (72, 1.0, "home_position"),
     245: (14, 1.0, "vehicle_land_detected"),
 }
-"""The messages to request, in order: bytes on a link (a PX4's, MAVLink 2), Hz (0 for `rate`), topics that need it."""
+"""Messages to request, in order: bytes per message (MAVLink 2, from PX4), Hz (0 for `rate`), topics that need it."""
 
-_MIN_RATE: Final = 2.0  # Hz, on a link that is full
-_USABLE_PART: Final = 0.9  # of a link; the rest is for heartbeats and answers
-_BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop
+_MIN_RATE: Final = 2.0  # Hz, on a saturated link
+_USABLE_PART: Final = 0.9  # share of a link; the rest is for heartbeats and answers
+_BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bits
 
 
 def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, float]:
-    """Return the rates to request [Hz] for these topics: positions at `rate`, each other message at its own rate.
+    """Return the rates to request [Hz] for these topics: positions at `rate`, other messages at their own rates.
 
-    On a link that does not carry all of them, the other messages have a common upper limit.
+    If the link cannot carry them all, the other messages share a common upper limit.
     """
     wanted = {
         number: max(_MIN_RATE, rate) if number == _STATUS else hertz or rate
@@ -74,7 +74,7 @@ def request_rates(rate: float, baud: int, topics: Collection[str]) -> dict[int, 
 
 
 class Vehicle:
-    """The state of one vehicle: pass messages to `handle`, and send what `next_request` returns."""
+    """State of one vehicle: pass its messages to `handle`, and send the requests from `next_request`."""
 
     def __init__(self, name: str, options: MavlinkOptions) -> None:
         self._name = name
@@ -86,12 +86,12 @@ class Vehicle:
         self._last_message = 0.0
         self.lost = 0
         self._rebooted = False
-        self._reported: set[int] = set()  # messages that did not arrive, and were logged
+        self._reported: set[int] = set()  # requested messages that were logged as missing
         self._reset(0.0)
 
     def _reset(self, now: float) -> None:
-        """Discard all state and request everything again: the vehicle was silent, or rebooted."""
-        self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and until when
+        """Discard all state and request everything again, after silence or a reboot."""
+        self._kept: dict[str, tuple[dict[str, object], float]] = {}  # fields of earlier messages, and their expiry
         self._last: dict[Address, int] = {}  # timestamps
         self._sequence: int | None = None
         self._started = now
@@ -100,7 +100,7 @@ class Vehicle:
         self._next_round = now + _REQUEST_INTERVAL
 
     def track_sequence(self, sequence: int, now: float) -> None:
-        """Count the messages that were lost before this one, whatever its type."""
+        """Count the messages lost before this one, of any type."""
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -112,9 +112,9 @@ class Vehicle:
             self._sequence = sequence
 
     def next_request(self, now: float) -> tuple[int, float] | None:
-        """Return the number of a message to request now and its rate [Hz], 0 for once; None for no request.
+        """Return the id of the next message to request and its rate [Hz], 0 for once; None if there is none.
 
-        Each is requested three times at first, and later for as long as it does not arrive.
+        Each message is requested three times at first, then for as long as it does not arrive.
         """
         if now - self._last_message > _SILENCE_TIMEOUT:
             return None
@@ -128,14 +128,14 @@ class Vehicle:
         return number, self._rates[number]
 
     def _log_missing(self) -> None:
-        """Log once each message that was requested, and never arrived; an origin needs a global position first."""
+        """Log each requested message that never arrived, once; the origin needs a global position first."""
         for number in {*self._pending} - self._arrivals.keys() - self._reported - {ORIGIN}:
             self._reported.add(number)
             name, address = dialect.mavlink_map[number].msgname, Address(self._name, DEFAULT_TOPIC)
-            _log.info("%s: does not send %s when it is requested", address, name, extra=about("unsupported", address))
+            _log.info("%s: the vehicle does not send %s on request", address, name, extra=about("unsupported", address))
 
     def handle(self, message: Any, now: float) -> SourceMessage | Rejection | None:
-        """Return the message of a chosen topic that this one holds, if any; late ones are rejected."""
+        """Convert a message; return None if it has nothing for the chosen topics, a Rejection if it is late."""
         kind = message.get_type()
         topic, fields_of = CONVERSIONS.get(kind, ("", None))
         timestamp = self._track_time(message, now) if fields_of or kind == "SYSTEM_TIME" else None
@@ -160,7 +160,7 @@ class Vehicle:
         return SourceMessage(0.0, address, fields, lost, rebooted)
 
     def _remember(self, kind: str, message: Any, timestamp: int | None, now: float) -> None:
-        """Keep the fields that belong to later messages."""
+        """Keep fields that complete later messages."""
         match kind:
             case "GLOBAL_POSITION_INT" if message.hdg != _UNKNOWN_HEADING:
                 heading = math.radians(message.hdg % _FULL_TURN / 100)
@@ -200,12 +200,12 @@ class Vehicle:
         return fields if now <= until else {}
 
     def _complete(self, topic: str, fields: dict[str, object], timestamp: int, now: float) -> None:
-        """Add the fields of earlier messages."""
+        """Add the fields kept from earlier messages."""
         match topic:
             case "vehicle_local_position":
                 for name in ("yaw", "heading", "status", "bottom", "velocity", "origin"):
                     fields |= self._recall(name, now)
-                # The flags are from an earlier message: these fields may have become NaN since.
+                # The flags are from an earlier message; the fields may have become NaN since.
                 for flag in ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"):
                     values = cast("list[float]", [fields[name] for name in FLAG_FIELDS[flag]])
                     if fields.get(flag) and not all(map(math.isfinite, values)):
@@ -218,7 +218,7 @@ class Vehicle:
                 fields["time_utc_usec"] = cast("int", utc["boot"]) + timestamp
 
     def _track_time(self, message: Any, now: float) -> int | None:
-        """Return when it was made [us since boot]; a message without a time is as old as the newest one with it."""
+        """Return the time of a message [us since boot]; without a time of its own, it gets the newest one received."""
         microseconds: int = getattr(message, "time_usec", 0)
         if 0 < microseconds < _LONG_AGO:
             return microseconds
@@ -235,10 +235,10 @@ class Vehicle:
 
 
 def _validity(bits: int) -> dict[str, object]:
-    """Return the validity of position and velocity by ESTIMATOR_STATUS.flags.
+    """Return the validity of position and velocity from ESTIMATOR_STATUS.flags.
 
-    The constant position mode was the opposite of a horizontal velocity up to PX4 1.15; since PX4's commit 48f1687d3a
-    it is set for every vehicle at rest too, whose velocity and position are valid.
+    Up to PX4 1.15, constant position mode means that there is no horizontal velocity. Since PX4's commit 48f1687d3a it
+    is also set for a vehicle at rest, whose velocity and position are valid.
     """
     has_velocity = bool(bits & dialect.ESTIMATOR_VELOCITY_HORIZ)
     has_position = bool(bits & (dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_POS_HORIZ_ABS))
@@ -251,7 +251,7 @@ def _validity(bits: int) -> dict[str, object]:
 
 
 def _velocity_deviations(covariance: Any) -> dict[str, object]:
-    """Return evh and evv from the variances in the diagonal, as far as they are known."""
+    """Return evh and evv from the diagonal of a covariance, without unknown ones."""
     north, east, down = covariance[0], covariance[6], covariance[11]
     fields: dict[str, object] = {}
     if math.isfinite(north + east) and min(north, east) >= 0:

@@ -1,4 +1,4 @@
-"""The node of a source in ROS 2: received messages, and a subscription to each published topic."""
+"""The ROS 2 node of a source: receives messages, and declares a subscription to each published topic."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from .streams import Form, NotAcceptedError, NotCarriedError, Px4Stream, StreamR
 _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
-_REPORT_INTERVAL: Final = 1.0  # s between two reports of absent topics
-_TOKENS_TIMEOUT: Final = 3.0  # s that a router has to list the publishers again, where too many changed at once
-_MAX_PENDING: Final = 4096  # samples that wait to be decoded
-_MAX_PENDING_BYTES: Final = 4096  # of the payload of each
-_RING_SIZE: Final = 16_384  # samples that arrive until the thread takes them
+_REPORT_INTERVAL: Final = 1.0  # s between reports of absent topics
+_TOKENS_TIMEOUT: Final = 3.0  # s for a router to list all publishers again, after too many changed at once
+_MAX_PENDING: Final = 4096  # samples waiting to be decoded
+_MAX_PENDING_BYTES: Final = 4096  # per payload
+_RING_SIZE: Final = 16_384  # samples waiting for the thread
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
@@ -50,10 +50,10 @@ _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes,
 
 
 class Px4ZenohNode:
-    """Receive from all publishers, turn samples into messages and rejections, and appear in ROS 2; a context manager.
+    """Receive from all publishers, convert samples to messages or rejections, and appear in ROS 2; a context manager.
 
-    Zenoh puts messages into a channel in Rust, which a thread of ours empties: a callback would wait for the
-    interpreter's lock. Tokens of its own make ROS 2 list this source, and a publisher in ROS 2 see a subscriber.
+    Samples wait in a channel in Rust, which a thread of this node drains: a callback would make Zenoh wait for the
+    GIL. Its liveliness tokens make ROS 2 list this source, and publishers in ROS 2 see a subscriber.
     """
 
     def __init__(self, session: Session, streams: StreamRegistry, *, domain: int | None) -> None:
@@ -83,7 +83,7 @@ class Px4ZenohNode:
             sample: zenoh.Sample | None = None
             with suppress(queue.Empty):
                 sample = self._pending.get(timeout=_TICK)
-            for token, alive in self._tokens.take(timeout=_TOKENS_TIMEOUT):  # those before the message are here
+            for token, alive in self._tokens.take(timeout=_TOKENS_TIMEOUT):  # older than the sample
                 self._on_token(token, alive=alive)
             yield None if sample is None else self._decode(sample)
             if (now := time.monotonic()) >= next_report:
@@ -95,7 +95,7 @@ class Px4ZenohNode:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        with suppress(zenoh.ZError):  # its session may be closed already
+        with suppress(zenoh.ZError):  # the session may be closed already
             for token in (*self._subscriptions.values(), *self._nodes.values()):
                 token.undeclare()
             self._tokens.undeclare()
@@ -118,31 +118,31 @@ class Px4ZenohNode:
             if is_bridged:
                 if not stream.is_bridged:
                     extra = about("looped", source="px4-zenoh")
-                    _log.info("%s comes from nedbus ros2: ignored, as it would loop", key, extra=extra)
+                    _log.info("%s comes from nedbus ros2: ignored to avoid a loop", key, extra=extra)
                 stream.is_bridged = True
                 return None
             fields = decode_with(definition, sample.payload.to_bytes(), layout)
             lost, rebooted = self._streams.accept(stream, attachment, now)
         except NotCarriedError as exc:
-            return Rejection(key, f"{exc}: not asked for by topics= or msg=") if str(exc) and not is_bridged else None
+            return Rejection(key, f"{exc}: not selected by topics= or msg=") if str(exc) and not is_bridged else None
         except (AddressError, DecodeError, NotAcceptedError) as exc:
             return Rejection(key, exc.reason if isinstance(exc, DecodeError) else str(exc), address)
         for name in unknown:
             del fields[name]
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
-            _log.warning("%s: its publisher restarted: the vehicle rebooted", key, extra=extra)
+            _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
         return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
 
     def _find_form(self, stream: Px4Stream) -> Form:
         form = self._streams.form_of(stream)
         if form.unknown:
             extra = about("newer-layout", stream.address, source="px4-zenoh")
-            _log.warning("%s: unknown here, and left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
+            _log.warning("%s: unknown fields left out: %s", stream.key, ", ".join(form.unknown), extra=extra)
         return form
 
     def _on_token(self, text: str, *, alive: bool) -> None:
-        """Add the publisher of a liveliness token, or remove it."""
+        """Add or remove the publisher of a liveliness token."""
         now = time.monotonic()
         try:
             token = PublisherToken.parse(text)
@@ -153,18 +153,18 @@ class Px4ZenohNode:
         if alive and not token.node.startswith("nedbus_"):
             self._subscribe(token.key)
         elif not alive and self._streams.remove_publisher(token, now) and token.key in self._subscriptions:
-            with suppress(zenoh.ZError):  # its session may be closed already
+            with suppress(zenoh.ZError):  # the session may be closed already
                 self._subscriptions.pop(token.key).undeclare()
 
     def _dropped_messages(self) -> Iterator[Rejection]:
-        """Yield a rejection for the messages of each reason that were dropped since the last call."""
+        """Yield one rejection per reason for the messages dropped since the last call."""
         new = self._dropped - self._reported
         for (where, reason), count in new.items():
             yield Rejection(where, reason, count=count)
         self._reported += new
 
     def _subscribe(self, key: TopicKey) -> None:
-        """Appear as a subscription to a topic."""
+        """Declare a subscription to a topic, for ROS 2 to list."""
         if key in self._subscriptions or len(self._subscriptions) >= _MAX_SUBSCRIPTIONS:
             return
         if key.domain not in self._nodes:

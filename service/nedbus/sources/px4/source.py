@@ -20,11 +20,11 @@ from .streams import Definitions, StreamRegistry
 
 _log = logging.getLogger(__name__)
 
-_CONNECT_TIMEOUT: Final = 0.5  # s; the service ends within 1 s, and tries again until then
+_CONNECT_TIMEOUT: Final = 0.5  # s; the service must be able to stop within 1 s, and it retries
 
 
 class Px4ZenohSource:
-    """Everything of px4_msgs at a router: that of the service, or another one."""
+    """All publishers of px4_msgs at a router: the service's own, or another one."""
 
     def __init__(self, endpoint: str, options: Px4ZenohOptions, context: SourceContext) -> None:
         if endpoint:
@@ -38,17 +38,17 @@ class Px4ZenohSource:
         self._name = f"px4-zenoh:{' or '.join(self._endpoints)}"
 
     def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
-        """Receive; raise SourceError when no router answers."""
+        """Receive; raise SourceError if no router answers."""
         with ExitStack() as closing:
             if router is not None and self._is_own:
-                # A link between the router and a client of its own would drop messages beyond its queue.
+                # A separate client would lose the messages that do not fit the queue of its link.
                 session = router
             else:
                 session = self._open_session()
                 closing.callback(session.close)
             streams = StreamRegistry(self._options, vehicle=self._vehicle, given=self._given)
             node = closing.enter_context(Px4ZenohNode(session, streams, domain=self._options.domain))
-            yield from node.run()  # a session that lost its router connects again by itself
+            yield from node.run()  # a session that loses its router reconnects by itself
 
     def _open_session(self) -> Session:
         try:
@@ -61,24 +61,24 @@ class Px4ZenohSource:
 def _read_definitions(paths: str) -> Definitions:
     """Read .msg files and folders of them, such as PX4's `msg`, separated by commas.
 
-    Messages of a folder that cannot be carried are left out, and named in the log.
+    Messages in a folder that cannot be carried are skipped and logged.
 
-    Raises ConfigError, with line and column, for a file that is not a message, or cannot be read.
+    Raises ConfigError for a file that is not a message, with line and column, or cannot be read.
     """
     found: dict[str, dict[str, Definition[Any]]] = {}
     left_out: list[str] = []
     for path in (Path(text.strip()).expanduser() for text in paths.split(",") if text.strip()):
         files = sorted([*path.glob("*.msg"), *path.glob("*/*.msg")])
         if not files and path.is_dir():
-            reason = "no .msg file is in this folder, nor in those within it: name PX4's folder msg"
+            reason = "there is no .msg file in this folder or its subfolders: give PX4's folder msg"
             raise ConfigError(str(path), reason, key="msg")
         for file in files or [path]:
             try:
                 text = _with_messages_within(file)
                 definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
             except (OSError, UnicodeDecodeError) as exc:
-                raise ConfigError(str(file), getattr(exc, "strerror", None) or "no UTF-8 text", key="msg") from None
-            except ValueError as exc:  # MsgError, and its like
+                raise ConfigError(str(file), getattr(exc, "strerror", None) or "not UTF-8 text", key="msg") from None
+            except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
                 left_out.append(f"{file.stem} ({exc})")
@@ -86,12 +86,12 @@ def _read_definitions(paths: str) -> Definitions:
             found.setdefault(dds_type(ros2_type(definition)), {})[type_hash] = definition
     if left_out:
         extra = about("damaged", source="px4-zenoh")
-        _log.info("px4-zenoh: not carried, of %s: %.2000s", paths, ", ".join(left_out), extra=extra)
+        _log.info("px4-zenoh: messages in %s that cannot be carried: %.2000s", paths, ", ".join(left_out), extra=extra)
     return found
 
 
 def _with_messages_within(file: Path) -> str:
-    """Return a .msg file followed by those beside it that it contains, in the form of ROS 2."""
+    """Return a .msg file followed by the nested messages that lie beside it, in the format of ROS 2."""
     text, added = file.read_text(), set[str]()
     while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
         added |= missing

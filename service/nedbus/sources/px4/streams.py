@@ -1,4 +1,4 @@
-"""Assign the messages of rmw_zenoh publishers to addresses, and find absent topics; no I/O, no clock.
+"""Assign messages from rmw_zenoh publishers to addresses, and detect absent topics; no I/O, no clock.
 
 Times are monotonic seconds of the caller's clock.
 """
@@ -26,30 +26,30 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-_MAX_STREAMS: Final = 10_000  # keys; a vehicle has some dozens
-_MAX_PUBLISHERS: Final = 64  # of a key that are followed
-_MAX_LOSS: Final = 1_000_000  # messages that can be lost at once; a larger step is not a gap
-_TIMEOUT: Final = 3.0  # s without messages after which another publisher may have the address
+_MAX_STREAMS: Final = 10_000  # keys; a vehicle has a few dozen
+_MAX_PUBLISHERS: Final = 64  # per key
+_MAX_LOSS: Final = 1_000_000  # messages lost at once; a larger step is not a gap
+_TIMEOUT: Final = 3.0  # s without messages after which another publisher may take the address
 _SETTLE_TIME: Final = 1.0  # s in which messages may still arrive from a publisher whose token is gone
-_SILENCE: Final = 5.0  # s, or messages at the nominal rate if that is slower, of which none came
-_MAX_NAMES: Final = 100  # in a report
+_SILENCE: Final = 5.0  # s without messages, or periods of the nominal rate if that is longer
+_MAX_NAMES: Final = 100  # per report
 _HINT: Final = "give each a namespace or a domain of its own"
 
 
 Definitions = Mapping[str, Mapping[str, Definition[Any]]]
-"""PX4's own definitions that a user gives, by the DDS type of the message, and the hash of its ROS 2 type."""
+"""Definitions given by the user, by DDS type and ROS 2 type hash."""
 
 
 class NotAcceptedError(Exception):
-    """Raised for a message that may be valid, but whose vehicle or layout is uncertain."""
+    """Raised for a message that may be valid, but whose vehicle or layout is not certain."""
 
 
 class NotCarriedError(Exception):
-    """Raised for a key that no option asks for; its text is the message, or empty if `topics=` leaves it out."""
+    """Raised for a key that no option selects; its text names the message, or is empty if `topics=` excludes it."""
 
 
 class Form(NamedTuple):
-    """The form of a stream's messages; `unknown`: fields of a newer layout, whose names or types are not known here."""
+    """Format of a stream's messages; `unknown`: fields of a newer layout, by name or type."""
 
     definition: Definition[Any]
     layout: Layout
@@ -58,16 +58,16 @@ class Form(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Px4Stream:
-    """One key: the address and form of its messages, its publishers, and the last sequence number.
+    """One key: the address and format of its messages, its publishers, and the last sequence number.
 
-    `not_carried`: None if they are carried, else the name of the message, "" if no option asks for it.
-    `form`: None until a message was received.
-    `tokens`: publishers that are announced, by the text of their tokens, `since` the first of them.
-    `alike_until`: until then two of them may not be told apart.
-    `heard`, `received`: when the last message arrived, and the last one that was accepted.
-    `restarted`: its publisher was replaced by another one, whose first message is not counted yet.
-    `reboots`: the number of reboots of its vehicle that it took part in.
-    `is_bridged`: messages of `nedbus ros2` arrived on it.
+    `not_carried`: None if its messages are carried, else their name, or "" if no option selects them.
+    `form`: None until the first message.
+    `tokens`: announced publishers by the text of their tokens; `since`: time of the first one.
+    `alike_until`: time until which two publishers may be indistinguishable.
+    `heard`, `received`: times of the last message, and of the last accepted one.
+    `restarted`: another publisher took over, and its first message is not counted yet.
+    `reboots`: number of reboots of its vehicle that it has been through.
+    `is_bridged`: messages from `nedbus ros2` arrived on it.
     """
 
     key: TopicKey
@@ -88,23 +88,23 @@ class Px4Stream:
     is_bridged: bool = False
 
     def has_alike(self) -> bool:
-        """Return whether publishers of several sessions have the same gid: their messages cannot be told apart."""
+        """Return whether several sessions publish with the same gid, which makes their messages indistinguishable."""
         sessions = {(token.gid, token.session) for token in self.tokens.values() if token.gid is not None}
         return len({gid for gid, _ in sessions}) < len(sessions)
 
     def nodes(self) -> set[tuple[str, str]]:
-        """Return the nodes that publish on it; those of nedbus are bridges of several vehicles."""
+        """Return the nodes that publish on it, without nedbus's own, which bridge several vehicles."""
         every = {(token.session, token.node) for token in self.tokens.values()}
         return {(session, node) for session, node in every if not node.startswith("nedbus_")}
 
     def is_silent(self, now: float) -> bool:
-        """Return whether nothing came for longer than its rate explains; a topic without a rate comes on events."""
+        """Return whether its messages are overdue; topics without a rate are sent on events, and never are."""
         rate = get_topic(self.address.topic).rate if self.not_carried is None else 0.0
         return rate > 0 and now - max(self.since, self.heard) >= max(_SILENCE, _SILENCE / rate)
 
 
 class StreamRegistry:
-    """All keys that are announced, or that messages arrived on, and the one stream that owns each address."""
+    """All keys that are announced or have messages, and the stream that owns each address."""
 
     def __init__(self, options: Px4ZenohOptions, *, vehicle: str, given: Definitions | None = None) -> None:
         self._options = options
@@ -115,10 +115,10 @@ class StreamRegistry:
         self._reboots: dict[str, int] = {}  # by vehicle
 
     def add_publisher(self, token: PublisherToken, now: float) -> None:
-        """Add the publisher of a liveliness token that appeared; raise as `hear` for a key without an address."""
+        """Add the publisher of a new liveliness token; raises like `hear` for a key without an address."""
         stream = self._find(token.key)
         if _TIMEOUT <= now - stream.received < math.inf:
-            # The publisher before is silent: it lost its connection, and a router takes longer to notice.
+            # The previous publisher is silent: it lost its connection, which a router takes longer to notice.
             stream.tokens.clear()
             stream.alike_until = -math.inf
         if not stream.tokens:
@@ -128,7 +128,7 @@ class StreamRegistry:
             stream.alike_until = math.inf if stream.has_alike() else stream.alike_until
 
     def remove_publisher(self, token: PublisherToken, now: float) -> bool:
-        """Remove a publisher that is gone; return whether its key has no other one."""
+        """Remove a publisher; return whether it was the last one of its key."""
         stream = self._streams.get(str(token.key))
         if stream is None:
             return True
@@ -138,10 +138,10 @@ class StreamRegistry:
         return not stream.tokens
 
     def hear(self, key: str, now: float) -> Px4Stream:
-        """Return the stream of a key on which a message arrived.
+        """Return the stream of a key, and note that a message arrived on it.
 
-        Raises DecodeError or AddressError for a key that is none of a topic of PX4's, NotAcceptedError for one key too
-        many, NotCarriedError for one that no option asks for, and that is not announced.
+        Raises DecodeError or AddressError for a key that is not of a PX4 topic, NotAcceptedError beyond the limit of
+        keys, NotCarriedError for a key that no option selects and no publisher announces.
         """
         stream = self._streams.get(key) or self._find(TopicKey.parse(key))
         stream.heard = now
@@ -150,7 +150,7 @@ class StreamRegistry:
         return stream
 
     def form_of(self, stream: Px4Stream) -> Form:
-        """Return the form of a stream's messages; raise NotAcceptedError for one that is unknown."""
+        """Return the format of a stream's messages; raise NotAcceptedError if it is unknown."""
         definition, layout = self._layout_of(stream.key, stream.address.topic)
         known = definition.known_types
         unknown = tuple(name for name, kind in layout.types.items() if kind not in known.get(name, ()))
@@ -161,9 +161,11 @@ class StreamRegistry:
     def accept(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> tuple[int, bool]:
         """Account for a message; return the number lost just before it, and whether its vehicle rebooted.
 
-        Its stream and its publisher become the owner of their address. Raises NotAcceptedError while another key, or
-        another publisher on the same key, owns it, while two publishers are alike, for a duplicate, and for a sequence
-        that goes back repeatedly: two vehicles with one gid.
+        Its stream and publisher become the owner of the address.
+
+        Raises NotAcceptedError while another key, or another publisher on the same key, owns the address; while two
+        publishers have the same gid; for a duplicate; and for a sequence that goes back repeatedly, as it does if two
+        vehicles have the same gid.
         """
         self._claim(stream, attachment, now)
         lost, restarted = 0, stream.restarted
@@ -174,7 +176,7 @@ class StreamRegistry:
             if step < 0:
                 is_repeated, stream.rebooted, restarted = now - stream.rebooted < _TIMEOUT, now, True
                 if is_repeated:
-                    reason = f"its sequence goes back and forth, as if two vehicles shared this key: {_HINT}"
+                    reason = f"sequence numbers go back and forth, as if two vehicles shared this key: {_HINT}"
                     raise NotAcceptedError(reason)
             elif step <= _MAX_LOSS:
                 lost = step - 1
@@ -183,12 +185,12 @@ class StreamRegistry:
         return lost, restarted and self._is_first_to_reboot(stream)
 
     def report(self, now: float) -> Absence:
-        """Return messages that are not carried, and topics that are silent while others of their node arrive."""
+        """Return messages that are not carried, and topics that are silent while others of the same node arrive."""
         self._streams = {
             key: each for key, each in self._streams.items() if each.tokens or each.form or now < each.alike_until
         }
         nodes = [(stream, stream.nodes()) for stream in self._streams.values()]
-        # A link that is down silences no topic.
+        # If no topic of a node arrives, its link is down.
         sending = {node for stream, own in nodes if now - stream.heard < _TIMEOUT for node in own}
         silent = {str(stream.address) for stream, own in nodes if sending & own and stream.is_silent(now)}
         not_carried = {stream.not_carried for stream, own in nodes if own and stream.not_carried}
@@ -198,7 +200,7 @@ class StreamRegistry:
         stream = self._streams.get(str(key))
         if stream is None:
             if len(self._streams) >= _MAX_STREAMS:
-                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: name a domain, as in px4-zenoh:?domain=0")
+                raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: choose a domain, as in px4-zenoh:?domain=0")
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
             stream = self._streams[str(key)] = Px4Stream(key, address, self._why_not_carried(key, topic))
@@ -208,11 +210,12 @@ class StreamRegistry:
         if now < stream.alike_until:
             stream.publisher = stream.gid = stream.sequence = None
             stream.received = now
-            raise NotAcceptedError(f"two vehicles are alike, with one key and one gid: {_HINT}")
+            raise NotAcceptedError(f"two vehicles publish on this key with the same gid: {_HINT}")
         owner = self._owners.setdefault(stream.address, stream)
         if owner is not stream:
             if now - owner.received < _TIMEOUT:
-                raise NotAcceptedError(f"{owner.key} is {stream.address} already: name one of them with vehicles=")
+                reason = f"{owner.key} is {stream.address} already: rename one of them with vehicles="
+                raise NotAcceptedError(reason)
             self._owners[stream.address] = stream
         if attachment is not None and attachment.gid != stream.gid:
             stream.restarted = stream.publisher is not None and stream.publisher.text not in stream.tokens
@@ -222,14 +225,14 @@ class StreamRegistry:
             stream.publisher = next(iter(stream.tokens.values())) if len(stream.tokens) == 1 else None
 
     def _is_first_to_reboot(self, stream: Px4Stream) -> bool:
-        """Count the restart of a stream; return whether it is the first one of its vehicle to restart."""
+        """Count the restart of a stream; return whether it is the first stream of its vehicle to restart."""
         known = self._reboots.get(stream.address.vehicle, 0)
         is_first = stream.reboots == known
         self._reboots[stream.address.vehicle] = stream.reboots = known + is_first
         return is_first
 
     def _why_not_carried(self, key: TopicKey, topic: str) -> str | None:
-        """Return None for a key whose messages are carried, else a value for `not_carried`."""
+        """Return None if the messages of a key are carried, else the value for `not_carried`."""
         options, name = self._options, _message_name(key)
         is_known = key.dds_type in _by_dds_type() or key.dds_type in self._given
         if options.chosen_topics is None:
@@ -239,7 +242,7 @@ class StreamRegistry:
         return "" if options.topics else f"{name} on {topic}" if is_known else name
 
     def _vehicle_of(self, domain: int, namespace: str) -> str:
-        """Return the vehicle that is configured, else one named by namespace and by any domain but the expected one."""
+        """Return the configured vehicle, else one named by the namespace, and any domain but the expected one."""
         vehicles = self._options.vehicles
         if namespace in vehicles:
             return vehicles[namespace]
@@ -248,7 +251,7 @@ class StreamRegistry:
         return "-".join(filter(None, [of_domain, namespace.replace("/", "-")])) or self._vehicle
 
     def _layout_of(self, key: TopicKey, topic: str) -> tuple[Definition[Any], Layout]:
-        """Return message and layout by the type hash of a key, else by the definition that is given for it."""
+        """Return message and layout for the type hash of a key, else from the definition given for it."""
         name, known, given = _message_name(key), _by_dds_type().get(key.dds_type), self._given.get(key.dds_type, {})
         expected = BY_TOPIC.get(topic)
         if expected is not None and expected is not known:
@@ -261,18 +264,18 @@ class StreamRegistry:
             [own] = given.values()
         if own is not None:
             return known or own, own.current
-        hint = f"give PX4's own definition of it, as in px4-zenoh:?msg={name}.msg"
+        hint = f"give PX4's definition of it, as in px4-zenoh:?msg={name}.msg"
         if given:
             hashes = " or ".join(given)
-            reason = f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's"
+            reason = f"{name}.msg has the type hash {hashes}, the key {key.type_hash}: give the vehicle's file"
         elif known is None:
-            reason = f"{name} with the type hash {key.type_hash} has no file here: {hint}"
+            reason = f"{name} with the type hash {key.type_hash} is unknown: {hint}"
         elif key.type_hash != NO_HASH:
             reason = f"no known layout of {name} has the type hash {key.type_hash}: update nedbus, or {hint}"
         elif layout := known.layout_of_release(self._options.layout or ""):
             return known, layout
         else:
-            reason = f"the key has {NO_HASH}: name the layout, as in px4-zenoh:?layout=1.14, or {hint}"
+            reason = f"the key has no type hash ({NO_HASH}): choose a layout, as in px4-zenoh:?layout=1.14, or {hint}"
         raise NotAcceptedError(reason)
 
 

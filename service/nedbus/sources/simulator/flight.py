@@ -1,8 +1,8 @@
-"""The simulated flight and its estimates: functions of the time since the start.
+"""A simulated flight and its estimates, as functions of the time since the start.
 
 The vehicle takes off and flies figures of eight at 20 m.
 
-Every lap of 120 s has the events of real flights:
+Every lap of 120 s has the events of a real flight:
 
     t = 15 s         the heading is aligned: a heading reset
     t = 60 to 75 s   no GPS: dead reckoning, growing error, xy invalid after 10 s; at its end resets of xy and vxy
@@ -21,15 +21,15 @@ from nedbus_msgs import MapProjection, VehicleLocalPosition, euler_to_quaternion
 TICK: Final = 0.01  # s: EKF2's own step, and the rate of the estimate on hardware
 LAP: Final = 120.0  # s
 OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
-ORIGIN_SET: Final = 2.0  # s after the start: the global origin is known
+ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
 REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
 BOOT: Final = 10_000_000  # us since boot at the start
 PROJECTION: Final = MapProjection(*REFERENCE[:2])
 
 _HEADING_RESET: Final = 15.0  # s into a lap
-_MAX_DEAD_RECKONING: Final = 10.0  # s after which the position is no longer valid
+_MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
 _Z_RESET: Final = 90.0  # s into a lap
-_HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap: the error that the next heading reset corrects
+_HEADING_DISTURBED: Final = LAP - 5.0  # s into a lap, when the error appears that the next heading reset corrects
 _Z_STEP: Final = 1.0  # m, up and down in turn
 _DRIFT: Final = 0.02  # m/s^2, half the acceleration of the error in dead reckoning
 _DELAY: Final = 5_000  # us from the sensor data to the estimate
@@ -39,7 +39,7 @@ _GRAVITY: Final = 9.80665  # m/s^2
 _ALTITUDE: Final = 20.0  # m
 CLIMB: Final = 10.0  # s to this altitude
 _SIZE: Final = 40.0  # m
-_STEP: Final = 1e-3  # s, of the derivatives
+_STEP: Final = 1e-3  # s, for the derivatives
 
 Vector = tuple[float, ...]  # north, east, down
 
@@ -54,7 +54,7 @@ class Truth(NamedTuple):
 
 
 def truth_at(time: float, direction: float) -> Truth:
-    """Return the truth at a time [s] since the start; `direction` [rad] is that of the figures."""
+    """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
     positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
     axes = list(zip(*positions, strict=True))
     velocity = tuple((after - before) / (2 * _STEP) for before, _, after in axes)
@@ -82,7 +82,7 @@ def _smoothstep(part: float) -> float:
 
 
 class _State(NamedTuple):
-    """The state of an estimate: its errors in SI units, seconds of dead reckoning, counts and deltas of resets."""
+    """State of an estimate: errors [SI units], dead reckoning [s], counts and deltas of resets."""
 
     position: tuple[float, float, float]
     velocity: tuple[float, float, float]
@@ -97,9 +97,9 @@ class _State(NamedTuple):
 
 
 class Estimator:
-    """An estimate of the truth with an error that wanders, drifts without GPS, and is reset.
+    """An estimate of the truth whose error wanders, drifts without GPS, and is reset.
 
-    `noise`: size of its position error [m]; `aided`: it always has position aiding, and no resets.
+    `noise`: size of the position error [m]; `aided`: position aiding never fails, and there are no resets.
     """
 
     def __init__(self, name: str, seed: int, noise: float, *, aided: bool = False) -> None:
@@ -111,11 +111,11 @@ class Estimator:
         self._heading_error = 0.0 if aided else random.choice((-1, 1)) * random.uniform(0.1, 0.3)
 
     def xy_valid(self, time: float) -> bool:
-        """Return the validity of its horizontal position and velocity."""
+        """Return whether horizontal position and velocity are valid."""
         return self._at(time).xy_valid
 
     def fields(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return the message of this moment; EKF2's limits are infinite."""
+        """Return the local position; its limits are infinite, as EKF2 sends them."""
         state = self._at(time)
         position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
         velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
@@ -133,7 +133,7 @@ class Estimator:
         }  # fmt: skip
 
     def attitude(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return the attitude: the tilt is that of a multicopter's thrust, which makes the acceleration; no wind."""
+        """Return the attitude of a multicopter whose thrust causes the acceleration, without wind."""
         state, (ax, ay, az) = self._at(time), truth.acceleration
         cos, sin = math.cos(truth.heading), math.sin(truth.heading)
         forward, right, up = ax * cos + ay * sin, ay * cos - ax * sin, _GRAVITY - az
@@ -143,7 +143,7 @@ class Estimator:
         return {**_timestamps(time), "q": q, "delta_q_reset": delta, "quat_reset_counter": state.counters["heading"]}
 
     def global_fields(self, time: float, truth: Truth) -> dict[str, object]:
-        """Return the global position; there is one once the origin is known."""
+        """Return the global position, which exists once the origin is known."""
         state = self._at(time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
         (latitude, longitude), altitude = PROJECTION.reproject(x, y), REFERENCE[2]
@@ -177,7 +177,7 @@ class Estimator:
         )  # fmt: skip
 
     def _drift(self, seconds: float) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the errors of position and velocity after this time of dead reckoning."""
+        """Return the errors of position and velocity after `seconds` of dead reckoning."""
         moved, speed = _DRIFT * seconds**2, 2 * _DRIFT * seconds
         return (moved * self._north, moved * self._east), (speed * self._north, speed * self._east)
 
@@ -207,7 +207,7 @@ def _timestamps(time: float) -> dict[str, object]:
 def _motion(
     time: float, position: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float], *, origin: bool
 ) -> dict[str, object]:
-    """Return the fields that estimate and truth have in common, with a distance sensor above flat ground."""
+    """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
     latitude, longitude, altitude = REFERENCE if origin else (math.nan,) * 3
     names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
     in_range = distance < _SENSOR_RANGE

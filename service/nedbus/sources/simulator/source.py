@@ -1,4 +1,4 @@
-"""Replay a simulated flight with all topics of its vehicle: the same seed gives the same messages, to the bit."""
+"""Replay a simulated flight with all topics of its vehicle; the same seed gives identical messages."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 from .flight import ORIGIN_SET, TICK, Estimator, Truth, truth_at, truth_fields
 from .vehicle import battery, gps, home, land_detected, status
 
-Fields = Callable[[float, Truth], dict[str, object]]  # of a message, from the time since the start and the truth
+Fields = Callable[[float, Truth], dict[str, object]]  # of a message, given time since start and truth
 
 
 class SimulatorSource:
-    """The simulated flight; endless unless its options have a duration."""
+    """A simulated flight; endless unless its options set a duration."""
 
     loop = False
 
@@ -44,7 +44,7 @@ class SimulatorSource:
         if not chosen:
             asked = ", ".join(sorted(self._topics or ()))
             known = ", ".join(sorted({address.topic for address in streams}))
-            raise SourceError("sim", f"a simulated vehicle does not have {asked}, but {known}")
+            raise SourceError("sim", f"a simulated vehicle has no {asked}; choose from {known}")
         total = None if self._ticks is None else sum(len(ticks) for ticks, _ in chosen.values())
         return ReplayRun(
             messages=self._messages(chosen),
@@ -87,6 +87,6 @@ class SimulatorSource:
 
 
 def _absent(topic: str) -> dict[str, object]:
-    """Return all fields that PX4's newest messages on a topic have, as "not known"."""
+    """Return all fields of PX4's newest layout on a topic, as "not provided"."""
     layout = BY_TOPIC[topic].layout_of_release("main")
     return {name: kind.absent for name, kind in layout.types.items()} if layout else {}

@@ -1,4 +1,4 @@
-"""The messages of the simulated vehicle beside its estimates: state, landing, home, battery and GNSS receiver."""
+"""Messages of the simulated vehicle besides its estimates: status, landing, home, battery and GNSS receiver."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _Gps: Final = MESSAGES["SensorGps"].model
 _ARMED: Final = BOOT - 1_000_000  # us since boot
 _CAPACITY: Final = 5000.0  # mAh
 _CURRENT: Final = 12.0  # A
-_ENDURANCE: Final = 1200.0  # s after which it flies on with a full battery; a fifth is left then
-_BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: 2026 begins
+_ENDURANCE: Final = 1200.0  # s until the battery is replaced by a full one, with a fifth of its charge left
+_BOOTED_AT: Final = 1_767_225_600_000_000  # us of Unix time: start of 2026
 
 
 def status(estimator: Estimator, time: float, _: Truth) -> dict[str, object]:
-    """Return take-off, then a mission; without a valid position a failsafe, in which it holds its altitude."""
+    """Return the status: take-off, then a mission; without a valid position, a failsafe that holds altitude."""
     failsafe = not estimator.xy_valid(time)
     flown = _Status.NAVIGATION_STATE_AUTO_MISSION if time >= CLIMB else _Status.NAVIGATION_STATE_AUTO_TAKEOFF
     mode = _Status.NAVIGATION_STATE_ALTCTL if failsafe else flown
@@ -33,7 +33,7 @@ def status(estimator: Estimator, time: float, _: Truth) -> dict[str, object]:
 
 
 def land_detected(time: float, truth: Truth) -> dict[str, object]:
-    """Return landed while it has not left the ground."""
+    """Return the land detector's output: landed until take-off."""
     (vx, vy, vz), landed = truth.velocity, truth.position[2] > -0.1
     return {
         "timestamp": BOOT + round(time * 1e6),
@@ -44,7 +44,7 @@ def land_detected(time: float, truth: Truth) -> dict[str, object]:
 
 
 def home(time: float, truth: Truth) -> dict[str, object]:
-    """Return where it took off, on the globe too once the origin is known."""
+    """Return the place of take-off, with global coordinates once the origin is known."""
     known = time >= ORIGIN_SET
     latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
     return {
@@ -56,7 +56,7 @@ def home(time: float, truth: Truth) -> dict[str, object]:
 
 
 def battery(time: float, _: Truth) -> dict[str, object]:
-    """Return a battery that a constant current discharges."""
+    """Return the state of a battery that is discharged by a constant current."""
     discharged = _CURRENT * (time % _ENDURANCE) / 3.6
     remaining = 1.0 - discharged / _CAPACITY
     return {
@@ -68,7 +68,7 @@ def battery(time: float, _: Truth) -> dict[str, object]:
 
 
 def gps(time: float, truth: Truth) -> dict[str, object]:
-    """Return its fix, with noise; in the outage, and before the first one, there is none."""
+    """Return a GNSS fix with noise; there is none before the origin is set, and in the outage."""
     now, is_started = BOOT + round(time * 1e6), time >= ORIGIN_SET
     fix = is_started and not OUTAGE[0] <= time % LAP < OUTAGE[1]
     north, east, down = (

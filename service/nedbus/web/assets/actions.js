@@ -1,20 +1,20 @@
-// Clicks on text, keys, and the size of the map, told to the viewer through the input `said`.
-// Body of a function of Bokeh's with the arguments `said`, `map` and `search`.
+// Sends clicks, keys and the size of the map to the viewer through the input `message`.
+// Body of a Bokeh callback with the arguments `message`, `map` and `search`.
 if (window.nedbusActions) return
 window.nedbusActions = true
-const say = (action, value = "") => {
+const send = (action, value = "") => {
   if (/^(focus|vehicle|event)/.test(action)) map.reset.emit()
-  said.value = JSON.stringify([action, value, Date.now()])
+  message.value = JSON.stringify([action, value, Date.now()])
 }
 const partOf = event => event.composedPath().find(each => each.dataset?.do)
 const act = part => {
-  if (part.dataset.do != "theme") return say(part.dataset.do, part.dataset.with)
-  const asked = new URLSearchParams(location.search)
-  asked.set("theme", asked.get("theme") == "light" ? "dark" : "light")
-  location.search = asked
+  if (part.dataset.do != "theme") return send(part.dataset.do, part.dataset.with)
+  const query = new URLSearchParams(location.search)
+  query.set("theme", query.get("theme") == "light" ? "dark" : "light")
+  location.search = query
 }
 
-let pressed = null  // what is under the pointer may be written anew while it is down, so that there is no click
+let pressed = null  // not "click" events: an update may replace the element between pointerdown and pointerup
 document.addEventListener("pointerdown", event => {
   pressed = event.button == 0 ? {part: partOf(event), x: event.clientX, y: event.clientY} : null
 })
@@ -35,11 +35,11 @@ document.addEventListener("keydown", event => {
   const action = keys[event.key]
   if (isPress && part) act(part)
   else if (event.key == "/") search.view?.focus?.()
-  else if (action) say(event.shiftKey && /^Arrow[LR]/.test(event.key) ? action.toUpperCase() : action)
+  else if (action) send(event.shiftKey && /^Arrow[LR]/.test(event.key) ? action.toUpperCase() : action)
   else return
   event.preventDefault()
 })
 
-const measure = () => { if (map.inner_width > 50) say("size", `${map.inner_width}x${map.inner_height}`) }
+const measure = () => { if (map.inner_width > 50) send("size", `${map.inner_width}x${map.inner_height}`) }
 setTimeout(measure, 1500)
 window.addEventListener("resize", () => setTimeout(measure, 500))

@@ -1,4 +1,4 @@
-// The ticks of a time axis: UTC where the start of the recording is known, else minutes and seconds since it.
+// Tick labels of a time axis: UTC if the start of the recording is known, else minutes and seconds since it.
 const seconds = tick / 1000 + start
 if (start || tick > 1e11) {
   const text = new Date(seconds * 1000).toISOString()

@@ -1,7 +1,7 @@
-// The server is away: say so, and load the page again when it answers.
+// Connection lost: show a bar, and reload the page when the server responds again.
 if (window.nedbusLost) return
 const bar = window.nedbusLost = document.createElement("div")
-bar.textContent = `nedbus web does not answer since ${new Date().toLocaleTimeString()}: waiting`
+bar.textContent = `nedbus web has not responded since ${new Date().toLocaleTimeString()}: reconnecting`
 bar.style = "position:fixed;top:0;width:100%;padding:9px;background:#b3261e;color:#fff;font:15px sans"
 document.body.append(bar)
 setInterval(() => fetch("/healthz").then(answer => answer.ok && location.reload()).catch(() => {}), 1000)
