@@ -90,7 +90,7 @@ class Timeline:
         replace(self.marks, marks)
         bars = [
             {"begin": max(begin, span.since) * 1e3, "row": rows[name], "colour": colours[span.severity],
-             "end": min(end, now if span.until is None else span.until) * 1e3}
+             "end": (end if span.until is None else min(end, span.until)) * 1e3}
             for name, span in held if name in rows
         ]  # fmt: skip
         replace(self._spans, bars)

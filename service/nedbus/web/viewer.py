@@ -196,7 +196,7 @@ class Viewer:
             first = max(begin, now - _MINUTE)
             move(self._plots.range, first, first + _MINUTE)
         events = self._events_of_chosen()
-        self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), picture.time)
+        self._plots.mark(events, self._chronicle.spans.get(vehicle, ()), end)
         order = [vehicle, *(each.vehicle for each in picture.rows if each.vehicle != vehicle)]
         self._timeline.update(self._chronicle.events, self._chronicle.spans, order, begin=begin, end=end, now=now)
         if self._ticks % (2 * _TEXT_TICKS) == 0 or self.pinned is not None:

@@ -9,11 +9,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from bokeh.models import DatetimeTickFormatter, HBar
 
 from nedbus.errors import NedbusError
+from nedbus.events import Event, Span
 from nedbus.recording import RecordingWriter
 from nedbus.web.fleet import TRUTH
 from nedbus.web.playback import Player, Recording
+from nedbus.web.style import DARK
+from nedbus.web.time_plots import Timeline
 from nedbus_msgs import DEFAULT, Address, Provenance
 from nedbus_msgs.arrays import to_array
 from nedbus_msgs.messages import VehicleAttitude
@@ -267,3 +271,14 @@ def test_jump_keeps_vehicles_that_are_silent_by_then(tmp_path: Path, clock: Simp
     assert {row.where.partition(",")[0] for row in rows.values()} == {"7.0 m north"}
     silent = next(event for event in recording.chronicle.events if event.kind == "silent")
     assert 22.0 <= silent.time <= 24.0
+
+
+def test_condition_after_the_playback_time_lasts_to_the_end() -> None:
+    """A condition that never ends is drawn from its begin to the end of the recording, also if that is yet to come."""
+    begin = Event("1", "failsafe_flag", "begin", "watch", "failsafe flags: position", 50.0)
+    span = Span("failsafe_flag", "watch", begin.text, 50.0, begin)
+    timeline = Timeline(DARK, DatetimeTickFormatter())
+    timeline.update([begin], {"1": [span]}, ["1"], begin=0.0, end=60.0, now=10.0)
+    renderers: list[Any] = list(timeline.figure.renderers)
+    [bars] = [each.data_source.data for each in renderers if isinstance(getattr(each, "glyph", None), HBar)]
+    assert (list(bars["begin"]), list(bars["end"])) == ([50e3], [60e3])
