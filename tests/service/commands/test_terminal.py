@@ -71,6 +71,11 @@ def test_table_fits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     assert (ROWS[0][0] in shown) == (width >= 60)
 
 
+def test_table_without_rows_is_its_head() -> None:
+    """Before the first message there is a head alone."""
+    assert to_table(HEAD, [], optional=OPTIONAL).split() == list(HEAD)
+
+
 def test_table_is_whole_without_a_terminal() -> None:
     """Where stdout is no terminal nothing is folded or left out, and no text is markup."""
     cells = ("1/[bold]", *ROWS[1][1:-1], "x" * 300)

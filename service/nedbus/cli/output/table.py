@@ -64,7 +64,7 @@ def to_table(head: Sequence[str], rows: Rows, *, optional: Sequence[str] = (), m
 
     shown, width = rows[:max_rows], terminal_width() or _UNLIMITED
     first, last = head[0], head[-1]
-    widths = {name: max(len(name), *map(len, cells)) for name, *cells in zip(head, *shown, strict=True)}
+    widths = {name: max(map(len, (name, *cells))) for name, *cells in zip(head, *shown, strict=True)}
     widths[last] = min(widths[last], _WHOLE)
     kept = fit_columns(widths, optional, width)
     widths[last] = min(widths[last], _FOLDED)
