@@ -78,8 +78,9 @@ def stories_of(
     """
     spans = [span for span in spans_of(events, conditions) if not (span.initial and span.end)]
     chosen = [span for kind in _MAIN_FAULTS for span in spans if span.kind == kind]
-    if not chosen or (at is not None and not any(span.holds(at) for span in chosen)):
-        chosen += [s for s in spans if s.kind not in _MAIN_FAULTS and s.severity != "info" and not s.initial]
+    if not any(span.until is None if at is None else span.holds(at) for span in chosen):
+        others = [s for s in spans if s.kind not in _MAIN_FAULTS and s.severity != "info" and not s.initial]
+        chosen += [s for s in others if s.until is None] if chosen and at is None else others
     stories: list[Story] = []
     while chosen:
         group = _together(chosen[0], chosen)

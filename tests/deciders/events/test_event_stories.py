@@ -105,6 +105,18 @@ def test_condition_to_watch_is_a_story_if_nothing_is_bad() -> None:
     assert [each.what for each in why(flight, at=flight.now + 50)] == ["xy not valid"]
 
 
+def test_active_warning_is_a_story_beside_a_fault_that_ended() -> None:
+    """A condition of severity watch that is active now is reported, also after a bad one that has ended."""
+    flight = Flight()
+    lose_gps(flight)
+    recover(flight)
+    flight.fly(60)
+    flight.wait(0.1).send(dead_reckoning=True)
+    assert [(each.what, each.until) for each in why(flight)][1:] == [("dead reckoning", None)]
+    flight.wait(1.0).send(dead_reckoning=True, xy_valid=False)
+    assert [each.what for each in why(flight)] == ["xy and vxy not valid", "xy not valid"]
+
+
 def test_condition_whose_begin_is_not_reported() -> None:
     """A condition without its begin among the events is active since its begin, or since the first message."""
     flight = Flight()

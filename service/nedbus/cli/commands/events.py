@@ -161,7 +161,7 @@ def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str)
     if story.end is not None:
         yield f"  ended at {times.text(story.end)}" + (" with" if story.after else "")
         yield from (fold(f"    {times.text(each)}  ", _shown(each)) for each in story.after)
-    if not story.before and story.begin is not None:
+    if not (story.before or story.meanwhile) and story.begin is not None:
         yield f"  no evidence in the {WINDOW:.0f} s before"
     if story.lacking:
         yield fold("  ", f"missing topics that may explain it: {', '.join(story.lacking)}; {advice}")
