@@ -239,7 +239,7 @@ def test_bundle(machine: Machine, tmp_path: Path) -> None:
     configure(machine, SIMULATION + 'router_config = "router.json5"\n', "router")
     machine.run("systemctl start nedbus@router")
     readme = (tmp_path / "bundle" / "README.txt").read_text()
-    commands = re.findall(r"^ {7}sudo (.*)$", readme.split("Or with systemd")[1].split("\n3. ")[0], re.MULTILINE)
+    commands = re.findall(r"^ {7}sudo (.*)$", readme.split("With systemd")[1].split("\n3. ")[0], re.MULTILINE)
     assert len(commands) == 5
     for command in commands:
         machine.run(f"cd /root/pki/bundle && {command}")
