@@ -199,7 +199,7 @@ def check_clocks(seen: Observation) -> Iterator[Finding]:
         yield _judge_clock(name, "its clock", offset, "this host's", f"{blame} {_SYNCHRONISE}")
     if clocks and not off:
         largest = max(abs(offset) for offset, _ in clocks.values())
-        yield Finding("clock", "", "ok", f"{len(clocks)} clocks agree with this host's to {to_age(largest)}")
+        yield Finding("clock", "", "ok", f"the clocks of all publishers agree with this host's to {to_age(largest)}")
 
 
 def _judge_clock(name: str, clock: str, offset: float, reference: str, advice: str) -> Finding:

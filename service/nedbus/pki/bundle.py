@@ -54,7 +54,7 @@ def make_bundle(
     authority = Authority.read(folder)
     for path in (output, folder / f"{name}.key", folder / f"{name}.crt"):
         if path.exists():
-            raise PkiError(f"{path} exists: it is not overwritten; 'nedbus pki list' shows when it expires")
+            raise PkiError(f"{path} exists: it is not overwritten; move it away to enroll {name} again")
     key = new_key()
     certificate = authority.sign(name, key.public_key(), days=days)
     target = target or _TARGET
