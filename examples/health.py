@@ -14,9 +14,6 @@ with suppress(KeyboardInterrupt), nedbus.connect() as bus, bus.subscribe("*", mo
             continue
         shown = time.monotonic()
         for address, health in monitor.snapshot().items():
-            flags = health.flags or {}
-            print(
-                f"{address}: {health.rate or 0.0:.1f} of {health.nominal:g} Hz, {health.lost} lost, {health.gaps} gaps,"
-                f" xy valid {flags.get('xy_valid', 0.0):.0%}, dead reckoning {flags.get('dead_reckoning', 0.0):.0%}",
-                flush=True,
-            )
+            shares = "".join(f", {flag} {share:.0%}" for flag, share in (health.flags or {}).items())
+            rates = f"{health.rate or 0.0:.1f} of {health.nominal:g} Hz"
+            print(f"{address}: {rates}, {health.lost} lost, {health.gaps} gaps{shares}", flush=True)

@@ -106,8 +106,9 @@ def keys_page() -> str:
         for name, each in MESSAGES.items()
     ]
     topics = [
-        [code(name), f"{each.rate:g}", str(each.kept), "first" if each.priority == "data_high" else ""]
+        [code(name), rate, str(each.kept), "first" if each.priority == "data_high" else ""]
         for name, each in TOPICS.items()
+        for rate in [f"{each.rate:g}" if each.rate else "on events"]
     ]
     return page(
         "Keys and payloads",
