@@ -91,8 +91,7 @@ class AsyncBus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         bus = self._blocking
         pending_queue = bus._make_queue(selection, mode, max_rate)
-        name = selection.key_expr(prefix=bus.prefix)
-        return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue, name=name)
+        return AsyncSubscription(lambda: bus._open_receiver(selection, pending_queue), pending_queue)
 
     latest = last_async(_awaited(Bus.latest))
     vehicles = _awaited(Bus.vehicles)

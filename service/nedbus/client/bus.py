@@ -24,6 +24,7 @@ from .protocol import LIVE
 from .publishing.publisher import Publisher
 from .publishing.publisher_registry import PublisherRegistry
 from .publishing.query_server import QueryServer
+from .rate_gate import check_max_rate, rate_step
 from .receiving import Decoder, LayoutLookup, MaxRateQueue, MaxRateReceiver, PendingQueue, Receiver
 from .sample import Mode, Sample
 from .subscription import Subscription
@@ -90,7 +91,7 @@ class Bus:
         """Subscribe to a selection of addresses; see `subscribe`."""
         pending_queue = self._make_queue(selection, mode, max_rate)
         receiver = self._open_receiver(selection, pending_queue)
-        return Subscription(receiver, pending_queue, name=selection.key_expr(prefix=self.prefix), owner=self)
+        return Subscription(receiver, pending_queue, owner=self)
 
     @last
     def latest(
@@ -197,9 +198,11 @@ class Bus:
     def _make_queue(self, selection: Selection, mode: Mode, max_rate: float | None) -> PendingQueue:
         """Return the queue of a new subscription; also used by AsyncBus."""
         self._require_open()
-        decoder, name = Decoder(self._layouts, prefix=self.prefix), selection.key_expr(prefix=self.prefix)
+        decoder = Decoder(self._layouts, prefix=self.prefix)
         if max_rate is None:
-            return PendingQueue(mode, decoder, name=name)
+            return PendingQueue(mode, decoder, name=selection.key_expr(prefix=self.prefix))
+        check_max_rate(max_rate)
+        name = selection.rate_key_expr(rate_step(max_rate), prefix=self.prefix)
         return MaxRateQueue(mode, decoder, max_rate=max_rate, name=name)
 
     def _open_receiver(self, selection: Selection, pending_queue: PendingQueue) -> Receiver:

@@ -29,8 +29,8 @@ _T = TypeVar("_T")
 class _SubscriptionBase(Generic[M_co]):
     """State shared by both subscriptions: name, counts and queue."""
 
-    def __init__(self, pending_queue: PendingQueue, *, name: str) -> None:
-        self.name = name
+    def __init__(self, pending_queue: PendingQueue) -> None:
+        self.name = pending_queue.name
         self._queue = pending_queue
         self._pop_row = partial(pending_queue.pop, rows=True)
 
@@ -52,8 +52,8 @@ class Subscription(_SubscriptionBase[M_co]):
     The subscription closes itself when it is no longer referenced and when the process exits.
     """
 
-    def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, name: str, owner: object) -> None:
-        super().__init__(pending_queue, name=name)
+    def __init__(self, receiver: Receiver, pending_queue: PendingQueue, *, owner: object) -> None:
+        super().__init__(pending_queue)
         self._receiver = receiver
         self._owner = owner  # keeps the bus open while the subscription is in use
         self._finalizer = Finalizer(self, receiver.close)
@@ -123,8 +123,8 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
     It opens on first use and is bound to the event loop running at that time.
     """
 
-    def __init__(self, open_receiver: Callable[[], Receiver], pending_queue: PendingQueue, *, name: str) -> None:
-        super().__init__(pending_queue, name=name)
+    def __init__(self, open_receiver: Callable[[], Receiver], pending_queue: PendingQueue) -> None:
+        super().__init__(pending_queue)
         self._open_receiver = open_receiver
         self._finalizer: Finalizer | None = None
         self._opening: asyncio.Task[None] | None = None

@@ -238,7 +238,7 @@ def test_collecting_garbage_never_closes() -> None:
                 closed.append(threading.current_thread())
 
     queue = PendingQueue("latest", Decoder(LayoutLookup(lambda _: {}), prefix="nedbus"))
-    subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, name="", owner=None)
+    subscription = nedbus.Subscription(cast("Receiver", Subscriber()), queue, owner=None)
     with lock:  # as a thread holds it that is in the midst of something
         del subscription
         gc.collect()  # a closing in this thread would wait for the lock for ever

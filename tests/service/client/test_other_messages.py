@@ -163,7 +163,7 @@ def test_what_is_missing_is_recovered(endpoint: str, bus: nedbus.Bus, address: A
     queue.missing = {1, 2, 3, 6}
     with closing(Housekeeping()) as housekeeping, closing(open_client([endpoint], timeout=DEADLINE)) as session:
         receiver = Receiver(session, address.key(), queue, housekeeping=housekeeping)
-        with nedbus.Subscription[Any](receiver, queue, name="lossy", owner=None) as subscription:
+        with nedbus.Subscription[Any](receiver, queue, owner=None) as subscription:
             wait_for_reader(bus._session, address.key())
             for number in range(10):
                 publisher.publish(make(address, number))

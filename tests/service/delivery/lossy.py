@@ -32,7 +32,7 @@ class Lossy:
         self.session = session
         self.publish = partial(publish, publisher)
         self.queue = queue
-        self.subscription = nedbus.Subscription(receiver, queue, name="lossy", owner=None)
+        self.subscription = nedbus.Subscription(receiver, queue, owner=None)
         self.receive = partial(take, self.subscription)
         self.asked: list[tuple[str, int, int]] = []
         self.unanswered = 0

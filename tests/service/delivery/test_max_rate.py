@@ -267,6 +267,8 @@ def test_publisher_that_does_not_downsample_is_named(
             publish(publisher, clock, 1, 20)
         assert take(subscription, 2) == [1, 11]
         assert not any(map(is_read, publishers))
+        with pytest.raises(nedbus.NoDataError, match="/@rate/10 within"):
+            subscription.receive(timeout=0.0)
         monkeypatch.setattr("nedbus.client.receiving.max_rate.DOWNSAMPLED_TIMEOUT", 0.0)
         wait_for(lambda: "not downsampled" in caplog.text, what="the warning")
         assert caplog.text.count("1 streams are not received") == caplog.text.count(publishers[1].key) == 1

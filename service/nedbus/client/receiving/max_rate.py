@@ -16,7 +16,7 @@ import zenoh
 
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import LIVE
-from nedbus.client.rate_gate import RateGate, check_max_rate, rate_step
+from nedbus.client.rate_gate import RateGate, rate_step
 from nedbus.client.sample import Mode
 from nedbus.errors import NedbusError
 from nedbus.log_event import about
@@ -38,14 +38,13 @@ _OVERTAKEN: Final = 2_000_000_000  # ns by which a last message may overtake a d
 
 
 class MaxRateQueue(PendingQueue):
-    """Queue at most `max_rate` messages per second and stream; raise ConfigError unless it is a number above 0.
+    """Queue at most `max_rate` messages per second and stream, a finite number above 0.
 
     Messages omitted to keep the rate count neither as lost nor as dropped.
     """
 
     def __init__(self, mode: Mode, decoder: Decoder, *, max_rate: float, name: str = "") -> None:
         super().__init__(mode, decoder, name=name)
-        check_max_rate(max_rate)
         self.rate = rate_step(max_rate)  # requested from publishers
         self.downsampled: dict[str, RateGate] = {}
         """Rate gates of the streams with a downsampled message so far, by key."""

@@ -71,7 +71,7 @@ class PendingQueue:
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
         """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
-        self._name = name
+        self.name = name
         self._warned = False
         self._decoder = decoder
         self._lock = threading.Lock()
@@ -282,4 +282,4 @@ class PendingQueue:
         if not self._warned and not self.newest_only:
             self._warned = True
             extra = about("dropped")
-            _log.warning("%s: the reader is slower than the data: messages are dropped", self._name, extra=extra)
+            _log.warning("%s: the reader is slower than the data: messages are dropped", self.name, extra=extra)
