@@ -168,6 +168,7 @@ def test_nothing_was_wrong(tmp_path: Path) -> None:
     shown = run_command("events", log)
     assert (shown.exit_code, shown.out) == (0, "")
     assert shown.err == f"{log}: no events in 20 s\n"
+    assert run_command("events", log, "--severity", "bad").err == f"{log}: no events of severity bad in 20 s\n"
     shown = run_command("why", log)
     assert (shown.exit_code, shown.out, shown.err) == (0, "1: no faults in 20 s\n", "")
 

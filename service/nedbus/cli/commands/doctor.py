@@ -54,7 +54,7 @@ def _to_report(findings: Sequence[Finding]) -> str:
     """Format findings as lines, followed by the number of findings in each state."""
     lines = []
     for each in findings:
-        name = f"{each.check} {each.subject}".strip()
+        name = f"{each.check} {each.subject}".rstrip(" :")
         lines.append(fold(f"{each.state:<8} ", to_text(f"{name}: {each.seen}", MAX_TEXT)))
         if each.advice:
             lines.append(fold(f"{'':<8} -> ", to_text(each.advice, MAX_TEXT)))

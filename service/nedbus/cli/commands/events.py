@@ -74,7 +74,7 @@ def events(
     read, found = _read(file)
     if vehicle != ANY:
         _choose_vehicle(file, read.account.vehicles, vehicle)
-        found = [event for event in found if event.vehicle == vehicle]
+    found = [event for event in found if event.severity in severities and vehicle in (ANY, event.vehicle)]
     if csv_output:
         write(csv_line(_HEAD))
     elif not json_output:
@@ -85,7 +85,8 @@ def events(
     if texts:
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
-        write_stderr(f"{file}: no events in {read.end:.0f} s")
+        least = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
+        write_stderr(f"{file}: no events{least} in {read.end:.0f} s")
 
 
 @command
