@@ -92,10 +92,10 @@ def read_page(address: str) -> bytes:
 
 
 def test_compose_up_shows_data(make_stack: StartStack) -> None:
-    """The service tells what it publishes; the demo prints it; both run as nobody special, and are healthy."""
+    """The service logs its progress, the demo prints messages; both run as an ordinary user, and are healthy."""
     stack = make_stack("up", "docker-compose.yml", "tests/compose/quick-health.yml", NEDBUS_WEB="127.0.0.1:0")
     stack.compose("--profile", "demo", "up", "--detach", "--no-build")
-    wait_for(lambda: " ned " in stack.compose("logs", "service"), what="a message in the service's log", seconds=60)
+    wait_for(lambda: " messages, " in stack.compose("logs", "service"), what="a count in the service's log", seconds=60)
     wait_for(lambda: stack.compose("logs", "subscriber").count(" ned ") > 5, what="messages in the subscriber's log")
     wait_for(lambda: stack.health("service") == "healthy", what="health", seconds=60)
     assert stack.compose("exec", "--no-TTY", "service", "id", "-un").strip() == "nedbus"

@@ -165,7 +165,7 @@ def test_reload(machine: Machine) -> None:
     assert machine.call("systemctl reload nedbus").returncode != 0
     assert f"{CONFIG}, line 1, column " in machine.journal()
     machine.run("systemctl kill --kill-who=main --signal=HUP nedbus")
-    wait_for(lambda: "is rejected" in machine.property("StatusText"), what="the reason in the status")
+    wait_for(lambda: "configuration rejected" in machine.property("StatusText"), what="the reason in the status")
     assert CONFIG in machine.property("StatusText")
     assert machine.property("ActiveState") == "active"
     assert_reads(machine, "wing")
