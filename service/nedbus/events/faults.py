@@ -15,7 +15,7 @@ VALID: Final[Mapping[str, str]] = {
 }  # fmt: skip
 """Quantities whose validity a health check can require, with their flags in VehicleLocalPosition."""
 
-_MAX_LINES: Final = 20  # for recent events
+_MAX_RECENT: Final = 20  # for recent events
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +83,6 @@ def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> I
                 name = report.host if event.vehicle == ALL else f"vehicle {event.vehicle}"
                 at = f"{to_clock(event.time)} UTC, {to_age(report.now - event.time)} ago"
                 lines.append(f"{name}: {event.text}, at {at}")
-    yield from lines[:_MAX_LINES]
-    if len(lines) > _MAX_LINES:
-        yield f"{len(lines) - _MAX_LINES} more events in the last {expected.within:g} s"
+    yield from lines[:_MAX_RECENT]
+    if len(lines) > _MAX_RECENT:
+        yield f"{len(lines) - _MAX_RECENT} more events in the last {expected.within:g} s"
