@@ -64,7 +64,7 @@ def _section_of(value: Any) -> str:
 def _entry(name: str, value: Any) -> str:
     if inspect.isroutine(value):
         return section(f"`{name}`", _signature(name, value), docstring(value.__doc__), level=3)
-    made = "" if "get one from" in (value.__doc__ or "") or "from `connect" in (value.__doc__ or "") else name
+    made = "" if re.search("get one from|from `connect|returns one|yields them", value.__doc__ or "") else name
     signature = _signature(made, value) if made and not issubclass(value, (Exception, nedbus.Message)) else ""
     return section(f"`{name}`", signature, docstring(value.__doc__), *map(str, _members(value)), level=3)
 

@@ -19,7 +19,11 @@ def page(definition: Definition[Any]) -> str:
     parts.append(_topics(definition))
     fields = [[f"`{name}`", str(kind), definition.meaning(name)] for name, kind in definition.types.items()]
     parts.append(section("Fields", table(["field", "type", "meaning"], fields)))
-    constants = [[f"`{name}`", str(value)] for name, value in vars(definition.model).items() if type(value) is int]
+    constants = [
+        [f"`{name}`", str(value)]
+        for name, value in vars(definition.model).items()
+        if type(value) is int and name.isupper()
+    ]
     parts.append(section("Constants", table(["constant", "value"], constants)))
     parts.append(_layouts(definition))
     rules = [row for rule in definition.rules for row in rows_of(rule)]

@@ -17,7 +17,7 @@
     │   ├── ClosedError (RuntimeError)       the bus was closed
     │   └── ForkError (RuntimeError)         this process was forked from one that was connected
     └── the data
-        ├── DecodeError (ValueError)         a payload that is not a VehicleLocalPosition
+        ├── DecodeError (ValueError)         a payload that is not a valid message
         │   └── UnknownLayoutError           ... because its layout is newer than this reader
         └── SourceError                      a source that cannot be opened or read
 

@@ -12,11 +12,11 @@ from .commands.bridges import export, foxglove, ros2, web
 from .commands.doctor import check, doctor
 from .commands.echo import echo
 from .commands.events import events, why
-from .commands.files import convert, plot, record
 from .commands.health import health
 from .commands.hz import hz
 from .commands.pki import pki
 from .commands.query import get, info, list_, schema
+from .commands.recordings import convert, plot, record
 from .commands.serve import router, serve
 from .options import command
 from .output.logs import LogFormat, LogLevel, log_to_stderr

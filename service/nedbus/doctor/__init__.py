@@ -1,6 +1,6 @@
 """The doctor: checks of settings, routers, certificates, permissions, vehicles and clocks."""
 
-from .check import check_router_file, check_service
+from .configuration import check_router_file, check_service
 from .examination import examine
 from .finding import Finding, State, worst_state
 

@@ -15,9 +15,9 @@ from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.transport import Tls, open_client, probe_writes
 
-from .check import check_sources
+from .configuration import check_sources
 from .finding import Finding, limit_findings, sort_findings
-from .network import NETWORK_CHECKS
+from .network_checks import NETWORK_CHECKS
 from .observation import Observation
 from .prober import check_endpoint, check_tls_files
 

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from .alignment import align
     from .arrays import Flight, addresses_of, missing_of, read
     from .flight_files import SUFFIXES, check_recording, format_of, matching
+    from .mcap_reader import RecordedMessage, RecordedStream, RecordingReader
+    from .mcap_writer import RecordingWriter
     from .plot import MAX_STREAMS, draw
-    from .reader import RecordedMessage, RecordedStream, RecordingReader
     from .recorder import Recorder
     from .ulog import UlogColumns, UlogTopic, UlogTopics, read_ulog
     from .utc import UtcOffset, utc_of
-    from .writer import RecordingWriter
 else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
@@ -27,9 +27,9 @@ else:
         ("", "flight_files"): "SUFFIXES check_recording format_of matching",
         ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
         ("", "utc"): "UtcOffset utc_of",
-        ("mcap", "reader"): "RecordedMessage RecordedStream RecordingReader",
+        ("mcap", "mcap_reader"): "RecordedMessage RecordedStream RecordingReader",
         ("mcap", "recorder"): "Recorder",
-        ("mcap", "writer"): "RecordingWriter",
+        ("mcap", "mcap_writer"): "RecordingWriter",
         ("plot", "plot"): "MAX_STREAMS draw",
     }
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})

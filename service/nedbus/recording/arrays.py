@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from .reader import RecordedMessage, RecordedStream, RecordingReader
+    from .mcap_reader import RecordedMessage, RecordedStream, RecordingReader
 
 _log = logging.getLogger(__name__)
 
@@ -157,7 +157,7 @@ class Flight:
         self._file: RecordingReader | UlogTopics
         self._invalid: list[str] = []
         if SUFFIXES.get(path.suffix) == "mcap":
-            reader = needs("mcap", f"{__package__}.reader").RecordingReader(path, vehicle="1")
+            reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
             if not self.definitions:
                 reader.close()

@@ -12,7 +12,7 @@ from nedbus.client import Batch, Subscription
 from nedbus.errors import ClosedError, NoDataError
 
 from .flight_files import check_recording
-from .writer import RecordingWriter
+from .mcap_writer import RecordingWriter
 
 _FLUSH_INTERVAL: Final = 1.0  # s; a power cut costs at most the messages of this interval
 _POLL_INTERVAL: Final = 0.2  # s between checks of `stop`

@@ -2,9 +2,9 @@
 
 from .account import KEPT_OF_FILE, FileAccount, follow, read_account, times_of
 from .conversion import convert
+from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 from .mavlink.link import Link, open_link, parse_link
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
-from .spec import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 
 __all__ = [
     "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Link", "LiveSource", "Rejection", "ReplayRun",

@@ -12,8 +12,8 @@ from nedbus.errors import InvalidMessageError
 from nedbus.events import Account, Times
 from nedbus_msgs import BY_TOPIC, Address, codec_of, upgrade_fields
 
+from .kinds import parse_source, source_text_of_file
 from .source import ReplaySource, SourceMessage
-from .spec import parse_source, source_text_of_file
 
 KEPT_OF_FILE: Final = 100_000
 """Events kept per file; the oldest are discarded."""

@@ -143,7 +143,7 @@ def test_missing_extra_says_what_to_install(flight: Path, monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas: not installed: pip install pandas"):
         nedbus.read(flight, dataframe="pandas")
-    for name in ("reader", "chunks"):
+    for name in ("mcap_reader", "mcap_chunks"):
         monkeypatch.delitem(sys.modules, f"nedbus.recording.{name}")
     monkeypatch.setitem(sys.modules, "mcap.records", None)
     with pytest.raises(ConfigError, match=r"^mcap: not installed: .*pip install .*\[mcap\]'$"):

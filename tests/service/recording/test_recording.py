@@ -376,8 +376,8 @@ def test_recording_nothing_is_said(endpoint: str, tmp_path: Path, monkeypatch: p
         if ended == "by Ctrl-C":
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("nedbus.cli.commands.files.write_notice", end_after_notice)
-    monkeypatch.setattr("nedbus.cli.commands.files.SILENCE_TIMEOUT", 0.1)
+    monkeypatch.setattr("nedbus.cli.commands.recordings.write_notice", end_after_notice)
+    monkeypatch.setattr("nedbus.cli.commands.recordings.SILENCE_TIMEOUT", 0.1)
     duration = ["-d", "0.5"] if ended == "by its duration" else []
     recorder = run_command("record", "-v", "9", "-c", endpoint, "-o", str(path), *duration)
     assert recorder.exit_code == 1

@@ -13,7 +13,7 @@ from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
 
-from .chunks import READ_ERRORS, ChunkFile, records_of
+from .mcap_chunks import READ_ERRORS, ChunkFile, records_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
