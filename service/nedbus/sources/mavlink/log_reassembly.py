@@ -1,0 +1,99 @@
+"""Reassembly of PX4's ULog stream from LOGGING_DATA and LOGGING_DATA_ACKED; no I/O, no clock."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final, Literal, NamedTuple
+
+_MAGIC: Final = b"ULog\x01\x12\x35"  # the first bytes of a ULog file
+_MAX_LENGTH: Final = 249  # bytes of `data` in a message
+_NO_RECORD_BEGINS: Final = 255  # first_message_offset
+_MODULUS: Final = 2**16  # of the sequence
+_MAX_STEP: Final = 2**15  # a larger step of the sequence is a duplicate
+_OLD_RUN: Final = 256  # consecutive old sequence numbers after which the sequence is taken to have moved on unseen
+
+Verdict = Literal["delivered", "duplicate", "malformed", "unsynchronised", "no_definitions"]
+"""Use of a message.
+
+`delivered`: its bytes, or those from its first record on after a gap, are in the stream.
+`duplicate`: repeated, or late: a late one was counted as lost, and its bytes are not used.
+`malformed`: `length` is above 249, or first_message_offset beyond the data; the gap that it leaves is counted as lost.
+`unsynchronised`: no record begins in it, after a gap.
+`no_definitions`: its stream was joined in the middle, so it cannot be decoded; losses of that stream are not counted.
+"""
+
+
+class Piece(NamedTuple):
+    """Result of one message.
+
+    `data`: bytes for the ULog parser; empty unless `verdict` is `delivered`.
+    `begins`: a new stream begins with `data`: it needs a new parser.
+    `gap`: messages were lost before this one: the parser discards its incomplete record, before it takes `data`.
+    `lost`: the number of those messages.
+    """
+
+    verdict: Verdict
+    data: bytes = b""
+    begins: bool = False
+    gap: bool = False
+    lost: int = 0
+
+
+class Reassembly:
+    """The ULog streams of one vehicle, one after the other.
+
+    Totals over all of them:
+    `counts`: messages by verdict.
+    `lost`: LOGGING_DATA lost, exact unless 65,536 or more are lost in one gap: a lower bound then.
+    `bytes`: delivered. `skipped`: received after a gap and discarded, as their record began in the gap.
+
+    At most 249 * `lost` bytes are lost. The number of ULog records lost is not known: it is at least one for each gap.
+    """
+
+    def __init__(self) -> None:
+        self.counts = Counter[Verdict]()
+        self.lost = self.bytes = self.skipped = 0
+        self._old_next = self._old_run = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the stream after a reboot of the vehicle: the next one may begin with the same bytes."""
+        self._first = b""  # data of the first message, which tells its repetition from a new stream
+        self._last: int | None = None  # sequence; None before the first stream
+        self._synchronised = False
+
+    def add(self, sequence: int, length: int, first_message_offset: int, data: Sequence[int]) -> Piece:
+        """Take the fields of the next message; `data` may lack trailing zeros, which MAVLink 2 does not transmit."""
+        content = bytes(data[:length]).ljust(length, b"\0")
+        if length > _MAX_LENGTH or (first_message_offset >= length and first_message_offset != _NO_RECORD_BEGINS):
+            piece = Piece("malformed")
+        elif sequence == 0 and content.startswith(_MAGIC) and content != self._first:
+            self._first, self._last, self._synchronised, self._old_run = content, 0, True, 0
+            piece = Piece("delivered", content, begins=True)
+        elif self._last is None:
+            piece = Piece("no_definitions")
+        else:
+            piece = self._continue(self._last, sequence, first_message_offset, content)
+        self.counts[piece.verdict] += 1
+        self.lost += piece.lost
+        self.bytes += len(piece.data)
+        return piece
+
+    def _continue(self, last: int, sequence: int, first_message_offset: int, content: bytes) -> Piece:
+        step = (sequence - last) % _MODULUS
+        if step == 0 or (step > _MAX_STEP and not self._is_ahead(sequence)):
+            return Piece("duplicate")
+        self._last, self._old_run, lost = sequence, 0, step - 1
+        is_contiguous = self._synchronised and not lost
+        self._synchronised = is_contiguous or first_message_offset != _NO_RECORD_BEGINS
+        skipped = 0 if is_contiguous else min(first_message_offset, len(content))
+        self.skipped += skipped
+        verdict: Verdict = "delivered" if self._synchronised else "unsynchronised"
+        return Piece(verdict, content[skipped:], gap=lost > 0, lost=lost)
+
+    def _is_ahead(self, sequence: int) -> bool:
+        """Return whether a long run of old numbers ends here: more than 32,768 messages were lost at once."""
+        self._old_run = self._old_run + 1 if sequence == self._old_next else 1
+        self._old_next = (sequence + 1) % _MODULUS
+        return self._old_run >= _OLD_RUN
