@@ -1,0 +1,32 @@
+"""ULog, PX4's log format: an incremental parser for files and streams, and the definitions of logged messages."""
+
+from __future__ import annotations
+
+from .definitions import address_of, definition_of
+from .layout import Field, PayloadLayout
+from .parser import UlogParser
+from .records import (
+    Damage,
+    Data,
+    Dropout,
+    FlagBits,
+    Format,
+    Header,
+    Information,
+    LoggedText,
+    MultiInformation,
+    Parameter,
+    ParameterDefault,
+    Record,
+    Subscription,
+    Sync,
+    UlogError,
+    Unsubscription,
+    Value,
+)
+
+__all__ = [
+    "Damage", "Data", "Dropout", "Field", "FlagBits", "Format", "Header", "Information", "LoggedText",
+    "MultiInformation", "Parameter", "ParameterDefault", "PayloadLayout", "Record", "Subscription", "Sync",
+    "UlogError", "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
+]  # fmt: skip
