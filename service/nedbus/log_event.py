@@ -52,6 +52,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "rejected": Event("a message from a source is not published: it cannot be decoded, or violates a rule"),
     "duplicate": Event("another process publishes the same stream"),
     "rebooted": Event("a vehicle rebooted"),
+    "log-stream": Event("the ULog stream of a vehicle begins, ends or is refused, or its file is opened or given up"),
     "unsupported": Event("a vehicle does not send a requested message"),
     "looped": Event("a key comes from `nedbus ros2`, and is ignored"),
     # a reader

@@ -38,7 +38,12 @@ class Sky:
         def publish(fields: dict[str, int]) -> None:
             self.published.append((address, fields["timestamp"]))
 
-        return SimpleNamespace(definition=definition or BY_TOPIC[address.topic], publish=publish, close=lambda: None)
+        return SimpleNamespace(
+            definition=definition or BY_TOPIC[address.topic],
+            publish=publish,
+            close=lambda: None,
+            relabel=lambda _: None,
+        )
 
 
 def test_home_stays_while_its_vehicle_is_heard() -> None:

@@ -71,7 +71,9 @@ class FakeRegistry:
             self.log.append(f"{self.clock.seconds:g} -{address.vehicle}")
 
         self.log.append(f"{self.clock.seconds:g} +{address.vehicle}{' lossless' if lossless else ''} {source}")
-        self.open[address] = SimpleNamespace(publish=publish, close=close, definition=definition or DEFAULT)
+        self.open[address] = SimpleNamespace(
+            publish=publish, close=close, relabel=lambda _: None, definition=definition or DEFAULT
+        )
         return self.open[address]
 
     def is_published(self, address: Address) -> bool:

@@ -8,6 +8,7 @@ from nedbus.extras import lazy_exports
 from .async_bus import AsyncBus, AsyncPublisher, connect_async
 from .bus import Bus, connect, connect_with
 from .discovery import (
+    LogStreamStatus,
     RejectionReport,
     Rejections,
     ServiceStatus,
@@ -35,8 +36,8 @@ else:
 
 __all__ = [
     "HEARTBEAT", "AsyncBus", "AsyncPublisher", "AsyncSubscription", "Batch", "Bus", "Counts", "Health", "Histogram",
-    "Housekeeping", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer", "RejectionReport", "Rejections",
-    "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState", "StreamStatus", "Subscription",
-    "check_max_rate", "connect", "connect_async", "connect_with", "describe_stream", "find_accounts", "find_services",
-    "health_of_last", "stream_state", "to_age",
+    "Housekeeping", "LogStreamStatus", "Mode", "Monitor", "Publisher", "PublisherRegistry", "QueryServer",
+    "RejectionReport", "Rejections", "Sample", "ServiceStatus", "SourceStatus", "StreamHealth", "StreamState",
+    "StreamStatus", "Subscription", "check_max_rate", "connect", "connect_async", "connect_with", "describe_stream",
+    "find_accounts", "find_services", "health_of_last", "stream_state", "to_age",
 ]  # fmt: skip

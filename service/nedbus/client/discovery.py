@@ -111,6 +111,53 @@ class _FromPeer:
 
 
 @dataclass(frozen=True, slots=True)
+class LogStreamStatus(_FromPeer):
+    """The ULog stream of one vehicle over MAVLink, of a source with `log=`.
+
+    `state`: "streaming" while messages are published from the stream; otherwise they are converted from MAVLink.
+    `reason`: why there is no stream, and what to do about it.
+    `received`: bytes so far. `rate`: bytes per second over the last second. `delay`: mean age of messages on arrival,
+    by the vehicle's clock [s]; None until the vehicle has answered TIMESYNC.
+    `header_time`: duration of the header [s]; the vehicle's own log has a gap of this length.
+    `gaps`: interruptions. `lost`: LOGGING_DATA messages lost. `lost_at_least`, `lost_at_most`: bounds of the number of
+    ULog messages in them, which the protocol does not tell. `undecodable`: data without a usable definition.
+    `saved`: the file that it is saved to.
+    """
+
+    vehicle: str = ""
+    state: str = ""
+    reason: str = ""
+    received: int = 0
+    rate: float = 0.0
+    delay: float | None = None
+    header_time: float | None = None
+    gaps: int = 0
+    lost: int = 0
+    lost_at_least: int = 0
+    lost_at_most: int = 0
+    undecodable: int = 0
+    saved: str = ""
+
+    @property
+    def text(self) -> str:
+        """All of it but the vehicle in one line; the reason and the file are text from a peer."""
+        parts = [self.state, self.reason] if self.reason else [self.state]
+        if self.received:
+            parts.append(f"{self.rate / 1000:.1f} KB/s")
+        if self.delay is not None:
+            parts.append(f"delay {self.delay * 1000:.0f} ms")
+        if self.header_time is not None:
+            parts.append(f"header {self.header_time:.1f} s")
+        if self.gaps:
+            parts.append(f"{self.gaps} gaps, {self.lost_at_least} to {self.lost_at_most} messages lost")
+        if self.undecodable:
+            parts.append(f"{self.undecodable} without a definition")
+        if self.saved:
+            parts.append(f"saved to {self.saved}")
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True, slots=True)
 class SourceStatus(_FromPeer):
     """The status of one source.
 
@@ -122,7 +169,7 @@ class SourceStatus(_FromPeer):
     announce but do not send, while others arrive.
     `rejections`: the number of rejected messages by rule.
     `retries`: restarts after a failure. `error`: the reason of the last failure.
-    `streams`: the health of each published stream, 100 at most.
+    `streams`: the health of each published stream, 100 at most. `log_streams`: the ULog stream of each vehicle.
     """
 
     source: str = ""
@@ -143,6 +190,7 @@ class SourceStatus(_FromPeer):
     streams: tuple[StreamStatus, ...] = ()
     not_carried: tuple[str, ...] = ()
     silent: tuple[str, ...] = ()
+    log_streams: tuple[LogStreamStatus, ...] = ()
 
     @property
     def ended(self) -> bool:

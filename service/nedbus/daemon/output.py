@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
 
-from nedbus.client import Histogram, Publisher, PublisherRegistry, StreamHealth, StreamStatus
+from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import Account
 from nedbus.log_event import about
@@ -53,6 +53,8 @@ class SourceOutput:
         """Number of rejected messages by violated rule."""
         self.absence = Absence()
         """Topics that vehicles publish and a live source does not deliver now."""
+        self.log_streams: dict[str, LogStreamStatus] = {}
+        """The ULog stream of each vehicle of a live source."""
         self.durations = Histogram(_DURATIONS)
         """Time to validate, encode and send a message [s]."""
         self._name = name
@@ -145,6 +147,10 @@ class SourceOutput:
         self.reboots += message.rebooted
         address = message.address
         stream = self._streams.get(address)
+        publisher = stream.publisher if stream is not None else None
+        if stream is not None and publisher is not None and message.definition not in (None, publisher.definition):
+            publisher.close()  # another firmware, after a reboot
+            stream.publisher = None
         if stream is None or stream.publisher is None:
             back = stream is not None and stream.heard is not None
             if not back and self._live >= _MAX_ADDRESSES:
@@ -159,7 +165,10 @@ class SourceOutput:
             event = "back" if back else "published"
             _log.info("%s: %s is %s", self._name, address, event, extra=about(event, address, source=self._name))
             self._bring_back(message)
-        self._streams[address].heard, self._streams[address].last = self._now(), message
+            stream = self._streams[address]
+        stream.heard, stream.last = self._now(), message
+        if stream.publisher is not None:
+            stream.publisher.relabel(message.source or self._kind)
         self.publish(message)
 
     def expire_stale(self) -> bool:

@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
 
-from nedbus.client import Histogram, PublisherRegistry, SourceStatus, StreamStatus, stream_state
+from nedbus.client import Histogram, LogStreamStatus, PublisherRegistry, SourceStatus, StreamStatus, stream_state
 from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import Account
 from nedbus.log_event import about
@@ -30,7 +30,7 @@ _READER_POLL: Final = 0.05  # s between two checks for a reader
 _RETIRE_TIMEOUT: Final = 5.0  # s for a source removed by a reload to stop
 _MAX_STREAMS: Final = 100  # in a status, which must fit into one message
 
-_Item = SourceMessage | Rejection | Absence | None
+_Item = SourceMessage | Rejection | Absence | LogStreamStatus | None
 State = Literal["starting", "waiting", "running", "retrying", "done", "failed"]
 STATES: Final[tuple[State, ...]] = get_args(State)
 
@@ -140,6 +140,7 @@ class Worker:
             streams=streams,
             not_carried=output.absence.not_carried,
             silent=output.absence.silent,
+            log_streams=tuple(output.log_streams.values()),
         )
 
     def run(self) -> None:
@@ -244,6 +245,8 @@ class Worker:
                     self._output.reject(item)
                 elif isinstance(item, Absence):
                     self._output.note(item)
+                elif isinstance(item, LogStreamStatus):
+                    self._output.log_streams[item.vehicle] = item
                 elif item is not None:
                     self._output.publish_live(item)
                     self._set_state("running")

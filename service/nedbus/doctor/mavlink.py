@@ -1,12 +1,14 @@
-"""Check of a MAVLink link for packets, messages and positions; needs the extra `mavlink`."""
+"""Check of a MAVLink link for packets, messages, positions and the ULog stream; needs the extra `mavlink`."""
 
 from __future__ import annotations
 
 import errno
+import struct
 import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
@@ -21,6 +23,34 @@ _MAX_SENDERS: Final = 5
 _POSITION: Final = "LOCAL_POSITION_NED"
 _BAUD: Final = 57600
 _SYSTEM: Final = 245  # ours, as in the source
+_BACKEND: Final = "SDLOG_BACKEND"
+_TO_MAVLINK: Final = 2  # bit of SDLOG_BACKEND
+
+
+@dataclass(slots=True)
+class _System:
+    """Traffic of one system: messages by type, bytes, and what concerns its ULog stream.
+
+    `backend`: the value of SDLOG_BACKEND, None without an answer. `log_clients`: to whom it sends its log.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    bytes: int = 0
+    is_px4: bool = False
+    backend: int | None = None
+    log_clients: set[str] = field(default_factory=set)
+
+    def add(self, message: Any) -> None:
+        """Add one message."""
+        kind = message.get_type()
+        self.counts[kind] += 1
+        self.bytes += len(message.get_msgbuf())
+        if kind == "HEARTBEAT":
+            self.is_px4 |= message.autopilot == dialect.MAV_AUTOPILOT_PX4
+        elif kind == "PARAM_VALUE" and message.param_id == _BACKEND:
+            (self.backend,) = struct.unpack("<i", struct.pack("<f", message.param_value))  # PX4 copies the bytes
+        elif kind.startswith("LOGGING_DATA"):
+            self.log_clients.add(f"system {message.target_system} component {message.target_component}")
 
 
 def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
@@ -43,14 +73,20 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
     yield from limit_findings(
-        _judge_system(f"{link} system {system}", link, counts, listen) for system, counts in sorted(systems.items())
+        _judge_system(f"{link} system {number}", link, system.counts, listen)
+        for number, system in sorted(systems.items())
+    )
+    yield from limit_findings(
+        _judge_log(f"{link} system {number}", link, system, listen)
+        for number, system in sorted(systems.items())
+        if system.is_px4
     )
 
 
-def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter[str]]]:
-    """Count packets by sender, and messages by system and type."""
+def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System]]:
+    """Count packets by sender, and read what each system sends; ask each PX4 for SDLOG_BACKEND."""
     senders: Counter[str] = Counter()
-    systems: dict[int, Counter[str]] = {}
+    systems: dict[int, _System] = {}
     end, next_heartbeat = time.monotonic() + seconds, 0.0
     parser = _new_parser()
     sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
@@ -69,7 +105,12 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, Counter
                 parser = _new_parser()
             for message in parser.parse_buffer(data) or []:
                 if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
-                    systems.setdefault(message.get_srcSystem(), Counter())[message.get_type()] += 1  # 255 at most
+                    system = systems.setdefault(message.get_srcSystem(), _System())  # 255 at most
+                    system.add(message)
+                    if message.get_type() == "HEARTBEAT" and system.is_px4 and system.backend is None:
+                        ids = message.get_srcSystem(), message.get_srcComponent()
+                        ask = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
+                        link.send(ask.pack(sender), peer)
     return senders, systems
 
 
@@ -85,6 +126,20 @@ def _judge_system(name: str, link: str, counts: Counter[str], seconds: float) ->
         f" 'mavlink stream -s {_POSITION} -r 30' in its shell"
     )
     return Finding("mavlink", name, "warning", seen, advice)
+
+
+def _judge_log(name: str, link: str, system: _System, seconds: float) -> Finding:
+    """Judge whether a PX4 can send its ULog stream on this link, without asking for it."""
+    if system.log_clients:
+        seen = f"sends its ULog stream to {list_names(sorted(system.log_clients))}"
+        advice = "PX4 has one stream: 'nedbus serve' is refused while another program receives it, unless log=take"
+        return Finding("mavlink", name, "ok" if f"system {_SYSTEM} " in seen else "warning", seen, advice)
+    if system.backend is not None and not system.backend & _TO_MAVLINK:
+        seen = f"{_BACKEND} is {system.backend}: it refuses to send its ULog stream"
+        return Finding("mavlink", name, "warning", seen, f"set {_BACKEND} to 3 for file and MAVLink, and restart it")
+    seen = f"a PX4, on a link that carries {system.bytes / seconds / 1000:.0f} KB/s now"
+    advice = f"for all fields of all topics, 'nedbus serve --source \"mavlink:{link}?log=1\"': docs/live.md"
+    return Finding("mavlink", name, "ok", seen, advice)
 
 
 def _new_parser() -> Any:

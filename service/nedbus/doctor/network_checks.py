@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from nedbus.client import SourceStatus
+from nedbus.client import LogStreamStatus, SourceStatus
 from nedbus.events import merge_vehicles, since_text, to_age
 from nedbus_msgs import Address, get_topic
 
@@ -111,6 +111,8 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         advice = "to carry them, pass PX4's definitions: px4-zenoh:?msg=NAME.msg, or a folder of them"
         seen = f"published by vehicles, but not carried: {list_names(source.not_carried, 20)}"
         yield Finding("source", name, "ok", seen, advice)
+    for log in source.log_streams:
+        yield from _check_log_stream(f"{name} vehicle {brief(log.vehicle)}", log)
     if stale := [address for address in source.stale if address not in source.silent]:
         advice = "check that the vehicle is on and its link is up; they recover by themselves"
         seen = f"no more messages of {list_names(stale)}"
@@ -119,6 +121,16 @@ def _check_source(source: SourceStatus) -> Iterator[Finding]:
         why = f": {list_names(source.rejections)}" if source.rejections else ""
         advice = "rejected messages are not published; the log of the service and @rejected keys have the reasons"
         yield Finding("source", name, "warning", f"{source.rejected} messages rejected{why}", advice)
+
+
+def _check_log_stream(name: str, log: LogStreamStatus) -> Iterator[Finding]:
+    if log.reason:
+        text = f"no ULog stream, fields are converted from MAVLink: {log.reason[:_MAX_TEXT]}"
+        yield Finding("source", name, "warning", text, "see 'The ULog stream' in docs/live.md")
+    if log.gaps:
+        text = f"the ULog stream lost {log.lost_at_least} to {log.lost_at_most} messages in {log.gaps} gaps"
+        advice = "raise the rate of the link, or log fewer topics: see the table of rates in docs/live.md"
+        yield Finding("source", name, "warning", text, advice)
 
 
 def check_vehicles(seen: Observation) -> Iterator[Finding]:

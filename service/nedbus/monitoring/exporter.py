@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from prometheus_client.core import Metric
 
-from nedbus.client import Bus, Sample
+from nedbus.client import Bus, LogStreamStatus, Sample, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
 from nedbus.transport import RouterState, Session, ask_routers
@@ -40,6 +40,7 @@ _POLL_INTERVAL: Final = 0.5  # s between polls of all vehicles
 _MAX_SOURCES: Final = 4 * MAX_STREAMS  # addresses whose source is kept
 _MAX_ROUTERS: Final = 16  # routers exported; any peer may claim to be one
 _ROUTERS_INTERVAL: Final = 30.0  # s between router queries; a reply has 183 bytes per session
+_SERVICES_INTERVAL: Final = 5.0  # s between queries of services, while messages from MAVLink arrive
 _ROUTERS_TIMEOUT: Final = 5.0  # s for all replies; the link may be slow
 _SESSION_TIMEOUT: Final = 1.0  # s to open the session for router queries
 
@@ -73,13 +74,15 @@ class Exporter:
         }
         self._alive: Collection[Address] = ()
         self._routers: list[RouterState] = []
+        self.log_streams: Mapping[str, LogStreamStatus] = {}
+        """The ULog streams of vehicles with MAVLink, by vehicle."""
         self._session: Session | None = None  # for the queries of routers
         self._sources: dict[Address, str] = {}
 
     def run(self, stop: threading.Event) -> None:
         """Run until `stop` is set; raise the error that stopped the reader early."""
         with ThreadPoolExecutor(2, thread_name_prefix="nedbus-export") as pool:
-            tasks = pool.submit(self._read), pool.submit(self._ask_routers, stop)
+            tasks = pool.submit(self._read), pool.submit(self._ask_peers, stop)
             for task in tasks:
                 task.add_done_callback(lambda _: stop.set())
             try:
@@ -127,8 +130,8 @@ class Exporter:
                 self._sources[sample.address] = sample.source or ""
             self._on_sample(sample)
 
-    def _ask_routers(self, stop: threading.Event) -> None:
-        """Query the session counts of all routers periodically, until `stop` is set.
+    def _ask_peers(self, stop: threading.Event) -> None:
+        """Query the session counts of all routers, and the ULog streams of services, until `stop` is set.
 
         A separate session keeps large replies (183 kB from a router with 1,000 sessions) from delaying messages.
         """
@@ -139,7 +142,15 @@ class Exporter:
                 if not stop.is_set():
                     states = ask_routers(self._session, timeout=_ROUTERS_TIMEOUT)
             self._routers = states[:_MAX_ROUTERS]
-            stop.wait(_ROUTERS_INTERVAL)
+            until = time.monotonic() + _ROUTERS_INTERVAL
+            while not stop.wait(max(0.0, min(_SERVICES_INTERVAL, until - time.monotonic()))):
+                if time.monotonic() >= until:
+                    break
+                if self._session is not None and any(each.startswith("mavlink") for each in [*self._sources.values()]):
+                    with suppress(NedbusError):
+                        services = find_services(self._session, prefix=self._bus.prefix, timeout=_ROUTERS_TIMEOUT)
+                        logs = (log for each in services for source in each.sources for log in source.log_streams)
+                        self.log_streams = {log.vehicle: log for log in logs}
         if self._session is not None:
             self._session.close()
 

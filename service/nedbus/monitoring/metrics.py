@@ -19,7 +19,7 @@ from prometheus_client import ProcessCollector, core, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
-from nedbus.client import Health, Histogram
+from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, Daemon, SourceMeasures
 from nedbus.events import SEVERITIES, Account
 
@@ -34,6 +34,7 @@ SWITCHED_OFF: Final = 3600.0
 _COUNTER, _GAUGE, _HISTOGRAM = core.CounterMetricFamily, core.GaugeMetricFamily, core.HistogramMetricFamily
 _STREAM: Final = ("vehicle", "topic", "source")
 _SOURCE: Final = ("source",)
+_LOG_STREAM: Final = ("vehicle", "source")
 
 METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     # Services
@@ -91,6 +92,20 @@ METRICS: Final[Mapping[str, tuple[Any, Sequence[str], str]]] = {
     ),
     "nedbus_source_state": (_GAUGE, ("source", "state"), "1 for the current state of a source, 0 for the others"),
     "nedbus_source_restarts": (_COUNTER, _SOURCE, "Restarts of a source after a failure"),
+    "nedbus_log_stream_active": (
+        _GAUGE, _LOG_STREAM, "1 while a vehicle's messages come from its ULog stream, 0 while converted from MAVLink",
+    ),
+    "nedbus_log_stream_bytes": (_COUNTER, _LOG_STREAM, "Bytes received of a vehicle's ULog stream"),
+    "nedbus_log_stream_gaps": (_COUNTER, _LOG_STREAM, "Interruptions of a vehicle's ULog stream"),
+    "nedbus_log_stream_lost": (_COUNTER, _LOG_STREAM, "LOGGING_DATA messages lost of a vehicle's ULog stream"),
+    "nedbus_log_stream_messages_lost": (
+        _COUNTER, (*_LOG_STREAM, "bound"), "Bounds, least and most, of the ULog messages lost in these gaps",
+    ),
+    "nedbus_log_stream_undecodable": (_COUNTER, _LOG_STREAM, "ULog messages without a usable definition"),
+    "nedbus_log_stream_delay_seconds": (_GAUGE, _LOG_STREAM, "Mean age of the ULog stream's messages on arrival"),
+    "nedbus_log_stream_header_seconds": (
+        _GAUGE, _LOG_STREAM, "Duration of the last header; the vehicle's own log has a gap of this length",
+    ),
     "nedbus_publish_duration_seconds": (_HISTOGRAM, _SOURCE, "Time to validate, encode and send a message"),
 }  # fmt: skip
 """The type, labels and help text of each metric, by name."""
@@ -225,10 +240,30 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
             ((label, state), state == status.state) for label, status in of.items() for state in STATES
         ],
         "nedbus_source_restarts": [((label,), status.retries) for label, status in of.items()],
+        **_log_stream_rows(of),
         "nedbus_publish_duration_seconds": [
             _histogram_row((label,), measures.durations) for label, measures in sources.items()
         ],
     })  # fmt: skip
+
+
+def _log_stream_rows(of: Mapping[str, SourceStatus]) -> dict[str, list[tuple[Any, ...]]]:
+    streams = [((each.vehicle, label), each) for label, status in of.items() for each in status.log_streams]
+    columns = {"bytes": "received", "gaps": "gaps", "lost": "lost", "undecodable": "undecodable"}
+    seconds = {"delay_seconds": "delay", "header_seconds": "header_time"}
+    rows: dict[str, list[tuple[Any, ...]]] = {
+        f"nedbus_log_stream_{name}": [
+            (labels, value) for labels, each in streams if (value := getattr(each, attribute)) is not None
+        ]
+        for name, attribute in (columns | seconds).items()
+    }
+    rows["nedbus_log_stream_active"] = [(labels, each.state == "streaming") for labels, each in streams]
+    rows["nedbus_log_stream_messages_lost"] = [
+        ((*labels, bound), count)
+        for labels, each in streams
+        for bound, count in (("least", each.lost_at_least), ("most", each.lost_at_most))
+    ]
+    return rows
 
 
 def _by_label(sources: Iterable[SourceMeasures]) -> dict[str, SourceMeasures]:

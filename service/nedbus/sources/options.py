@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Set
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 
 from nedbus_msgs import ANY, DEFAULT, MESSAGES, RELEASES, TOPICS, check_vehicle, get_topic
 
@@ -123,6 +123,17 @@ class Px4ZenohOptions(Options):
     msg: str = Field("", description="PX4's message definitions: .msg files or folders, separated by commas")
 
 
+def _parse_log(text: object) -> object:
+    """Parse `log=`: 0 or 1, or `armed` and `take`, separated by a comma."""
+    return frozenset(text.split(",")) - {"0"} if isinstance(text, str) else text
+
+
+def _check_save(folder: str, info: ValidationInfo) -> str:
+    if folder and not info.data.get("log"):
+        raise ValueError(folder)
+    return folder
+
+
 class MavlinkOptions(Options):
     """Options of `mavlink:`."""
 
@@ -135,3 +146,16 @@ class MavlinkOptions(Options):
     vehicles: Annotated[Vehicles, AfterValidator(_check_system_ids)] = Field(
         {}, description="SYSTEM_ID:VEHICLE, separated by commas, each id and each vehicle once"
     )
+    log: Annotated[frozenset[Literal["1", "armed", "take"]], BeforeValidator(_parse_log)] = Field(
+        frozenset(),
+        description="1 to request the ULog stream of each PX4 on the link, armed to start it in the air as well, take"
+        " to end the stream of another client, or armed,take",
+    )
+    save: Annotated[str, AfterValidator(_check_save)] = Field(
+        "", description="a folder in which each ULog stream is saved as a .ulg file; it needs log="
+    )
+
+    @property
+    def chosen_topics(self) -> Collection[str] | None:
+        """The topics to deliver; all topics of the ULog stream by default."""
+        return None if self.log and not self.topics else super().chosen_topics

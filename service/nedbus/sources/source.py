@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from nedbus.client import LogStreamStatus
 from nedbus.transport import Session, Tls
 from nedbus_msgs import Address, Definition
 
@@ -20,6 +21,7 @@ class SourceMessage:
     `rebooted`: True for the first message after the vehicle rebooted.
     `error`: the reason if it cannot be decoded; `fields` is empty then.
     `definition`: its message definition; None for the default of its topic.
+    `source`: what readers see in `sample.source`, if it differs from the kind of the source.
     """
 
     due: float
@@ -29,6 +31,7 @@ class SourceMessage:
     rebooted: bool = False
     error: str | None = None
     definition: Definition[Any] | None = None
+    source: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +113,7 @@ class ReplaySource(Protocol):
 class LiveSource(Protocol):
     """A source that receives from vehicles; its addresses become known as messages arrive."""
 
-    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | None]:
+    def listen(self, router: Session | None) -> Iterator[SourceMessage | Rejection | Absence | LogStreamStatus | None]:
         """Yield events until the iterator is closed; yield None at least twice a second while idle.
 
         `router`: the service's own session if it is a router; borrowed, so do not close it.

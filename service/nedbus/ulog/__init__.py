@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .definitions import address_of, definition_of
-from .layout import Field, PayloadLayout
+from .layout import PayloadField, PayloadLayout
 from .parser import UlogParser
 from .records import (
     Damage,
@@ -26,7 +26,26 @@ from .records import (
 )
 
 __all__ = [
-    "Damage", "Data", "Dropout", "Field", "FlagBits", "Format", "Header", "Information", "LoggedText",
-    "MultiInformation", "Parameter", "ParameterDefault", "PayloadLayout", "Record", "Subscription", "Sync",
-    "UlogError", "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
+    "Damage",
+    "Data",
+    "Dropout",
+    "FlagBits",
+    "Format",
+    "Header",
+    "Information",
+    "LoggedText",
+    "MultiInformation",
+    "Parameter",
+    "ParameterDefault",
+    "PayloadField",
+    "PayloadLayout",
+    "Record",
+    "Subscription",
+    "Sync",
+    "UlogError",
+    "UlogParser",
+    "Unsubscription",
+    "Value",
+    "address_of",
+    "definition_of",
 ]  # fmt: skip

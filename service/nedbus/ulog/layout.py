@@ -31,7 +31,7 @@ _FIELDS = re.compile(rf"(?:{_FIELD.pattern})*", re.ASCII)
 _BOOLS: Final = (False, True, *range(2, 256))  # a byte other than 0 and 1 is left for the model to reject
 
 
-class Field(NamedTuple):
+class PayloadField(NamedTuple):
     """One field of a message, with the name that nedbus gives it and its offset in the payload."""
 
     name: str
@@ -46,7 +46,7 @@ class PayloadLayout:
     `size`: bytes of a payload without the padding at its end, which PX4 does not log; `padding`: bytes of that.
     """
 
-    def __init__(self, fields: tuple[Field, ...], size: int, padding: int) -> None:
+    def __init__(self, fields: tuple[PayloadField, ...], size: int, padding: int) -> None:
         self.fields, self.size, self.padding = fields, size, padding
 
     @cached_property
@@ -159,7 +159,7 @@ class Formats:
 
     def _resolve(self, name: str) -> PayloadLayout:
         _, size, _ = self._measure(name, 0)
-        fields: list[Field] = []
+        fields: list[PayloadField] = []
         padding = 0
         for field, kind, length, offset in self._flatten(name, "", 0):
             if field.startswith("_padding"):
@@ -168,7 +168,7 @@ class Formats:
             padding = 0
             if not field.rpartition(".")[2].startswith("_padding"):
                 flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_")
-                fields.append(Field(flat, FieldType(BASIC_TYPES[kind].base, length), offset))
+                fields.append(PayloadField(flat, FieldType(BASIC_TYPES[kind].base, length), offset))
         names = [field.name for field in fields]
         if len(set(names)) < len(names):
             twice = max(names, key=names.count)

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from nedbus_msgs import BASES
 
-from .layout import BASIC_TYPES, Field, PayloadLayout, is_format
+from .layout import BASIC_TYPES, PayloadField, PayloadLayout, is_format
 
 SYNC_MAGIC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 
@@ -86,7 +86,7 @@ class Subscription(NamedTuple):
     layout: PayloadLayout
 
     @property
-    def fields(self) -> tuple[Field, ...]:
+    def fields(self) -> tuple[PayloadField, ...]:
         """The fields of its messages, without padding."""
         return self.layout.fields
 

@@ -7,9 +7,19 @@ import re
 from collections import Counter, deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Final
 
-from nedbus.client import Health, RejectionReport, Sample, StreamState, describe_stream, health_of_last, stream_state
+from nedbus.client import (
+    Health,
+    LogStreamStatus,
+    RejectionReport,
+    Sample,
+    StreamState,
+    describe_stream,
+    health_of_last,
+    stream_state,
+)
 from nedbus.events import FIXES, MODES, State
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
@@ -51,7 +61,7 @@ class Row:
     """Snapshot of one vehicle: its state and its streams.
 
     `main`: the stream shown as its marker; `facts`: mode, armed, battery and gps from its other messages, "" if
-    unknown; `number`: determines its colour.
+    unknown; `number`: determines its colour; `log`: its ULog stream over MAVLink, None without one.
     """
 
     vehicle: str
@@ -60,6 +70,7 @@ class Row:
     lines: tuple[Line, ...]
     facts: Mapping[str, str]
     number: int
+    log: LogStreamStatus | None = None
 
     @property
     def grade(self) -> str:
@@ -171,10 +182,12 @@ class Fleet:
     def update(
         self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
         alive: Collection[Address] | None = None, link: str = "", own: str = "",
+        logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
     ) -> Picture:  # fmt: skip
         """Take a picture at `time` [s], keep it in `picture` and return it.
 
-        `states`: states by vehicle; `alive`: the currently published addresses, None if unknown.
+        `states`, `logs`: states and ULog streams by vehicle; `alive`: the currently published addresses, None if
+        unknown.
         """
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
@@ -184,19 +197,21 @@ class Fleet:
             state = stream_state(health, alive=None if alive is None else address in alive, connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
-        rows = [self._row(vehicle, each, states.get(vehicle), own) for vehicle, each in lines.items()]
+        rows = [self._row(name, each, states.get(name), own, logs.get(name)) for name, each in lines.items()]
         rows.sort(key=lambda row: (_rank(row, time), natural(row.vehicle)))
         rejected = self._rejected.total()
         self.picture = Picture(time, rows, tuple(self._reports), rejected, len(self._left_out), link, own)
         return self.picture
 
-    def _row(self, vehicle: str, lines: Sequence[Line], state: State | None, own: str) -> Row:
+    def _row(
+        self, vehicle: str, lines: Sequence[Line], state: State | None, own: str, log: LogStreamStatus | None
+    ) -> Row:
         main = min(lines, key=lambda line: (line.address.topic != DEFAULT_TOPIC, not is_position(line.address)))
         state = state or State("info", "ok", None, ())
         if state.severity == "info" and main.state.name == "slow" and not own:  # otherwise the page itself is slow
             state = replace(state, severity="watch", text=str(main.state))
         number = self._numbers.setdefault(vehicle, len(self._numbers)) if len(self._numbers) < MAX_STREAMS else 0
-        return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number)
+        return Row(vehicle, state, main, tuple(lines), self._facts(vehicle), number, log)
 
     def _facts(self, vehicle: str) -> dict[str, str]:
         status = self._last(vehicle, "vehicle_status")

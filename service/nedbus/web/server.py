@@ -117,7 +117,10 @@ class LiveFleet:
         self.fleet.reject(snapshot.rejected)
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in list(account.vehicles)}
         own = snapshot.behind.replace("this reader", "this page")
-        self.fleet.update(snapshot.time, snapshot.healths, states, alive=snapshot.alive, link=snapshot.link, own=own)
+        self.fleet.update(
+            snapshot.time, snapshot.healths, states,
+            alive=snapshot.alive, link=snapshot.link, own=own, logs=self._exporter.log_streams,
+        )  # fmt: skip
 
 
 class WebServer:

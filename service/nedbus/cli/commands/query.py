@@ -14,7 +14,15 @@ from nedbus.cli.options import POSITIONS, FieldOption, JsonOption, VehicleOption
 from nedbus.cli.output.samples import to_fields, to_json
 from nedbus.cli.output.streams import to_text, write, write_stderr
 from nedbus.cli.output.table import fold, to_table
-from nedbus.client import Bus, SourceStatus, StreamStatus, describe_stream, health_of_last, stream_state, to_age
+from nedbus.client import (
+    Bus,
+    SourceStatus,
+    StreamStatus,
+    describe_stream,
+    health_of_last,
+    stream_state,
+    to_age,
+)
 from nedbus.errors import AddressError, ConfigError, ConnectError
 from nedbus_msgs import (
     ANY,
@@ -113,6 +121,8 @@ def info(bus: Bus, *, json_output: JsonOption = False) -> None:
         for what, head in _ABSENT.items():
             if absent := [each for source in service.sources for each in getattr(source, what)]:
                 write(fold(head, to_text(", ".join(absent), _MAX_VEHICLES)))
+        for each in (log for source in service.sources for log in source.log_streams):
+            write(fold(f"ULog stream of vehicle {to_text(each.vehicle)}: ", to_text(each.text, _MAX_VEHICLES)))
         if refused := service.refused:
             write(fold("refused by the router: vehicle ", to_text(", ".join(refused), _MAX_VEHICLES)))
         streams = [_stream_row(source, refused, each) for source in service.sources for each in source.streams]

@@ -57,7 +57,7 @@ class Publisher:
         self.definition = definition
         self._codec = codec_of(definition)
         self._all = definition.all_fields
-        self._encoding = encoding_of(definition, source)
+        self._encoding = self._declared = encoding_of(definition, source)
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # fields of the last message with missing ones
         topic = get_topic(address.topic)
         with while_open():
@@ -71,6 +71,12 @@ class Publisher:
     def published(self) -> int:
         """The number of messages published."""
         return self._writer.published
+
+    def relabel(self, source: str) -> None:
+        """Set the source of all further messages, which readers see in `sample.source`."""
+        if source != self.source:
+            self.source, self._encoding = source, encoding_of(self.definition, source)
+            self._partial = self._all, self._encoding
 
     def publish(self, message: Message | Mapping[str, object]) -> None:
         """Publish a message, or validate a dict of fields and publish them as a message.
@@ -157,7 +163,7 @@ class Publisher:
             encoding = self._partial[1]
         try:
             stamp = self._new_timestamp()
-            self._writer.put(payload, stamp, None if is_whole else encoding)
+            self._writer.put(payload, stamp, None if encoding is self._declared else encoding)
             self.last = payload, stamp, encoding
             self._downsampler.put(payload, stamp, encoding)
         except zenoh.ZError as exc:

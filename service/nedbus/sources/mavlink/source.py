@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -10,6 +11,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
+from nedbus.client import LogStreamStatus
 from nedbus.errors import ConfigError, SourceError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
@@ -19,16 +21,19 @@ from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
 from .link import Link, Peer, open_link, parse_link
+from .log_receiver import LogReceiver
+from .log_stream import LogStream
+from .reader import AUTOPILOT, LinkReader, ReadAhead, Received
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
 
 _TICK: Final = 0.25  # s
 _HEARTBEAT_INTERVAL: Final = 1.0  # s
-_MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
+_STATUS_INTERVAL: Final = 1.0  # s between reports on ULog streams
 # Of a companion computer: unlike a ground station, its loss triggers no failsafe.
 _SYSTEM: Final = 245
-_AUTOPILOT: Final = 1  # component id; cameras, gimbals and ground stations have others
+_COMPONENT: Final = dialect.MAV_COMP_ID_ONBOARD_COMPUTER
 
 
 class MavlinkSource:
@@ -42,76 +47,97 @@ class MavlinkSource:
     def __init__(self, link: str, options: MavlinkOptions, _: SourceContext) -> None:
         parse_link(link)
         known = {topic for topic, _ in CONVERSIONS.values()}
-        if known.isdisjoint(options.chosen_topics or known):
+        if not options.log and known.isdisjoint(options.chosen_topics or known):
             reason = f"MAVLink has none of these topics; choose from {', '.join(sorted(known))}"
             raise ConfigError(f"mavlink:{link}", reason, key="topics")
         self._link = link
         self._options = options
 
-    def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | None]:
+    def listen(self, _: Session | None) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
         """Receive; raise SourceError if the link cannot be opened or breaks."""
         with closing(open_link(self._link, baud=self._options.baud)) as link:
             try:
-                yield from _LinkSession(link, self._options, name=self._link).run()
+                with closing(_LinkSession(link, self._options, name=self._link)) as session:
+                    yield from session.run()
             except OSError as exc:
                 reason = (exc.strerror or str(exc)).lower()
                 raise SourceError(f"mavlink:{self._link}", f"the link broke ({reason})") from exc
 
 
 class _LinkSession:
-    """One open link: parse messages, request streams, send heartbeats."""
+    """One open link: convert messages, request streams, send heartbeats; with `log=`, publish the ULog streams."""
 
     def __init__(self, link: Link, options: MavlinkOptions, *, name: str) -> None:
-        self._link = link
-        self._options = options
-        self._name = name
-        self._sender = dialect.MAVLink(None, _SYSTEM, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
-        self._parser = _new_parser()
+        self._link, self._options, self._name = link, options, name
+        self._sender = dialect.MAVLink(None, _SYSTEM, _COMPONENT)
+        self._sending = threading.Lock()
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
+        self._logs: dict[int, LogStream] = {}
+        self._receiver = LogReceiver(options, name, self._send, system=_SYSTEM, component=_COMPONENT)
+        reader = LinkReader(link, name=name)
+        self._ahead = ReadAhead(reader, self._receiver) if options.log else None
+        self._read = self._ahead.read if self._ahead else reader.read
 
-    def run(self) -> Iterator[SourceMessage | Rejection | None]:
-        next_requests = next_heartbeat = 0.0
+    def run(self) -> Iterator[SourceMessage | Rejection | LogStreamStatus | None]:
+        next_requests = next_heartbeat = next_status = 0.0
         while True:
-            for data, peer in self._link.read(_TICK):
-                for message in self._parse(data):
-                    yield self._handle(message, peer)
-                if not self._link.stream and self._parser.buf_len():
-                    yield Rejection(self._name, f"{self._parser.buf_len()} bytes of a truncated message")
+            for item in self._read(_TICK):
+                if isinstance(item, Rejection):
+                    yield item
+                elif item.piece is not None:
+                    if (log := self._log_of(item.system)) is not None:
+                        yield from log.add(item.piece, item.time)
+                    self._handle(item)  # for its sequence number
+                else:
+                    yield self._handle(item)
             yield None
             now = time.monotonic()
             if now >= next_requests:
                 next_requests = now + _TICK
                 self._send_requests(now)
+                for log in self._logs.values():
+                    log.log_changes(now)
             if now >= next_heartbeat:
                 next_heartbeat = now + _HEARTBEAT_INTERVAL
                 self._send_heartbeat()
+            if now >= next_status:
+                next_status = now + _STATUS_INTERVAL
+                for system, log in self._logs.items():
+                    yield log.status(now)
+                    self._send(dialect.MAVLink_timesync_message(0, time.monotonic_ns()), self._peers[system])
 
-    def _parse(self, data: bytes) -> list[Any]:
-        if not self._link.stream or len(self._parser.buf) > _MAX_BUFFER:
-            # Half a message in one datagram must not consume the next one, which may have another sender.
-            self._parser = _new_parser()
-        return self._parser.parse_buffer(data) or []
+    def close(self) -> None:
+        """End the ULog streams."""
+        if self._ahead is not None:
+            self._ahead.close()
+        for log in self._logs.values():
+            log.close()
 
-    def _handle(self, message: Any, peer: Peer) -> SourceMessage | Rejection | None:
-        raw = bytes(message.get_msgbuf())
-        if message.get_type() == "BAD_DATA":
-            return Rejection(self._name, f"{len(raw)} bytes that are not MAVLink")
-        # If the dialect does not have the message, only its header can be parsed.
-        sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
-        if not system or component != _AUTOPILOT:
-            return None
-        now = time.monotonic()
+    def _handle(self, received: Received) -> SourceMessage | Rejection | None:
+        message, system, now = received.message, received.system, received.time
         vehicle = self._vehicles.get(system)
         if vehicle is None:
             vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
-        self._peers[system] = peer
-        vehicle.track_sequence(sequence, now)
+        self._peers[system] = received.peer
+        vehicle.track_sequence(received.sequence, now)
+        log = self._log_of(system)
+        if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
+            log.add_timesync(message.tc1 / 1e9, message.ts1 / 1e9, now)
         converted = vehicle.handle(message, now)
         if isinstance(converted, SourceMessage) and converted.rebooted:
             address = Address(converted.address.vehicle, DEFAULT_TOPIC)
             _log.warning("%s: the vehicle rebooted", address, extra=about("rebooted", address, source=self._name))
-        return converted
+        if log is None or converted is None or converted.address is None or not log.carries(converted.address):
+            return converted
+        return None
+
+    def _log_of(self, system: int) -> LogStream | None:
+        """Return the ULog stream of a vehicle; None without `log=`, or before the first heartbeat."""
+        log = self._logs.get(system)
+        if log is None and (client := self._receiver.client(system)) is not None:
+            log = self._logs[system] = LogStream(self._name_of(system), self._options, client)
+        return log
 
     def _name_of(self, system: int) -> str:
         configured = self._options.vehicles
@@ -124,7 +150,7 @@ class _LinkSession:
                 number, rate = request
                 command = dialect.MAV_CMD_SET_MESSAGE_INTERVAL if rate else dialect.MAV_CMD_REQUEST_MESSAGE
                 parameters = [number, 1e6 / rate if rate else 0, 0, 0, 0, 0, 0]
-                message = dialect.MAVLink_command_long_message(system, _AUTOPILOT, command, 0, *parameters)
+                message = dialect.MAVLink_command_long_message(system, AUTOPILOT, command, 0, *parameters)
                 self._send(message, self._peers[system])
 
     def _send_heartbeat(self) -> None:
@@ -136,11 +162,6 @@ class _LinkSession:
             self._send(heartbeat, peer)
 
     def _send(self, message: Any, peer: Peer) -> None:
-        self._link.send(message.pack(self._sender), peer)
-        self._sender.seq = (self._sender.seq + 1) % 256
-
-
-def _new_parser() -> Any:
-    parser = dialect.MAVLink(None)
-    parser.robust_parsing = True
-    return parser
+        with self._sending:  # the thread that reads the link acknowledges its data
+            self._link.send(message.pack(self._sender), peer)
+            self._sender.seq = (self._sender.seq + 1) % 256

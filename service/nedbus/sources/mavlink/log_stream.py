@@ -1,0 +1,212 @@
+"""The ULog stream of one vehicle: reassembled bytes in, messages out, with its losses, its delay and its file."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from nedbus.client import LogStreamStatus
+from nedbus.errors import AddressError, OutputError
+from nedbus.log_event import about
+from nedbus.sources.options import MavlinkOptions
+from nedbus.sources.source import Rejection, SourceMessage
+from nedbus.ulog import Damage, Data, Subscription, UlogError, UlogParser, address_of, definition_of
+from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
+
+from .log_client import LogStatus, LogStreamClient
+from .log_file import LogFile
+from .log_reassembly import Piece
+
+_log = logging.getLogger(__name__)
+
+SOURCE: Final = "mavlink-ulog"
+"""`sample.source` of a message from the stream; that of a converted one is `mavlink`."""
+
+_WINDOW: Final = 1.0  # s over which rate and delay are measured
+_PIECE: Final = 249  # bytes of a LOGGING_DATA
+_DATA_HEADER: Final = 5  # bytes of a record before its message
+_MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
+
+
+class LogStream:
+    """State of the stream of one vehicle, in the thread of the source.
+
+    `client`: its requests and acknowledgements, in the thread that reads the link.
+    """
+
+    def __init__(self, name: str, options: MavlinkOptions, client: LogStreamClient) -> None:
+        self._name, self._client = name, client
+        self._topics = options.chosen_topics
+        self._folder = Path(options.save).expanduser() if options.save else None
+        self._file: LogFile | None = None
+        self._logged = LogStatus("idle")
+        self._carried: set[Address] = set()
+        self._received = self._gaps = self._lost = self._at_least = self._at_most = self._undecodable = 0
+        self._last_piece: float | None = None
+        self._owed = 0  # losses that the next message reports
+        self._unsynchronised = 0  # pieces since the last gap
+        self._clock: tuple[float, float] | None = None  # the vehicle's minus ours [s], and when it was measured
+        self._round_trip = math.inf
+        self._window_start = self._rate = self._delays = 0.0
+        self._window_bytes = self._delayed = 0
+        self._delay: float | None = None
+        self._restart()
+
+    def _restart(self) -> None:
+        """Forget the definitions: those of the next stream may differ."""
+        self._parser = UlogParser(verify=False)
+        self._routes: dict[int, tuple[Subscription, Address, Definition[Any]] | None] = {}
+        self._damages: set[str] = set()
+
+    @property
+    def is_streaming(self) -> bool:
+        """True while messages come from the stream."""
+        return self._client.status.state == "streaming"
+
+    def carries(self, address: Address) -> bool:
+        """Return whether messages of an address come from the stream, so that none are converted."""
+        return self.is_streaming and address in self._carried
+
+    def add(self, piece: Piece, now: float) -> Iterator[SourceMessage | Rejection]:
+        """Yield the messages that a piece completes."""
+        if piece.begins:
+            self._restart()
+            self._open_file()
+        if piece.gap:
+            self._count_gap(piece.lost, now)
+        if piece.verdict == "unsynchronised":
+            self._at_most += self._most_records(_PIECE)
+        self._last_piece = now
+        if not piece.data:
+            return
+        self._received += len(piece.data)
+        self._window_bytes += len(piece.data)
+        self._save(piece.data)
+        known, before = self._parser, self._parser.undecodable
+        try:
+            records = known.feed(piece.data)
+        except UlogError as exc:
+            yield Rejection(f"{self._name} ULog stream", str(exc))
+            return
+        self._undecodable += known.undecodable - before
+        for record in records:
+            if isinstance(record, Data):
+                route = self._routes.get(record.subscription.message_id)
+                if route is None or route[0] is not record.subscription:
+                    route = yield from self._find_route(record.subscription)
+                if route is not None:
+                    yield self._message(record, route[1], route[2], now)
+            elif isinstance(record, Damage) and record.reason not in self._damages and len(self._damages) < 100:
+                self._damages.add(record.reason)
+                yield Rejection(f"{self._name} ULog stream", record.reason)
+
+    def add_timesync(self, vehicle_time: float, sent: float, now: float) -> None:
+        """Take the answer to a TIMESYNC request that was sent at `sent`; the shortest round trip is the best one."""
+        is_old = self._clock is None or now - self._clock[1] > _MAX_OFFSET_AGE
+        if 0 <= now - sent <= self._round_trip or is_old:
+            self._round_trip = now - sent
+            self._clock = vehicle_time - (sent + now) / 2, now
+
+    def log_changes(self, now: float) -> None:
+        """Log the state of the stream if it has changed, and forget what it carried when it has ended."""
+        status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
+        if not self.is_streaming:
+            self._carried.clear()
+        if status == self._logged:
+            return
+        self._logged = status
+        if status.state == "streaming":
+            header = self._client.header_seconds or 0.0
+            text = f"streaming; the header took {header:.1f} s, a gap in the vehicle's own log"
+            _log.info("%s: ULog stream: %s", address, text, extra=about("log-stream", address))
+        elif status.reason is not None:
+            extra = about("log-stream", address, reason=status.text)
+            _log.warning("%s: no ULog stream: %s", address, status.text, extra=extra)
+
+    def status(self, now: float) -> LogStreamStatus:
+        """Return the status; measures rate and delay since the last call."""
+        seconds = now - self._window_start
+        if seconds >= _WINDOW:
+            self._rate = self._window_bytes / seconds
+            self._delay = self._delays / self._delayed if self._delayed else None
+            self._window_start, self._window_bytes, self._delays, self._delayed = now, 0, 0.0, 0
+        state = self._client.status
+        return LogStreamStatus(
+            vehicle=self._name, state=state.state, reason=state.text, received=self._received, rate=self._rate,
+            delay=self._delay, header_time=self._client.header_seconds, gaps=self._gaps, lost=self._lost,
+            lost_at_least=self._at_least, lost_at_most=self._at_most, undecodable=self._undecodable,
+            saved=str(self._file.path) if self._file else "",
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _find_route(
+        self, subscription: Subscription
+    ) -> Iterator[Rejection] | Any:  # a generator that returns the route
+        """Find address and definition of a subscription; None if it is not selected, or cannot be published."""
+        route = None
+        if self._topics is None or subscription.name in self._topics:
+            try:
+                route = subscription, address_of(self._name, subscription), definition_of(subscription)
+            except (AddressError, ValueError) as exc:
+                yield Rejection(f"{self._name} {subscription.name}", str(exc))
+        self._routes[subscription.message_id] = route
+        return route
+
+    def _message(self, record: Data, address: Address, definition: Definition[Any], now: float) -> SourceMessage:
+        fields = record.subscription.layout.decode(record.payload)
+        timestamp = fields.get("timestamp")
+        if self._clock is not None and isinstance(timestamp, int):
+            self._delays += now + self._clock[0] - timestamp / 1e6
+            self._delayed += 1
+        self._carried.add(address)
+        lost, self._owed = self._owed, 0
+        return SourceMessage(0.0, address, fields, lost, definition=definition, source=SOURCE)
+
+    def _count_gap(self, lost: int, now: float) -> None:
+        """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""
+        self._gaps += 1
+        self._lost += lost
+        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
+        least = max(1, math.ceil(_PIECE * lost / max(sizes, default=_PIECE)))
+        self._at_least += least
+        self._owed += least
+        self._at_most += self._most_records(_PIECE * (lost + 1)) + 1  # the end of the gap, and the record that it cut
+        self._parser.gap()
+        if self._file is not None:
+            try:
+                self._file.mark_gap(now - (self._last_piece or now))
+            except OutputError as exc:
+                self._end_file(exc)
+
+    def _most_records(self, size: int) -> int:
+        sizes = [each.layout.size + _DATA_HEADER for each in self._parser.subscriptions.values()]
+        return math.ceil(size / min(sizes, default=_DATA_HEADER))
+
+    def _open_file(self) -> None:
+        self.close()
+        if self._folder is not None:
+            try:
+                self._file = LogFile(self._folder, self._name)
+                _log.info("%s: ULog stream saved to %s", self._name, self._file.path, extra=about("log-stream"))
+            except OutputError as exc:
+                self._end_file(exc)
+
+    def _save(self, data: bytes) -> None:
+        if self._file is not None:
+            try:
+                self._file.write(data)
+            except OutputError as exc:
+                self._end_file(exc)
+
+    def _end_file(self, error: OutputError) -> None:
+        """Give up saving this stream; publishing goes on."""
+        self.close()
+        _log.error("%s: the ULog stream is no longer saved: %s", self._name, error, extra=about("log-stream"))

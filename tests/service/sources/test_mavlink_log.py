@@ -1,0 +1,131 @@
+"""`mavlink:LINK?log=1`: the ULog stream that a real PX4 recorded, published in full and compared with its own log."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final, cast
+
+import pytest
+from pyulog import ULog
+
+from nedbus.client import LogStreamStatus
+from nedbus.sources import LiveSource, SourceMessage, parse_source
+from nedbus.ulog import Data, UlogParser
+from tests.peers.ports import free_port
+from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording
+
+FLIGHT: Final = STREAMS / "ulog_stream_flight1.bin.gz"
+
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.slow,
+    pytest.mark.skipif(not FLIGHT.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+]
+
+
+class Received:
+    """What one source yields until the recording has been sent and nothing more arrives."""
+
+    def __init__(self, options: str, name: str = "ulog_stream_flight1", **peer: Any) -> None:
+        port = free_port()
+        self.stream: list[SourceMessage] = []
+        self.converted: list[SourceMessage] = []
+        self.status = LogStreamStatus()
+        self.reasons: set[str] = set()
+        source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"))
+        with (
+            closing(cast("Any", source.listen(None))) as items,
+            Px4LogStream(read_recording(STREAMS / f"{name}.bin.gz"), port, speed=None, **peer) as self.peer,
+        ):
+            quiet = 0
+            for item in items:
+                is_quiet = not isinstance(item, SourceMessage) and self.peer.finished.is_set()
+                quiet = quiet + is_quiet if is_quiet else 0
+                if isinstance(item, SourceMessage):
+                    (self.stream if item.source else self.converted).append(item)
+                elif isinstance(item, LogStreamStatus):
+                    self.status = item
+                    self.reasons.add(item.reason)
+                if quiet > 8:
+                    break
+
+
+def logged_messages(path: Path) -> dict[tuple[str, int], set[str]]:
+    """Return the messages of a vehicle's own log by topic and instance, as text, which NaN equals itself in."""
+    parser, found = UlogParser(verify=True), defaultdict[tuple[str, int], set[str]](set)
+    for record in [*parser.feed(path.read_bytes()), *parser.close()]:
+        if isinstance(record, Data):
+            subscription = record.subscription
+            found[subscription.name, subscription.multi_id].add(repr(subscription.layout.decode(record.payload)))
+    return found
+
+
+def compare(received: Received, path: Path) -> int:
+    """Return the number of messages that the log has; those of the hole at the header are not in it."""
+    logged = logged_messages(path)
+    missing = [
+        each for each in received.stream
+        if repr(dict(each.fields)) not in logged[each.address.topic, each.address.instance or 0]
+    ]  # fmt: skip
+    start = min(cast("int", each.fields["timestamp"]) for each in received.stream)
+    assert all(cast("int", each.fields["timestamp"]) < start + 2_000_000 for each in missing), missing[-3:]
+    return len(received.stream) - len(missing)
+
+
+def test_stream_of_px4_equals_its_own_log() -> None:
+    """All topics of the stream arrive without a gap, each message equal to the own log of a real PX4 (SITL)."""
+    received = Received("log=1")
+    status = received.status
+    assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
+    assert status.header_time is not None
+    assert compare(received, STREAMS / "ulog_stream_flight1.ulg") >= 47_000
+    counts = Counter(each.address.topic for each in received.stream)
+    assert counts["vehicle_local_position"] > 3_900
+
+
+def test_converted_topics_give_way_to_the_stream() -> None:
+    """A topic is converted until the stream brings it, never both; topics that the stream lacks stay converted."""
+    received = Received("log=1&topics=vehicle_attitude,vehicle_local_position,home_position")
+    first = min(cast("int", each.fields["timestamp"]) for each in received.stream)
+    after = Counter(
+        each.address.topic for each in received.converted if cast("int", each.fields["timestamp"]) > first + 2_000_000
+    )
+    assert set(after) <= {"home_position"}
+    assert {each.address.topic for each in received.converted} >= {"vehicle_attitude", "vehicle_local_position"}
+
+
+@pytest.mark.parametrize("loss", [0.01, 0.05])
+def test_lossy_link_gives_no_wrong_value(loss: float) -> None:
+    """With datagrams dropped, each message that arrives is one of the log's; the losses lie within the bounds."""
+    whole, received = Received("log=1"), Received("log=1", loss=loss, seed=3)
+    known = Counter((each.address, cast("int", each.fields["timestamp"])) for each in whole.stream)
+    got = Counter((each.address, cast("int", each.fields["timestamp"])) for each in received.stream)
+    assert got <= known
+    compare(received, STREAMS / "ulog_stream_flight1.ulg")
+    status = received.status
+    assert status.gaps > 10
+    assert len(received.stream) + status.lost_at_least <= len(whole.stream) + 3 * status.gaps
+    assert len(received.stream) + status.lost_at_most >= len(whole.stream)
+
+
+def test_saved_stream_is_the_log(tmp_path: Path) -> None:
+    """A saved stream opens in pyulog, with every message; nothing is marked as lost."""
+    received = Received(f"log=1&save={tmp_path}")
+    (path,) = tmp_path.glob("1_*.ulg")
+    log = ULog(str(path))
+    assert not log.file_corruption
+    assert sum(len(each.data["timestamp"]) for each in log.data_list) == len(received.stream)
+    assert log.dropouts == []
+
+
+@pytest.mark.parametrize(("peer", "reason"), [
+    ({"refusal": 1}, "another client has it"), ({"refusal": 2}, "5000 B/s"),
+])  # fmt: skip
+def test_refused_stream_names_the_reason(peer: dict[str, Any], reason: str) -> None:
+    """A refusal is reported with its cause, and everything is converted from MAVLink as without `log=`."""
+    received = Received("log=1", **peer)
+    assert not received.stream
+    assert len(received.converted) > 1000
+    assert any(reason in each for each in received.reasons), received.reasons
