@@ -1,15 +1,12 @@
 """ULog, PX4's log format: an incremental parser for files and streams, and the definitions of logged messages."""
 
-from __future__ import annotations
-
 from .definitions import address_of, definition_of
 from .layout import PayloadField, PayloadLayout
 from .parser import UlogParser
-from .records import (
+from .records import (  # fmt: skip  # fmt: skip
     Damage,
     Data,
     Dropout,
-    FlagBits,
     Format,
     Header,
     Information,
@@ -29,7 +26,6 @@ __all__ = [
     "Damage",
     "Data",
     "Dropout",
-    "FlagBits",
     "Format",
     "Header",
     "Information",

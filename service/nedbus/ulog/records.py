@@ -9,16 +9,18 @@ from typing import Final, NamedTuple
 
 from nedbus_msgs import BASES
 
-from .layout import BASIC_TYPES, PayloadField, PayloadLayout, is_format
+from .layout import BASIC_TYPES, FIELD, PayloadField, PayloadLayout
 
-SYNC_MAGIC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+SYNC: Final = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
+"""Content of a sync record."""
 
 _MAX_TEXT: Final = 1024  # bytes of a logged text; PX4 logs at most 127
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_/-]{0,254}")
+_FORMAT = re.compile(rf"([A-Za-z][\w/-]*):((?:{FIELD.pattern})*)", re.ASCII)
+_NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
 _KEY = re.compile(rb"(\w+)(\[\d{1,5}\])? (\S[^\0]*)")
 
 Value = int | float | bool | str | bytes
-"""Value of an information or a parameter: bytes for an array of numbers."""
+"""Value of an information or a parameter; an array of numbers is bytes."""
 
 
 class UlogError(ValueError):
@@ -30,14 +32,6 @@ class Header(NamedTuple):
 
     version: int
     timestamp: int
-
-
-class FlagBits(NamedTuple):
-    """Flags of a log; `appended`: offsets of data that were appended after logging ended."""
-
-    compat: bytes
-    incompat: bytes
-    appended: tuple[int, ...]
 
 
 class Format(NamedTuple):
@@ -78,7 +72,10 @@ class ParameterDefault(NamedTuple):
 
 
 class Subscription(NamedTuple):
-    """One instance of a topic whose data follow under a message id."""
+    """One instance of a topic whose data follow under a message id.
+
+    Names of nested fields are flat: `esc[0].rpm` of the log is `esc_0_rpm`.
+    """
 
     message_id: int
     multi_id: int
@@ -123,7 +120,7 @@ class LoggedText(NamedTuple):
 
 
 class Sync(NamedTuple):
-    """A mark that is written twice a second, from which a parser can resume after damage."""
+    """A mark in the log, twice a second."""
 
 
 class Dropout(NamedTuple):
@@ -141,19 +138,10 @@ class Damage(NamedTuple):
     is_end: bool = False
 
 
-class Added(NamedTuple):
-    """The content of a subscription record, before its format is known."""
-
-    multi_id: int
-    message_id: int
-    name: str
-
-
 Record = (
-    Header | FlagBits | Format | Information | MultiInformation | Parameter | ParameterDefault | Subscription
-    | Unsubscription | Data | LoggedText | Sync | Dropout | Damage
+    Header | Format | Information | MultiInformation | Parameter | ParameterDefault | Subscription | Unsubscription
+    | Data | LoggedText | Sync | Dropout | Damage
 )  # fmt: skip
-Content = Record | Added
 
 
 def read_header(data: bytes) -> Header:
@@ -163,64 +151,62 @@ def read_header(data: bytes) -> Header:
     return Header(data[7], int.from_bytes(data[8:16], "little"))
 
 
-def read_flags(content: bytes) -> FlagBits:
-    """Read flags; raise UlogError for an unknown incompatible one: the specification requires to refuse the log."""
-    compat, incompat, *appended = struct.unpack_from("<8s8s3Q", content)
-    if incompat[0] & ~1 or any(incompat[1:]):
-        raise UlogError(f"it has unknown incompatible flags ({incompat.hex()}): read it with a newer parser")
-    return FlagBits(compat, incompat, tuple(filter(None, appended)) if incompat[0] & 1 else ())
+def read_flags(content: bytes) -> tuple[int, ...]:
+    """Return the offsets of appended data in flag bits.
+
+    Raises UlogError for an unknown incompatible flag: the specification requires to refuse the log.
+    """
+    incompatible, *offsets = struct.unpack_from("<8xQ3Q", content.ljust(40, b"\0"))
+    if incompatible & ~1:
+        raise UlogError(f"it has unknown incompatible flags ({incompatible:#x}): read it with a newer version")
+    return tuple(offsets) if incompatible else ()
 
 
 def _format(content: bytes) -> Format:
-    name, colon, fields = content.decode("ascii").partition(":")
-    if not (colon and _NAME.fullmatch(name) and is_format(fields)):
-        raise ValueError("no format")
-    return Format(name, fields)
+    found = _FORMAT.fullmatch(content.decode("ascii"))
+    if not found:
+        raise ValueError
+    return Format(found[1], found[2])
 
 
 def _key_and_value(content: bytes) -> tuple[str, Value]:
-    end = 1 + content[0]
-    found = _KEY.fullmatch(content[1:end])
-    if found is None:
-        raise ValueError("no key")
-    kind, value, key = BASIC_TYPES[found[1].decode()], content[end:], found[3].decode()
+    found, value = _KEY.fullmatch(content[1 : 1 + content[0]]), content[1 + content[0] :]
+    if not found:
+        raise ValueError
+    kind, key = BASIC_TYPES[found[1].decode()], found[3].decode()
     if found[2]:  # PX4 does not always log the length that it declares
         return key, value.decode(errors="replace") if found[1] == b"char" else value
     return key, struct.unpack_from("<" + BASES[kind.base].code, value)[0]
 
 
-def _text(content: bytes, offset: int) -> tuple[int, int, str]:
-    """Read level, timestamp and text; `offset`: that of the timestamp."""
-    level = content[0] - ord("0")
-    if not 0 <= level < 8 or len(content) > offset + 8 + _MAX_TEXT:
-        raise ValueError("no logged text")
-    return level, struct.unpack_from("<Q", content, offset)[0], content[offset + 8 :].decode(errors="replace")
+def _text(content: bytes, tag: int | None = None) -> LoggedText:
+    """Read a text whose level is followed by its timestamp."""
+    level, timestamp = struct.unpack_from("<BQ", content)
+    if not 0x30 <= level <= 0x37 or len(content) > _MAX_TEXT:
+        raise ValueError
+    return LoggedText(level - 0x30, timestamp, content[9:].decode(errors="replace"), tag)
 
 
-def _tagged_text(content: bytes) -> LoggedText:
-    return LoggedText(*_text(content, 3), struct.unpack_from("<H", content, 1)[0])
-
-
-def _added(content: bytes) -> Added:
+def _subscription(content: bytes) -> Subscription:
     multi_id, message_id = struct.unpack_from("<BH", content)
     name = content[3:].decode("ascii")
     if not _NAME.fullmatch(name):
-        raise ValueError("no name")
-    return Added(multi_id, message_id, name)
+        raise ValueError
+    return Subscription(message_id, multi_id, name, PayloadLayout((), 0, 0))
 
 
 def _sync(content: bytes) -> Sync:
-    if not content.startswith(SYNC_MAGIC):
-        raise ValueError("no sync")
+    if not content.startswith(SYNC):
+        raise ValueError
     return Sync()
 
 
-READERS: Final[Mapping[int, Callable[[bytes], Content]]] = {
-    ord("A"): _added,
-    ord("C"): _tagged_text,
+READERS: Final[Mapping[int, Callable[[bytes], Record]]] = {
+    ord("A"): _subscription,
+    ord("C"): lambda content: _text(content[:1] + content[3:], struct.unpack_from("<H", content, 1)[0]),
     ord("F"): _format,
     ord("I"): lambda content: Information(*_key_and_value(content)),
-    ord("L"): lambda content: LoggedText(*_text(content, 1)),
+    ord("L"): _text,
     ord("M"): lambda content: MultiInformation(*_key_and_value(content[1:]), bool(content[0])),
     ord("O"): lambda content: Dropout(struct.unpack_from("<H", content)[0]),
     ord("P"): lambda content: Parameter(*_key_and_value(content)),
@@ -228,7 +214,9 @@ READERS: Final[Mapping[int, Callable[[bytes], Content]]] = {
     ord("R"): lambda content: Unsubscription(struct.unpack_from("<H", content)[0]),
     ord("S"): _sync,
 }
-"""Reader of each type of record that has content of its own; raises ValueError, LookupError or struct.error."""
+"""Reader of each type of record apart from data; raises ValueError, LookupError or struct.error.
 
-EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC_MAGIC)}
-"""Sizes of records whose content alone tells nothing; with others they are read, but not relied on."""
+A subscription is returned without its layout.
+"""
+EXACT_SIZES: Final[Mapping[int, int]] = {ord("O"): 2, ord("R"): 2, ord("S"): len(SYNC)}
+"""Sizes of records that are recognized by their size; longer ones are read, too."""

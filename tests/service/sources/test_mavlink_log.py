@@ -26,7 +26,7 @@ pytestmark = [
 
 
 class Received:
-    """What one source yields until the recording has been sent and nothing more arrives."""
+    """Messages that one source yields until the recording has been sent and nothing more arrives."""
 
     def __init__(self, options: str, name: str = "ulog_stream_flight1", **peer: Any) -> None:
         port = free_port()
