@@ -26,9 +26,11 @@ _PX4_PATH: Final = ("fmu", "out")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@dataclass(frozen=True, slots=True)
 class Address:
     """The address of a stream: vehicle, topic and, where the topic has instances, the uORB instance.
+
+    Sorted in this order, without an instance before instance 0.
 
     Raises AddressError for a vehicle that is not 1 to 64 of A-Z a-z 0-9 _ -, a topic that `get_topic` rejects, a
     missing instance where the topic has instances, or an instance where it has none.
@@ -84,6 +86,13 @@ class Address:
     def stream(self) -> str:
         """The topic, with its instance where it has one: the part of the key after the vehicle."""
         return self.topic if self.instance is None else f"{self.topic}/{self.instance}"
+
+    def __lt__(self, other: Address) -> bool:
+        return self._sort_key < other._sort_key
+
+    @property
+    def _sort_key(self) -> tuple[str, str, int]:
+        return self.vehicle, self.topic, -1 if self.instance is None else self.instance
 
     def __str__(self) -> str:
         return f"{self.vehicle}/{self.stream}"

@@ -169,3 +169,9 @@ def test_errors_can_be_pickled() -> None:
         Address("a b", "vehicle_local_position")
     again = pickle.loads(pickle.dumps(info.value))
     assert (type(again), str(again), again.given) == (AddressError, str(info.value), "a b")
+
+
+def test_addresses_with_and_without_instance_are_sorted() -> None:
+    """A topic without a file has a plain first instance, and numbers for the others."""
+    plain, second, other = Address("1", "logger_status"), Address("1", "logger_status", 1), Address("1", "event")
+    assert sorted([second, plain, other]) == [other, plain, second]
