@@ -12,17 +12,27 @@ from pyulog import ULog
 
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, SourceMessage, parse_source
+from nedbus.sources.mavlink import reader
 from nedbus.ulog import Data, UlogParser
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording
 
 FLIGHT: Final = STREAMS / "ulog_stream_flight1.bin.gz"
+MESSAGES: Final = 47_708
+"""Messages of all topics in the stream."""
 
 pytestmark = [
     pytest.mark.logs,
+    pytest.mark.timeout(400),  # a flight of 84 s, which coverage slows down
     pytest.mark.slow,
     pytest.mark.skipif(not FLIGHT.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let messages wait: a flight is sent here as fast as the thread that reads the link takes it."""
+    monkeypatch.setattr(reader, "_MAX_WAITING", 1_000_000)
 
 
 class Received:
@@ -37,7 +47,9 @@ class Received:
         source = cast("LiveSource", parse_source(f"mavlink:udpin:127.0.0.1:{port}?{options}").open_source(vehicle="1"))
         with (
             closing(cast("Any", source.listen(None))) as items,
-            Px4LogStream(read_recording(STREAMS / f"{name}.bin.gz"), port, speed=None, **peer) as self.peer,
+            Px4LogStream(
+                read_recording(STREAMS / f"{name}.bin.gz"), port, speed=None, deadline=300, **peer
+            ) as self.peer,
         ):
             quiet = 0
             for item in items:
@@ -74,15 +86,19 @@ def compare(received: Received, path: Path) -> int:
     return len(received.stream) - len(missing)
 
 
-def test_stream_of_px4_equals_its_own_log() -> None:
-    """All topics of the stream arrive without a gap, each message equal to the own log of a real PX4 (SITL)."""
-    received = Received("log=1")
+def test_stream_of_px4_equals_its_own_log(tmp_path: Path) -> None:
+    """All topics arrive without a gap, each message equal to the own log of a real PX4 (SITL), and so is the file."""
+    received = Received(f"log=1&save={tmp_path}")
     status = received.status
     assert (status.state, status.gaps, status.lost, status.undecodable) == ("streaming", 0, 0, 0), received.reasons
     assert status.header_time is not None
     assert compare(received, STREAMS / "ulog_stream_flight1.ulg") >= 47_000
-    counts = Counter(each.address.topic for each in received.stream)
-    assert counts["vehicle_local_position"] > 3_900
+    assert len(received.stream) == MESSAGES
+    (path,) = tmp_path.glob("1_*.ulg")
+    log = ULog(str(path))
+    assert not log.file_corruption
+    assert sum(len(each.data["timestamp"]) for each in log.data_list) == MESSAGES
+    assert log.dropouts == []
 
 
 def test_converted_topics_give_way_to_the_stream() -> None:
@@ -96,28 +112,14 @@ def test_converted_topics_give_way_to_the_stream() -> None:
     assert {each.address.topic for each in received.converted} >= {"vehicle_attitude", "vehicle_local_position"}
 
 
-@pytest.mark.parametrize("loss", [0.01, 0.05])
-def test_lossy_link_gives_no_wrong_value(loss: float) -> None:
-    """With datagrams dropped, each message that arrives is one of the log's; the losses lie within the bounds."""
-    whole, received = Received("log=1"), Received("log=1", loss=loss, seed=3)
-    known = Counter((each.address, cast("int", each.fields["timestamp"])) for each in whole.stream)
-    got = Counter((each.address, cast("int", each.fields["timestamp"])) for each in received.stream)
-    assert got <= known
+def test_lossy_link_gives_no_wrong_value() -> None:
+    """With 5 % of the datagrams dropped each message that arrives is the log's; the losses lie within the bounds."""
+    received = Received("log=1", loss=0.05, seed=3)
     compare(received, STREAMS / "ulog_stream_flight1.ulg")
     status = received.status
-    assert status.gaps > 10
-    assert len(received.stream) + status.lost_at_least <= len(whole.stream) + 3 * status.gaps
-    assert len(received.stream) + status.lost_at_most >= len(whole.stream)
-
-
-def test_saved_stream_is_the_log(tmp_path: Path) -> None:
-    """A saved stream opens in pyulog, with every message; nothing is marked as lost."""
-    received = Received(f"log=1&save={tmp_path}")
-    (path,) = tmp_path.glob("1_*.ulg")
-    log = ULog(str(path))
-    assert not log.file_corruption
-    assert sum(len(each.data["timestamp"]) for each in log.data_list) == len(received.stream)
-    assert log.dropouts == []
+    assert status.gaps > 100
+    assert len(received.stream) + status.lost_at_least <= MESSAGES + 5 * status.gaps  # texts, marks and parameters too
+    assert len(received.stream) + status.lost_at_most >= MESSAGES
 
 
 @pytest.mark.parametrize(("peer", "reason"), [

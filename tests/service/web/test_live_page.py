@@ -40,7 +40,7 @@ def test_all_commands_are_known() -> None:
     """No command on the page that no test runs, but the installation."""
     others = set(COMMANDS) - {*SERVES, *ROS2}
     assert others == {"nedbus echo vehicle_local_position", 'pip install ".[mavlink]"'}
-    assert (len(SERVES), len(ROS2)) == (5, 6)
+    assert (len(SERVES), len(ROS2)) == (6, 6)
 
 
 def test_hashes_are_those_of_the_layouts() -> None:
@@ -54,7 +54,7 @@ def test_vehicle_is_echoed(run_nedbus: Start, endpoint: str, port: int, fly: Fly
     """The service as on the page, a vehicle, and the echo of the page: a line of that vehicle."""
     where = endpoint if "--connect" in command else free_endpoint()
     others = dict.fromkeys(("tcp/192.168.1.5:7447", "tcp/0.0.0.0:7447"), where)
-    arguments = arguments_of(command, **others, **{"mavlink:udpin:0.0.0.0:14540": f"mavlink:udpin:127.0.0.1:{port}"})
+    arguments = arguments_of(command.replace("0.0.0.0:14540", f"127.0.0.1:{port}"), **others)
     if where not in arguments:
         arguments += ["--listen", where]  # the page's own port may be taken
     service = run_nedbus(*arguments)

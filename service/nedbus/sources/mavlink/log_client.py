@@ -1,4 +1,4 @@
-"""Client of PX4's ULog stream for one vehicle, as a state machine: events in, messages to send out; no I/O, no clock.
+"""Client of one vehicle's ULog stream, as a state machine: events in, commands to send out; no I/O, no clock.
 
 Times are monotonic seconds of the caller's clock.
 """
@@ -12,34 +12,30 @@ from typing import Final, Literal, NamedTuple
 
 from pymavlink.dialects.v20 import common as dialect
 
-_TRIES: Final = 3  # of a command without an answer
-_RESTARTS: Final = 2  # times that STOP and START follow a START that was accepted without data
-_JUDGED: Final = 32  # messages of the header whose round trips are enough to judge the link
-_EXPECTED_MESSAGES: Final = 400  # of a header; 274 to 410 were seen
-_STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row before silence: PX4 sends 44 when it is stopped, and seldom 2 else
-_DECAY: Final = 0.98  # of the longest interval between messages, at each message
 _COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
+_TRIES: Final = 3  # of a command without an answer
+_RESTARTS: Final = 2  # after a START that was accepted without data
+_JUDGED: Final = 32  # messages of a header after which its duration is estimated
+_EXPECTED: Final = 400  # messages of a header; 274 to 410 were seen
+_STOP_TAIL: Final = 10  # LOGGING_DATA_ACKED in a row, after which silence is a STOP; PX4 sends 44, else 2 at most
+_DECAY: Final = 0.98  # of the longest interval between messages, with each message
 
 
 @dataclass(frozen=True, slots=True)
 class LogStreamTimes:
     """Times of the protocol [s].
 
-    `answer`: wait for a COMMAND_ACK, doubled for each repetition of START.
-    `first_data`: wait for LOGGING_DATA_ACKED after START was accepted.
-    `pause`: between STOP and START; PX4 gives up an unacknowledged message after as long.
-    `stall`: wait for the next LOGGING_DATA_ACKED of a header.
-    `silence`: without LOGGING_DATA, after which PX4 is asked, or three times the interval between them if longer.
-    `longest_silence`: of a stream that exists: its synchronisation records alone (22 B/s) fill a message in 11.3 s.
-    `link`: without any message of the vehicle, after which the link is considered lost.
-    `retry`, `slow_retry`: between attempts, after refusals that may pass, and after those that configuration causes.
-    `header`: maximum duration of the header; the vehicle's own log has a hole of the same length.
+    `answer`: wait for a COMMAND_ACK, doubled with each repetition of START, and for the first data.
+    `timeout`: PX4 gives up a message without acknowledgement; also the pause between STOP and START.
+    `silence`: without data, after which PX4 is asked; at least three times the interval of the stream.
+    `longest_silence`: of any stream; its synchronisation records alone (22 B/s) fill a message in 11.3 s.
+    `link`: without any message, after which the link is lost.
+    `retry`, `slow_retry`: after a refusal that may pass, and after one that lies in the configuration or the link.
+    `header`: limit of the header's duration, for which PX4's logger is blocked: a hole in the vehicle's own log.
     """
 
     answer: float = 1.0
-    first_data: float = 1.0
-    pause: float = 2.5
-    stall: float = 2.5
+    timeout: float = 2.5
     silence: float = 1.0
     longest_silence: float = 15.0
     link: float = 3.0
@@ -52,11 +48,9 @@ LogReason = Literal[
     "not_px4", "armed", "taken", "bandwidth", "unsupported", "failed", "no_answer", "no_data", "slow_link", "stalled",
     "silent", "stopped_elsewhere", "link_lost",
 ]  # fmt: skip
-"""Cause of a state: keys of the texts below."""
-
 _TEXTS: Final[Mapping[LogReason, str]] = {
-    "not_px4": "only PX4 streams its ULog, and this autopilot is {}",
-    "armed": "the vehicle is armed; the ULog stream starts once it is disarmed, or in flight with log=armed",
+    "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
+    "armed": "the vehicle is armed: the ULog stream starts after disarming, or in flight with log=armed",
     "taken": "PX4 rejected the ULog stream: another client has it (log=take ends that client's stream), or PX4 logs to"
     " files only (set SDLOG_BACKEND to 3 and reboot the vehicle)",
     "bandwidth": "PX4 denied the ULog stream: the rate of this MAVLink instance is below 5000 B/s; raise MAV_x_RATE, or"
@@ -65,35 +59,30 @@ _TEXTS: Final[Mapping[LogReason, str]] = {
     "failed": "PX4 answered MAV_CMD_LOGGING_START with {}",
     "no_answer": "PX4 does not answer MAV_CMD_LOGGING_START: its logger does not run; set SDLOG_BACKEND to 3 and reboot"
     " the vehicle",
-    "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends nothing: the stream may be bound to another link; stop it"
-    " there or reboot the vehicle",
-    "slow_link": "the header of the ULog stream would take {:.0f} s at {:.0f} ms per acknowledged message, and blocks"
-    " PX4's logger for as long; use a link with a shorter round trip",
+    "no_data": "PX4 accepted MAV_CMD_LOGGING_START, but sends no data: another link may have the stream; stop it there,"
+    " or reboot the vehicle",
+    "slow_link": "the header of the ULog stream would take {:.0f} s, at {:.0f} ms for each acknowledged message, and"
+    " block PX4's logger; use a link with a shorter round trip",
     "stalled": "the header of the ULog stream stalled for {:.1f} s: PX4 does not receive the acknowledgements",
-    "silent": "the ULog stream ended: no LOGGING_DATA for {:.1f} s",
+    "silent": "the ULog stream ended: no data for {:.1f} s",
     "stopped_elsewhere": "another client stopped the ULog stream",
-    "link_lost": "no message from the vehicle for {:.1f} s",
+    "link_lost": "the link was lost: no message from the vehicle for {:.1f} s",
 }
-
-
 _REFUSALS: Final[Mapping[int, LogReason]] = {
     dialect.MAV_RESULT_TEMPORARILY_REJECTED: "taken",
     dialect.MAV_RESULT_DENIED: "bandwidth",
     dialect.MAV_RESULT_UNSUPPORTED: "unsupported",
 }
-
 LogState = Literal[
     "idle", "waiting_for_disarm", "starting", "header", "streaming", "refused", "ended", "stopping", "stopped"
 ]
 
 
 class LogStatus(NamedTuple):
-    """State of the stream, with its cause and a text for the log; they change only together.
+    """State of the stream, its cause, and a text for the log.
 
-    `idle`: no heartbeat yet, or none since a reboot. `waiting_for_disarm`, `refused`: START follows later.
-    `starting`: commands are under way. `header`, `streaming`: data arrive.
-    `ended`: the stream is over, or seems to be; it is started again as the policy allows.
-    `stopping`, `stopped`: after `stop`.
+    `idle`: before the first heartbeat. `starting`: commands are under way. `header`, `streaming`: data arrive.
+    `waiting_for_disarm`, `refused`, `ended`: START is sent again when it may be. `stopping`, `stopped`: by `stop`.
     """
 
     state: LogState
@@ -109,18 +98,16 @@ class Command(NamedTuple):
 
 
 class LogStreamClient:
-    """Requests the ULog stream of one vehicle, acknowledges it, and notices its end.
+    """Requests the stream, acknowledges it, and notices its end, which PX4 does not announce.
 
-    Pass every event to the method for it, and call `tick` several times a second; send the returned commands at once.
-    Log `status` when it changes: repeated attempts do not change it while their outcome is the same.
+    Pass every event to its method, call `tick` several times a second, and send the returned commands at once.
+    Log `status` when it changes; repeated attempts with the same outcome do not change it.
 
-    `log`: "armed" allows the start in flight. "take" allows to end the stream of another client, once until the vehicle
-    reboots. Without it, the only stream that is ended to start anew, once as well, is one to `system` and `component`
-    themselves whose header was missed: that of an earlier process with the same ids.
+    `log`: "armed" allows START in flight; "take" allows STOP of another client's stream, once until the next reboot.
+    Without "take", a rejected client stops only a stream that arrives for its own ids: that of an earlier process.
     `system`, `component`: the MAVLink ids of this client.
-
-    `rejected`: LOGGING_DATA to other ids or from a vehicle that was not asked.
-    `header_seconds`, `round_trip`: duration of the last header, and of its average message [s]; None before.
+    `rejected`: number of messages that were for other ids, or not requested.
+    `header_seconds`: duration of the last header; None before its end.
     """
 
     def __init__(
@@ -134,254 +121,232 @@ class LogStreamClient:
         self._log, self._ids, self._times = log, (system, component), times
         self.rejected = 0
         self.header_seconds: float | None = None
-        self.round_trip: float | None = None
         self._is_px4 = self._armed = False
         self._reset()
 
     def _reset(self) -> None:
-        """Forget the stream, before the first one and after a reboot."""
         self.status = LogStatus("idle")
-        self._asked = self._took_over = False
-        self._has_definitions = False  # of the current stream: it began with its header
-        self._acknowledges = True
         self._awaited: Literal["start", "stop", "data"] | None = None
-        self._deadline = self._next_start = 0.0
+        self._due = 0.0  # end of that wait, or else time of the next START
         self._tries = self._restarts = 0
-        self._last_heartbeat = self._last_data = self._last_acked = self._quiet_since = -math.inf
-        self._header_start = self._interval = 0.0
+        self._asked = self._took_over = False
+        self._has_header = False  # of the current stream, at least in part: its data can be decoded
         self._header_messages = self._acked_in_row = 0
+        self._header_start = self._interval = 0.0  # `_interval`: the longest of late
+        self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
     def accepts(self, target_system: int, target_component: int) -> bool:
-        """Return whether LOGGING_DATA or LOGGING_DATA_ACKED is for this client; count it if it is not."""
+        """Return whether LOGGING_DATA or LOGGING_DATA_ACKED is for this client."""
         is_accepted = self._asked and (target_system, target_component) == self._ids
         self.rejected += not is_accepted
         return is_accepted
 
     def on_heartbeat(self, autopilot: int, now: float, *, armed: bool) -> list[Command]:
-        """Take a HEARTBEAT of the autopilot: its MAV_AUTOPILOT, and whether base_mode has it armed."""
-        self._armed, self._is_px4 = armed, autopilot == dialect.MAV_AUTOPILOT_PX4
+        """Take a HEARTBEAT of the autopilot: MAV_AUTOPILOT, and whether base_mode is armed."""
+        self._is_px4, self._armed, self._last_heartbeat = autopilot == dialect.MAV_AUTOPILOT_PX4, armed, now
         if not self._is_px4 and self.status.state == "idle":
-            self._set("refused", "not_px4", _name("MAV_AUTOPILOT", autopilot))
-        if now - self._last_heartbeat > self._times.link:
-            self._quiet_since, self._acked_in_row = now, 0
-            if self.status.reason == "link_lost":
-                self._set("streaming")  # PX4 streams on without a client
-        self._last_heartbeat = now
+            self._enter("refused", "not_px4", now, _name("MAV_AUTOPILOT", autopilot))
+        elif self.status.reason == "link_lost":
+            self._resume(now)  # PX4 streams on without a client
         return self.tick(now)
 
     def on_reboot(self) -> None:
-        """Take a reboot of the vehicle, as time_boot_ms shows it: its stream is gone."""
+        """Take a reboot of the vehicle: its stream is gone."""
         if self.status.state not in ("stopping", "stopped"):
             self._reset()
 
     def on_data(self, sequence: int, now: float, *, acked: bool, begins: bool) -> list[Command]:
-        """Take a message that `accepts` has accepted; `acked`: it is LOGGING_DATA_ACKED.
-
-        `begins`: a new stream begins with it, as `Reassembly` states, which tells it from a repetition.
-        """
-        commands = [Command("acknowledge", sequence)] if acked and self._acknowledges else []
-        state = self.status.state
+        """Take a message that `accepts` accepted; `acked`: LOGGING_DATA_ACKED; `begins`: `Piece.begins`."""
+        state, reason, _ = self.status
+        is_new, self._sequence = sequence != self._sequence, sequence
         self._interval = max(now - self._last_data, _DECAY * self._interval)
         self._last_data = now
-        is_new, self._sequence = sequence != self._sequence, sequence
         self._acked_in_row = self._acked_in_row + is_new if acked else 0
+        # PX4 obeys STOP only after the header, unless an acknowledgement is missing.
+        is_aborted = self._awaited == "stop" and reason == "slow_link"
+        commands = [Command("acknowledge", sequence)] if acked and not is_aborted else []
         if self._awaited == "stop" or state in ("stopping", "stopped"):
-            return commands
-        if begins:
-            self._set("header")
-            self._awaited, self._has_definitions, self._next_start, self._restarts = None, True, now, 0
-            self._header_start = self._last_acked = now
-            self._header_messages, self._interval, self.header_seconds = 1, 0.0, None
+            pass
+        elif begins:
+            self._awaited, self._has_header, self._restarts, self.header_seconds = None, True, 0, None
+            self._enter("header", None, now)
+            self._header_start, self._last_acked, self._header_messages, self._interval = now, now, 1, 0.0
         elif state == "header" and not acked:
-            self._end_header()
+            self._end_header(now)
         elif state == "header" and is_new:
-            self._last_acked = now
-            self._header_messages += 1
+            self._last_acked, self._header_messages = now, self._header_messages + 1
             return self._judge_link(now) or commands
-        elif state in ("refused", "ended") and self._has_definitions:
-            self._awaited, self._next_start = None, now
-            self._set("streaming")
-        elif self.status.reason == "taken" and self._may_start() and not self._took_over:
-            return [*commands, *self._take_over(now)]
+        elif state in ("refused", "ended") and self._has_header:
+            self._awaited = None
+            self._enter("streaming", None, now)
+        elif reason == "taken" and self._may_start() and not self._took_over:
+            commands += self._take_over(now)
         return commands
 
     def on_command_ack(
         self, command: int, result: int, target_system: int, target_component: int, now: float
     ) -> list[Command]:
-        """Take a COMMAND_ACK of the autopilot; those of other commands and for other ids are ignored."""
+        """Take a COMMAND_ACK of the autopilot; others than those to this client's commands are ignored."""
         is_for_us = (target_system, target_component) in (self._ids, (0, 0))  # zeros: without ids
         if not is_for_us or self._awaited is None or command != _COMMANDS.get(self._awaited):
             return []
         if result == dialect.MAV_RESULT_IN_PROGRESS:
-            self._deadline = now + self._times.answer
-        elif self._awaited == "stop":
-            self._end_stop(now)
-        else:
+            self._due = now + self._times.answer
+        elif self._awaited == "start":
             return self._on_start_result(result, now)
+        else:
+            self._end_stop(now)
         return []
 
     def tick(self, now: float) -> list[Command]:
         """Return the commands that are due."""
-        state, is_lost = self.status.state, self._silence(now) > self._times.link
+        state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
+        is_lost = silence > self._times.link
         if self._awaited is not None:
-            return self._on_timeout(now, is_lost=is_lost) if now >= self._deadline else []
+            return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
         if state in ("header", "streaming"):
-            return self._check_silence(now, is_lost=is_lost)
-        if state in ("stopping", "stopped") or not self._is_px4 or is_lost or now < self._next_start:
+            if not is_lost:
+                return self._check_silence(now)
+            self._enter("ended", "link_lost", now, silence)
+        if state in ("stopping", "stopped") or not self._is_px4 or is_lost or now < self._due:
             return []
         if self._may_start():
             if state in ("idle", "waiting_for_disarm"):
-                self._set("starting")
+                self._enter("starting", None, now)
             return self._send("start", now)
         if state in ("idle", "starting"):
-            self._set("waiting_for_disarm", "armed")
+            self._enter("waiting_for_disarm", "armed", now)
         return []
 
     def stop(self, now: float) -> list[Command]:
-        """End the stream; go on with `on_data`, `on_command_ack` and `tick` until the state is `stopped`.
-
-        A stream that is not this client's is left alone: an open START is answered first.
-        """
-        owns = self.status.state in ("header", "streaming") or self._awaited in ("data", "stop")
-        self._set("stopping" if owns or self._awaited else "stopped")
-        return self._stop(now) if owns and self._awaited != "stop" else []
+        """End this client's stream; go on with `on_data`, `on_command_ack` and `tick` until the state is `stopped`."""
+        is_ours = self.status.state in ("header", "streaming") or self._awaited == "data"
+        self._enter("stopping" if is_ours or self._awaited else "stopped", None, now)
+        return self._send("stop", now) if is_ours else []
 
     def _may_start(self) -> bool:
         return not self._armed or "armed" in self._log
 
-    def _silence(self, now: float) -> float:
-        """Return the time without any message from the vehicle [s]."""
-        return now - max(self._last_heartbeat, self._last_data)
-
-    def _set(self, state: LogState, reason: LogReason | None = None, *values: object) -> None:
+    def _enter(self, state: LogState, reason: LogReason | None, now: float, *values: object) -> None:
+        """Change the state, and set the time of the next START unless an answer is awaited."""
         if (state, reason) != self.status[:2]:
             self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
+        if self._awaited is None:
+            is_slow = reason in ("bandwidth", "unsupported", "slow_link")
+            is_over = state in ("refused", "ended")
+            self._due = now + (self._times.slow_retry if is_slow else self._times.retry if is_over else 0.0)
 
     def _send(self, kind: Literal["start", "stop"], now: float, *, tries: int = 0) -> list[Command]:
         self._awaited, self._tries, self._asked = kind, tries + 1, True
-        self._deadline = now + self._times.answer * (2**tries if kind == "start" else 1)
+        self._due = now + self._times.answer * (2**tries if kind == "start" else 1)
         return [Command(kind)]
 
-    def _stop(self, now: float) -> list[Command]:
-        """Send STOP; the status set before remains."""
-        self._has_definitions = False
-        return self._send("stop", now)
-
     def _end_stop(self, now: float) -> None:
-        self._awaited, self._acknowledges = None, True
-        self._next_start = max(self._next_start, now + self._times.pause)
-        if self.status.state == "stopping":
-            self._set("stopped")
+        self._awaited = None
+        state, reason, _ = self.status
+        self._enter("stopped" if state == "stopping" else state, reason, now)
+        self._due = max(self._due, now + self._times.timeout)
 
     def _restart(self, now: float) -> list[Command]:
-        """Send STOP; START follows after the pause."""
-        self._set("starting")
-        self._next_start = now
-        return self._stop(now)
+        """Send STOP; START follows."""
+        self._has_header = False
+        self._enter("starting", None, now)
+        return self._send("stop", now)
 
     def _take_over(self, now: float) -> list[Command]:
         self._took_over = True
         return self._restart(now)
 
-    def _end_header(self) -> None:
-        self._set("streaming")
+    def _resume(self, now: float) -> None:
+        """Consider a silent stream alive, until `_check_silence` finds that it is not."""
+        self._last_data, self._acked_in_row = now, 0
+        self._enter("streaming", None, now)
+
+    def _end_header(self, now: float) -> None:
         self.header_seconds, self._acked_in_row = self._last_acked - self._header_start, 0
+        self._enter("streaming", None, now)
 
     def _judge_link(self, now: float) -> list[Command]:
-        """Stop a stream whose header would take too long."""
+        """Stop a stream whose header takes too long, or would."""
         elapsed = now - self._header_start
-        self.round_trip = elapsed / (self._header_messages - 1)
-        expected = max(elapsed, self.round_trip * _EXPECTED_MESSAGES)
-        if elapsed <= self._times.header and (expected <= self._times.header or self._header_messages < _JUDGED):
+        round_trip = elapsed / (self._header_messages - 1)
+        expected = max(elapsed, round_trip * _EXPECTED if self._header_messages >= _JUDGED else 0.0)
+        if expected <= self._times.header:
             return []
-        self._set("refused", "slow_link", expected, 1e3 * self.round_trip)
-        self._next_start = now + self._times.slow_retry
-        self._acknowledges = False  # PX4 obeys no command during the header: an acknowledgement missing ends it sooner
-        return self._stop(now)
+        self._has_header = False
+        self._enter("refused", "slow_link", now, max(expected, round_trip * _EXPECTED), 1e3 * round_trip)
+        return self._send("stop", now)
 
     def _on_start_result(self, result: int, now: float) -> list[Command]:
-        state, times, self._awaited = self.status.state, self._times, None
-        if state == "stopping":
-            if result == dialect.MAV_RESULT_ACCEPTED:
-                return self._stop(now)
-            self._set("stopped")
-        elif result == dialect.MAV_RESULT_ACCEPTED:
-            if state in ("header", "streaming"):  # sent because of silence
-                self._set("starting", "silent", now - self._last_data)
-            else:
-                self._set("starting")
-            self._awaited, self._deadline, self._has_definitions = "data", now + times.first_data, False
-        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_definitions:
-            self._next_start = now + self._patience()  # the stream exists: it is only slow
+        state, self._awaited = self.status.state, None
+        if result == dialect.MAV_RESULT_ACCEPTED:
+            if state == "stopping":
+                return self._send("stop", now)
+            was_silent = state in ("header", "streaming")
+            self._enter("starting", "silent" if was_silent else None, now, now - self._last_data)
+            self._awaited, self._has_header, self._due = "data", False, now + self._times.answer
+        elif state == "stopping":
+            self._enter("stopped", None, now)
+        elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and self._has_header:  # the stream exists: it is slow
             if state == "header":
-                self._end_header()
+                self._end_header(now)
             elif state != "streaming":
-                self._quiet_since = now
-                self._set("streaming")
+                self._resume(now)
+            self._due = now + self._patience()
         elif result == dialect.MAV_RESULT_TEMPORARILY_REJECTED and "take" in self._log and not self._took_over:
             return self._take_over(now)
         else:
-            reason = _REFUSALS.get(result, "failed")
-            self._set("refused", reason, _name("MAV_RESULT", result))
-            self._next_start = now + (times.slow_retry if reason in ("bandwidth", "unsupported") else times.retry)
+            self._enter("refused", _REFUSALS.get(result, "failed"), now, _name("MAV_RESULT", result))
         return []
 
     def _on_timeout(self, now: float, *, is_lost: bool) -> list[Command]:
         state, awaited, self._awaited = self.status.state, self._awaited, None
+        is_repeated = self._tries < _TRIES
         if awaited == "stop":
-            if self._tries < _TRIES:
+            if is_repeated:
                 return self._send("stop", now, tries=self._tries)
             self._end_stop(now)
         elif state == "stopping":  # START was not answered: there is nothing to stop
-            self._set("stopped")
+            self._enter("stopped", None, now)
         elif awaited == "data" and not is_lost:
             self._restarts += 1
             if self._restarts <= _RESTARTS:
                 return self._restart(now)
-            self._set("refused", "no_data")
-            self._next_start = now + self._times.retry
-            return self._stop(now)
+            self._enter("refused", "no_data", now)
+            return self._send("stop", now)
         elif is_lost or not self._may_start():
             if state == "starting":
-                self._set("idle")
-        elif self._tries < _TRIES:
+                self._enter("idle", None, now)
+        elif is_repeated:
             return self._send("start", now, tries=self._tries)
         elif state in ("header", "streaming"):
-            self._end("ended", "stalled" if state == "header" else "silent", now)
+            self._enter("ended", "stalled" if state == "header" else "silent", now, now - self._last_data)
         else:
-            self._end("refused", "no_answer", now)
+            self._enter("refused", "no_answer", now)
         return []
-
-    def _end(self, state: LogState, reason: LogReason, now: float) -> None:
-        """Show the end of the stream; START follows after a while."""
-        self._set(state, reason, now - self._last_data)
-        self._next_start = now + self._times.retry
 
     def _patience(self) -> float:
         """Return the silence after which the stream may have ended [s]."""
-        return min(max(self._times.silence, 3 * self._interval), self._times.longest_silence)
+        return min(max(self._times.silence, 3 * self._interval), self._times.longest_silence / 2)
 
-    def _check_silence(self, now: float, *, is_lost: bool) -> list[Command]:
-        """Probe a silent stream with START: PX4 rejects it and leaves the stream alone, or begins a new one."""
+    def _check_silence(self, now: float) -> list[Command]:
+        """Ask for a silent stream with START: PX4 rejects it and goes on, or begins a new stream."""
         state, times, patience = self.status.state, self._times, self._patience()
-        silence = now - max(self._last_data, self._quiet_since)
-        repeated = self._last_data - self._last_acked  # time in which only repetitions arrived
-        if is_lost:
-            self._set("ended", "link_lost", self._silence(now))
-        elif state == "header" and now - self._last_acked > times.stall and repeated > times.silence:
-            self._has_definitions = False
-            self._end("ended", "stalled", now)
+        silence, since_acked = now - self._last_data, now - self._last_acked
+        if state == "header" and since_acked > times.timeout and since_acked - silence > times.silence:
+            self._has_header = False  # only repetitions arrived
+            self._enter("ended", "stalled", now, since_acked)
         elif state == "streaming" and self._acked_in_row >= _STOP_TAIL and silence > times.silence:
-            self._has_definitions = False
-            self._end("ended", "stopped_elsewhere", now)
+            self._has_header = False
+            self._enter("ended", "stopped_elsewhere", now)
         elif not self._may_start():
-            if silence > max(times.stall, 2 * patience):
-                self._set("ended", "silent", silence)
+            if silence > max(times.timeout, 2 * patience):
+                self._enter("ended", "silent", now, silence)
         elif silence > times.longest_silence:
-            self._has_definitions = False
-            self._end("refused", "taken", now)
-        elif silence > patience and now >= self._next_start:
+            self._has_header = False
+            self._enter("refused", "taken", now)
+        elif silence > patience and now >= self._due:
             return self._send("start", now)
         return []
 
