@@ -88,10 +88,11 @@ class Address:
         return self.topic if self.instance is None else f"{self.topic}/{self.instance}"
 
     def __lt__(self, other: Address) -> bool:
-        return self._sort_key < other._sort_key
+        return self._order < other._order
 
     @property
-    def _sort_key(self) -> tuple[str, str, int]:
+    def _order(self) -> tuple[str, str, int]:
+        """The order by parts, in which an address without an instance is before those with one."""
         return self.vehicle, self.topic, -1 if self.instance is None else self.instance
 
     def __str__(self) -> str:

@@ -162,7 +162,8 @@ class SourceStatus(_FromPeer):
     """The status of one source.
 
     `state`: starting, waiting, running, retrying, done or failed; empty if not reported.
-    `published`, `rejected`: messages since the service started. `done`, `total`: progress of this run.
+    `published`, `rejected`: messages since the service started. `done`, `total`: progress of this run,
+    in messages, or in bytes of a log.
     `lost`: messages lost before they reached a live source, if it can detect them. `reboots`: reboots of vehicles.
     `stale`: addresses of a live source without a message for 3 s.
     `not_carried`: messages of vehicles that this source has no definition for. `silent`: addresses that vehicles

@@ -90,7 +90,7 @@ class SourceOutput:
         return tuple(self._warnings.values())
 
     def claim_all(self, run: ReplayRun, *, lossless: bool) -> None:
-        """Claim all addresses of a run or none: otherwise two sources could block each other.
+        """Claim all addresses known at the start of a run or none: otherwise two sources could block each other.
 
         Raises AddressInUseError if another source of this service publishes one of them.
         """
@@ -140,6 +140,15 @@ class SourceOutput:
         self.published += 1
         stream.health.add(fields, received=self._now_ns(), lost=message.lost)
         self._account.add(message.address, fields, time.time(), lost=message.lost)
+
+    def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
+        """Publish a message of a replay; claim its address first if it was unknown at the start."""
+        try:
+            self.claim(message.address, message.definition, lossless=lossless)
+        except AddressInUseError as exc:
+            self.reject(Rejection(str(message.address), str(exc)))
+        else:
+            self.publish(message)
 
     def publish_live(self, message: SourceMessage) -> None:
         """Publish a message of a live source; claim its address first if necessary."""

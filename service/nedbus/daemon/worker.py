@@ -101,6 +101,7 @@ class Worker:
         self._done = self._retries = 0
         self._turn: float | None = None  # start of the current turn; None while it may take any time
         self._release = False
+        self._warned: set[str] = set()
 
     @property
     def busy(self) -> float:
@@ -124,14 +125,14 @@ class Worker:
         return SourceStatus(
             source=self.text,
             state=self._state,
-            addresses=tuple(map(str, run.addresses if run else output.addresses)),
+            addresses=tuple(map(str, list(run.addresses) if run else output.addresses)),
             stale=tuple(map(str, output.stale)),
             published=output.published,
             rejected=output.rejected,
             rejections=dict(output.rejections),
             lost=output.lost,
             reboots=output.reboots,
-            done=self._done,
+            done=run.done(self._done) if run else self._done,
             total=run.total if run else None,
             retries=self._retries,
             summary=run.summary if run else "",
@@ -203,8 +204,10 @@ class Worker:
         run, last = source.open(), self._run
         if last is None or last.summary != run.summary:
             _log.info("%s: %s", self._name, run.summary, extra=about("opened", source=self._name))
-            for warning in run.warnings:
-                _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
+            self._warned.clear()
+        else:
+            run.addresses.update(last.addresses)  # a loop keeps the publishers of streams that come later
+        self._warn(run)
         self._run, self._done = run, 0
         if source.wait and last is None:
             self._state = "waiting"
@@ -228,10 +231,18 @@ class Worker:
                 return
             # A lossless publisher may wait for its readers.
             self._turn = None if source.speed is None else self._clock.now()
-            self._output.publish(message)
+            self._output.publish_replay(message, lossless=source.speed is None)
             self._turn = None
             self._done += 1
+        self._warn(run)
         self._error = run.damage
+
+    def _warn(self, run: ReplayRun) -> None:
+        """Log the warnings of a run that were not logged yet."""
+        for warning in run.warnings:
+            if warning not in self._warned:
+                self._warned.add(warning)
+                _log.warning("%s: %s", self._name, warning, extra=about("damaged", source=self._name, reason=warning))
 
     def _listen(self, source: LiveSource) -> None:
         """Publish the messages of a live source; it yields None several times a second while no message arrives."""

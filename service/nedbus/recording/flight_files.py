@@ -51,8 +51,13 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
 
 
 def single_match(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:
-    """Return the single selected address of a file; raise AddressError if there is none or more than one."""
+    """Return the single selected address of a file; raise AddressError if there is none or more than one.
+
+    Of a topic without a file in nedbus, the first instance has the plain address, and is the one that a topic selects.
+    """
     found = matching(path, addresses, selection)
+    plain = [address for address in found if address.instance is None]
+    found = plain if len(plain) == 1 and len({(each.vehicle, each.topic) for each in found}) == 1 else found
     lacking = [part for part in ("topic", "vehicle", "instance") if len({getattr(each, part) for each in found}) > 1]
     if lacking:
         problem = f"one stream of {path}, but several match: set {' and '.join(lacking)} to one of {_list(found)}"

@@ -60,23 +60,29 @@ class Absence:
     silent: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ReplayRun:
-    """One run of a replay.
+    """One run of a replay; what is known at the start, and more while the messages are iterated.
 
     `messages`: in order of `due`; can be iterated once.
-    `addresses`: every address in the messages, with its definition, or None for the default of its topic.
-    `total`: number of messages; None if endless.
+    `addresses`: every address in the messages so far, with its definition, or None for the default of its topic.
+    `total`: number of messages, or of bytes if there is a `position`; None if endless.
     `summary`: a description for the log; `warnings`: damage, and skipped parts.
     `damage`: a description of messages lost to damage; with it, the run ends as failed.
+    `position`: bytes of the file that were read; None if progress is counted in messages.
     """
 
     messages: Iterator[SourceMessage]
-    addresses: Mapping[Address, Definition[Any] | None]
+    addresses: dict[Address, Definition[Any] | None]
     total: int | None
     summary: str
     warnings: tuple[str, ...] = ()
     damage: str | None = None
+    position: int | None = None
+
+    def done(self, messages: int) -> int:
+        """Return the progress towards `total`, given the number of messages so far."""
+        return messages if self.position is None else self.position
 
 
 @dataclass(frozen=True, slots=True)

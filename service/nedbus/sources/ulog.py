@@ -1,28 +1,27 @@
-"""Replay a PX4 .ulg log with all instances of its topics, paced by their timestamps."""
+"""Replay a PX4 .ulg log while reading it: all instances of its topics in the log's own order, paced by timestamps."""
 
 from __future__ import annotations
 
-import heapq
-from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, cast
 
-import numpy as np
-import numpy.typing as npt
-
-from nedbus.recording import UlogTopic, read_ulog
-from nedbus_msgs import ALL, DEFAULT, Definition
+from nedbus.recording import UlogReader, UlogStream
+from nedbus_msgs import ALL, DEFAULT, Address
 
 from .options import RecordedOptions
 from .source import ReplayRun, SourceContext, SourceMessage
 
-_MAX_GAP: Final = 60_000_000  # us; a longer gap is a damaged timestamp, and is skipped
-_CHUNK: Final = 1000  # rows converted to Python values at a time
+_AHEAD: Final = 1000  # messages read when a log is opened: their addresses are known from the start
+_MAX_STEP: Final = 1_000_000  # us; a longer step must be confirmed by the next message
+_MAX_GAP: Final = 60_000_000  # us; a longer step is skipped
+_MAX_BEHIND: Final = 1000  # messages in a row that are older than that; then the clock goes back
 
 
 class UlogSource:
-    """A .ulg file; `open` reads its topics into memory."""
+    """A .ulg file, read chunk by chunk."""
 
     def __init__(self, path: str, options: RecordedOptions, context: SourceContext) -> None:
         self._path, self._options = Path(path).expanduser(), options
@@ -31,99 +30,109 @@ class UlogSource:
         self.speed, self.wait = options.speed, options.wait
 
     def open(self) -> ReplayRun:
-        """Read the log; raise SourceError if it is not a ULog file or has none of the requested topics."""
+        """Read the beginning; raise SourceError if it is not a ULog file or has none of the requested topics."""
         options = self._options
-        log = read_ulog(
+        reader = UlogReader(
             self._path, topics=options.chosen_topics, vehicle=options.vehicle, default_vehicle=self._default_vehicle
         )
-        topics, warnings = list(log.topics.values()), list(log.warnings)
-        clocks = [_monotonic(topic.columns["timestamp"]) for topic in topics]
-        for topic, clock in zip(topics, clocks, strict=True):
-            outliers = int(np.count_nonzero(clock != topic.columns["timestamp"]))
-            if outliers:
-                warnings.append(f"{topic.address}: {outliers} timestamps out of order; the log's own order is kept")
-            unknown = sorted(topic.columns.keys() - topic.definition.known_types.keys())
-            if unknown and _is_newer(topic):
-                warnings.append(f"{topic.address}: {', '.join(unknown)} left out: the log is newer than nedbus")
-        warnings += options.absent_from({topic.address.topic for topic in topics}, "this log")
-        dues, gaps = _pace(clocks)
-        if gaps:
-            warnings.append(f"skipped {gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
-        total = sum(map(len, clocks))
-        layouts = " and ".join(sorted({_layout_name(topic) for topic in topics if topic.definition is DEFAULT}))
+        run = ReplayRun(iter(()), {}, None, "", position=0)
+        messages = self._read(reader, run)
+        ahead = list(islice(messages, _AHEAD))
+        run.messages = (message for part in (ahead, messages) for message in part)
+        run.total = self._path.stat().st_size
+        streams = list(reader.streams.values())
+        layouts = " and ".join(sorted({_layout_name(each) for each in streams if each.definition is DEFAULT}))
         layout = f", layout {layouts}" if layouts else ""
-        return ReplayRun(
-            messages=heapq.merge(*map(_messages, topics, dues), key=lambda message: message.due),
-            addresses={topic.address: topic.definition for topic in topics},
-            total=total,
-            summary=f"vehicle {topics[0].address.vehicle}, {total} messages of {len(topics)} streams{layout},"
-            f" {max(due[-1] for due in dues):.1f} s",
-            warnings=tuple(warnings),
-            damage=f"{self._path}: messages lost to damage: {'; '.join(log.warnings)}" if log.damaged else None,
-        )
+        run.summary = f"vehicle {streams[0].address.vehicle}{layout}, {run.total / 1e6:.1f} MB"
+        run.warnings = run.warnings or tuple(_warnings_of(reader))
+        return run
+
+    def _read(self, reader: UlogReader, run: ReplayRun) -> Iterator[SourceMessage]:
+        """Yield the messages of a log, and update its run."""
+        clock = _Clock()
+        for due, stream, fields in clock.pace(reader):
+            run.addresses[stream.address], run.position = stream.definition, reader.position
+            yield SourceMessage(due, stream.address, fields, definition=stream.definition)
+        warnings = _warnings_of(reader)
+        for address, count in clock.unordered.items():
+            warnings.append(f"{address}: {count} timestamps out of order; the log's own order is kept")
+        warnings += self._options.absent_from({address.topic for address in reader.streams}, "this log")
+        if clock.gaps:
+            warnings.append(f"skipped {clock.gaps} gaps of more than {_MAX_GAP // 1e6:.0f} s in the timestamps")
+        run.warnings = tuple(warnings)
+        if reader.damaged:
+            run.damage = f"{self._path}: messages lost to damage: {'; '.join(reader.warnings)}"
 
 
-def _messages(topic: UlogTopic, dues: npt.NDArray[np.float64]) -> Iterator[SourceMessage]:
-    """Yield the rows of a topic as messages with these due times."""
-    definition, names = topic.definition, tuple(topic.columns)
-    for start in range(0, len(dues), _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        columns = [_python_values(definition, name, column[rows]) for name, column in topic.columns.items()]
-        for due, row in zip(dues[rows].tolist(), zip(*columns, strict=True), strict=True):
-            yield SourceMessage(due, topic.address, dict(zip(names, row, strict=True)), definition=definition)
+class _Clock:
+    """A clock that follows the timestamps of a log from the start of logging, and does not wait for outliers.
+
+    `gaps`: number of steps that were skipped as too long. `unordered`: number of timestamps out of order.
+    """
+
+    def __init__(self) -> None:
+        self.gaps = 0
+        self.unordered: Counter[Address] = Counter()
+        self._now = self._due = self._behind = 0  # us; messages
+        self._is_running = False
+
+    def pace(self, reader: UlogReader) -> Iterator[tuple[float, UlogStream, dict[str, object]]]:
+        """Yield due time [s since the start], stream and fields of each message; due times do not decrease."""
+        newest: dict[UlogStream, int] = {}
+        held: tuple[int, UlogStream, dict[str, object]] | None = None
+        for stream, payload in reader.messages():
+            fields = stream.decode(payload)
+            time = cast("int", fields["timestamp"])
+            self._now = self._now or reader.start
+            if time < newest.get(stream, 0):
+                self.unordered[stream.address] += 1
+            newest[stream] = time
+            if held is not None:
+                if time >= held[0] - _MAX_STEP:
+                    self._follow(held[0])
+                yield self._due / 1e6, *held[1:]
+                held = None
+            if time > self._now + _MAX_STEP:
+                held = time, stream, fields
+            else:
+                self._follow(time)
+                yield self._due / 1e6, stream, fields
+        if held is not None:
+            if held[0] <= self._now + _MAX_GAP:
+                self._follow(held[0])
+            elif self._is_running:
+                self.unordered[held[1].address] += 1
+            yield self._due / 1e6, *held[1:]
+
+    def _follow(self, time: int) -> None:
+        """Advance to a timestamp; go back only if the clock is far ahead of many messages."""
+        step = time - self._now
+        self._behind = self._behind + 1 if step < -_MAX_GAP else 0
+        if step < 0 and self._behind < _MAX_BEHIND:
+            return
+        if step > _MAX_GAP and self._is_running:
+            self.gaps += 1
+        elif self._is_running:
+            self._due += max(0, step)
+        self._now, self._is_running = time, True
 
 
-def _python_values(definition: Definition[Any], name: str, column: npt.NDArray[np.generic]) -> list[object]:
-    """Convert a column to values that the model accepts: int, float, bool, or tuples of them."""
-    values: list[object] = column.tolist()
-    if any(kind.base == "bool" for kind in definition.known_types.get(name, ())):
-        return [_to_bool(value) for value in values]
-    return list(map(tuple, column.tolist())) if column.ndim == 2 else values
+def _warnings_of(reader: UlogReader) -> list[str]:
+    """Return the damage and the skipped parts so far."""
+    warnings = reader.warnings
+    for stream in reader.streams.values():
+        unknown = sorted(set(stream.names) - stream.definition.known_types.keys())
+        if unknown and _is_newer(stream):
+            warnings.append(f"{stream.address}: {', '.join(unknown)} left out: the log is newer than nedbus")
+    return warnings
 
 
-def _to_bool(value: object) -> object:
-    """Convert 0 and 1 to bool; leave any other byte for the model to reject."""
-    if isinstance(value, list):
-        return tuple(map(_to_bool, value))
-    return bool(value) if value in (0, 1) else value
-
-
-def _monotonic(timestamps: npt.NDArray[np.generic]) -> npt.NDArray[np.uint64]:
-    """Make timestamps non-decreasing with the fewest changes, so one outlier does not delay the rest."""
-    times = timestamps.astype(np.uint64)
-    if not np.any(times[1:] < times[:-1]):
-        return times
-    # The longest non-decreasing subsequence keeps its times; every other row takes the time of the row before it.
-    tails: list[int] = []  # the smallest time that ends a subsequence, by its length
-    lengths: list[int] = []  # of the longest subsequence that ends with each row
-    for time in times.tolist():
-        length = bisect_right(tails, time)
-        tails[length : length + 1] = [time]
-        lengths.append(length)
-    needed, keep = len(tails) - 1, np.zeros(len(times), dtype=bool)
-    for row in range(len(times) - 1, -1, -1):
-        if lengths[row] == needed:
-            keep[row], needed = True, needed - 1
-    first = times[np.argmax(keep)]
-    return np.maximum.accumulate(np.where(keep, times, first))
-
-
-def _pace(clocks: list[npt.NDArray[np.uint64]]) -> tuple[list[npt.NDArray[np.float64]], int]:
-    """Return the due time of each row of each topic [s since the first row], and the number of gaps removed."""
-    times = np.unique(np.concatenate(clocks))
-    steps = np.diff(times)
-    gaps = steps > _MAX_GAP
-    steps[gaps] = 0
-    elapsed = np.concatenate(([0.0], np.cumsum(steps) / 1e6))
-    return [elapsed[np.searchsorted(times, clock)] for clock in clocks], int(np.count_nonzero(gaps))
-
-
-def _is_newer(topic: UlogTopic) -> bool:
+def _is_newer(stream: UlogStream) -> bool:
     """Return whether a log may be newer than this version: it has all fields of the newest known layout."""
-    newest = [layout for layout in topic.definition.layouts.values() if layout.name != ALL][-1]
-    return newest.types.keys() <= topic.columns.keys()
+    newest = [layout for layout in stream.definition.layouts.values() if layout.name != ALL][-1]
+    return newest.types.keys() <= set(stream.names)
 
 
-def _layout_name(topic: UlogTopic) -> str:
-    layout = topic.definition.find_layout(topic.columns)
-    return layout.name if layout else "newer than 1.16" if _is_newer(topic) else "1.12 or older"
+def _layout_name(stream: UlogStream) -> str:
+    layout = stream.definition.find_layout(stream.names)
+    return layout.name if layout else "newer than 1.16" if _is_newer(stream) else "1.12 or older"

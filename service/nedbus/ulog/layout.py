@@ -110,8 +110,10 @@ class Formats:
 
     def _expand(self, name: str, prefix: str = "", level: int = 0) -> Iterator[tuple[str, FieldType, int | None]]:
         """Yield name, base type and length of each field one by one, so that the caller can stop at its limits."""
-        if not self._texts.get(name) or level > _MAX_NESTING:
-            raise ValueError(f"{name} has no format, no fields, or is nested more than {_MAX_NESTING} levels deep")
+        if level > _MAX_NESTING:
+            raise ValueError(f"its messages are nested more than {_MAX_NESTING} levels deep")
+        if not self._texts.get(name):
+            raise ValueError(f"there is no format, or one without fields, of {name}")
         for found in FIELD.finditer(self._texts[name]):
             kind, field, length = found[1], prefix + found[3], int(found[2]) if found[2] else None
             if length == 0:

@@ -145,13 +145,14 @@ class UlogParser:
     def _take_data(self, at: int) -> int:
         """Take messages up to the last one in a row, whose successor needs a closer look; return its position."""
         buffer, known, records = self._buffer, self._known, self._records
+        make = tuple.__new__  # half the time of calling a NamedTuple
         found = known.get(buffer[at : at + _DATA_HEADER])
         while found is not None:
             subscription, length, used = found
             stop = at + length
             found = known.get(buffer[stop : stop + _DATA_HEADER])
             if found is not None:
-                records.append(Data(subscription, buffer[at + _DATA_HEADER : at + used]))
+                records.append(make(Data, (subscription, buffer[at + _DATA_HEADER : at + used])))
                 at = stop
         return at
 

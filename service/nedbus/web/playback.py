@@ -62,8 +62,6 @@ class Recording:
         self._path = path
         self._indices: dict[Address, list[int]] = {}  # indices in `entries`, by stream
         self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
-        for warning in self._run.warnings:
-            _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property
@@ -85,6 +83,10 @@ class Recording:
             self.chronicle.times = times_of(self._path, self._run.addresses)
             for message, reason, payload in follow(self._run.messages, self.chronicle.account):
                 self._add(message, reason, payload)
+            for warning in self._run.warnings:
+                _log.warning(
+                    "%s: %s", self._path, warning, extra=about("damaged", source=str(self._path), reason=warning)
+                )
         except NedbusError as exc:
             _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))
         finally:

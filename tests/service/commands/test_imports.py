@@ -22,9 +22,9 @@ import nedbus, rlcompleter
 assert [name for name in dir(nedbus) if name[:2] != "__"] == sorted(nedbus.__all__) and "__version__" in dir(nedbus)
 absent("zenoh")
 assert rlcompleter.Completer(globals()).complete("nedbus.connect_", 0).startswith("nedbus.connect_async")
-absent("numpy pyulog typer rich cryptography")
+absent("numpy typer rich cryptography")
 import nedbus.cli.app
-absent("numpy pyulog rich.progress cryptography")
+absent("numpy rich.progress cryptography")
 """
     process = start("-c", program, fresh=True)
     assert process.wait() == 0, process.err

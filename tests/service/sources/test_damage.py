@@ -192,11 +192,8 @@ def count_rows(streams: dict[Address, MessageArray], missing: Mapping[str, set[s
 
 
 def is_shorter(damaged: bytes, data: bytes) -> bool:
-    """Return whether a log is the beginning of another one, up to the end of a message."""
-    offset = 16
-    while offset < len(damaged):
-        offset += 3 + int.from_bytes(damaged[offset : offset + 2], "little")
-    return offset == len(damaged) and data.startswith(damaged)
+    """Return whether a log is the beginning of another one."""
+    return len(damaged) < len(data) and data.startswith(damaged)
 
 
 @pytest.mark.timeout(120 + TRIES)
@@ -215,6 +212,7 @@ def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
         where = f"{name}, try {number}, {done}"
         try:
             read, run = rows_of(path), open_replay(f"ulog:{path}")
+            assert list(run.messages)
         except SourceError:
             outcomes["refused"] += 1
             continue
@@ -225,7 +223,7 @@ def test_damaged_logs_are_read_in_part(tmp_path: Path, tries: int) -> None:
         hit = 1 + count // 50 if count else 0
         strange, lost = (after - before).total(), (before - after).total()
         assert strange <= hit, f"{where}: {strange} messages differ: {run.warnings}"
-        # A log has no end: one that was cut between two messages is a whole log.
+        # A log has no end: one whose writer lost power is a whole log.
         assert run.damage or lost <= hit or is_shorter(damaged, data), f"{where}: {lost} lost: {run.warnings}"
         outcomes["reported" if run.damage else "lost" if lost else "whole"] += 1
     assert outcomes["whole"], outcomes
@@ -366,12 +364,12 @@ def test_damage_of_a_converted_flight_costs_seconds(tmp_path: Path) -> None:
     assert 0 < damage_chunk(path, 3) < total / 5
 
 
-def test_cut_log_is_converted_and_fails(tmp_path: Path) -> None:
-    """A log that was cut inside a message is converted up to there, with exit code 1."""
+def test_cut_log_is_converted_with_a_warning(tmp_path: Path) -> None:
+    """A log that ends inside a message, as after a loss of power, is converted up to there; nothing is missing."""
     path = write_log(tmp_path / "a.ulg")
     path.write_bytes(path.read_bytes()[:-50])
     convert = run_command("convert", str(path), str(tmp_path / "a.mcap"))
-    assert convert.exit_code == 1
+    assert convert.exit_code == 0
     assert "179 messages" in convert.err
     assert "truncated: the file ends inside a message" in convert.err
 

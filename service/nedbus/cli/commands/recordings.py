@@ -75,15 +75,15 @@ def convert(
     if isinstance(replay, LiveSource):
         raise ConfigError(str(source), "not a file")
     run = replay.open()
-    for warning in run.warnings:
-        write_stderr(f"{source}: {warning}")
     with show_progress() as show:
         report = convert_messages(
             run.messages,
             output,
             source=spec.kind,
-            on_progress=lambda done: show(f"{output}", done, run.total),
+            on_progress=lambda done: show(f"{output}", run.done(done), run.total),
         )
+    for warning in run.warnings:
+        write_stderr(f"{source}: {warning}")
     write_stderr(f"{output}: {report}")
     if run.damage:
         raise SourceError(str(source), "the file is damaged: only the readable messages were converted")

@@ -68,11 +68,11 @@ class ProgressLog:
 
 
 def _numbers(status: SourceStatus, rate: float) -> str:
-    count = f"{status.done} of {status.total}" if status.total else f"{status.published}"
+    part = f" ({status.done / status.total:.0%})" if status.total else ""
     rejected = f", {status.rejected} rejected" if status.rejected else ""
     lost = f", {status.lost} lost" if status.lost else ""
     gone = f", gone: {', '.join(status.stale)}" if status.stale else ""
-    return f"{count} messages, {rate:.0f}/s{rejected}{lost}{gone}"
+    return f"{status.published} messages{part}, {rate:.0f}/s{rejected}{lost}{gone}"
 
 
 @contextmanager

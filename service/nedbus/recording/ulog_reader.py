@@ -1,0 +1,178 @@
+"""Reader of PX4 .ulg logs, message by message."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+from zlib import crc32
+
+from nedbus.errors import AddressError, SourceError
+from nedbus.ulog import (
+    Damage,
+    Data,
+    Header,
+    Information,
+    Parameter,
+    Record,
+    Subscription,
+    UlogError,
+    UlogParser,
+    Unsubscription,
+    address_of,
+    definition_of,
+)
+from nedbus_msgs import TOPICS, Address, Definition
+
+from .flight_files import open_flight
+
+_CHUNK: Final = 2**17  # bytes read at a time
+_MAX_NAMED: Final = 5  # damaged places in the warnings
+_OLDEST: Final = 0x010D  # PX4 1.13, the oldest release with known layouts
+
+
+@dataclass(slots=True, eq=False)
+class UlogStream:
+    """The messages of one subscription.
+
+    `names`: its fields, without those that had another type before PX4 1.13.
+    `first`: the stream that has its address already, as PX4 can log a topic twice. `checksum`: of the messages so far,
+    if the topic has several subscriptions.
+    """
+
+    address: Address
+    definition: Definition[Any]
+    subscription: Subscription
+    names: tuple[str, ...]
+    first: UlogStream | None
+    checksum: int | None
+
+    def decode(self, payload: bytes) -> dict[str, object]:
+        """Return the fields of a message."""
+        fields = self.subscription.decode(payload)
+        return fields if len(fields) == len(self.names) else {name: fields[name] for name in self.names}
+
+
+class UlogReader:
+    """Read the messages of a log in the log's order; the memory does not grow with the log.
+
+    The options are those of `read_ulog`. `start`: when logging began [us]. `position`: bytes read so far.
+    `streams`: those with a message so far. `damaged`: True if damage may have cost messages so far.
+    """
+
+    def __init__(
+        self, path: Path, *, topics: Collection[str] | None, vehicle: str | None, default_vehicle: str
+    ) -> None:
+        self._path, self._topics = path, topics
+        self._vehicle, self._system_id = vehicle, default_vehicle
+        self._parser = UlogParser(verify=True)
+        self._release = self._places = self.start = self.position = 0
+        self._warnings: list[str] = []
+        self._by_id: dict[int, UlogStream | None] = {}
+        self._seconds: list[UlogStream] = []
+        self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
+        self.streams: dict[Address, UlogStream] = {}
+        self.damaged = False
+
+    @property
+    def warnings(self) -> list[str]:
+        """Damage and skipped parts so far."""
+        ends = {f"damaged: {self._places - _MAX_NAMED} further places": self._places > _MAX_NAMED}
+        ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
+        return self._warnings + [text for text, holds in ends.items() if holds]
+
+    def messages(self) -> Iterator[tuple[UlogStream, bytes]]:
+        """Yield each message as its stream and payload.
+
+        Raises SourceError if the file is not a ULog file, or has none of the topics.
+        """
+        streams = self._by_id
+        for records in self._records():
+            for record in records:
+                if not isinstance(record, Data):
+                    self._note(record)
+                    continue
+                subscription, payload = record
+                message_id = subscription.message_id
+                if message_id not in streams:
+                    streams[message_id] = self._open(subscription)
+                stream = streams[message_id]
+                if stream is not None:
+                    if stream.checksum is not None:
+                        stream.checksum = crc32(payload, stream.checksum)
+                    if stream.first is None:
+                        yield stream, payload
+        for second in self._seconds:
+            if second.first is not None and second.checksum != second.first.checksum:
+                number = second.subscription.multi_id
+                self._warnings.append(f"skipped a second {second.address.topic} [{number}] with other messages")
+                self.damaged |= second.address.instance is not None or number == 0
+        if not self.streams:
+            topics = self._topics
+            wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
+            raise SourceError(str(self._path), "; ".join([f"this log has no message of {wanted}", *self.warnings[:3]]))
+
+    def _records(self) -> Iterator[list[Record]]:
+        try:
+            with open_flight(self._path) as file:
+                while chunk := file.read(_CHUNK):
+                    self.position += len(chunk)
+                    yield self._parser.feed(chunk)
+            yield self._parser.close()
+        except UlogError as exc:
+            raise SourceError(str(self._path), f"not a readable ULog file: {exc}") from exc
+        except OSError as exc:
+            raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
+
+    def _note(self, record: Record) -> None:
+        """Take what is not a message."""
+        if isinstance(record, Header):
+            self.start = record.timestamp
+        elif isinstance(record, Information) and record.key == "ver_sw_release" and isinstance(record.value, int):
+            self._release = record.value >> 16
+        elif isinstance(record, Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
+            self._system_id = str(record.value)
+        elif isinstance(record, Subscription):
+            self._subscribed[record.name] += 1
+        elif isinstance(record, Unsubscription):
+            self._by_id.pop(record.message_id, None)
+        elif isinstance(record, Damage):
+            self._places += not record.is_end
+            self.damaged |= not record.is_end
+            if self._places <= _MAX_NAMED:
+                self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
+
+    def _open(self, subscription: Subscription) -> UlogStream | None:
+        """Return the stream of a subscription with its first message; None if it is not wanted, or cannot be used."""
+        topic, types = subscription.name, {field.name: field.kind for field in subscription.fields}
+        if self._topics is not None and topic not in self._topics:
+            return None
+        self._vehicle = self._vehicle or self._system_id
+        try:
+            definition, address = definition_of(subscription), address_of(self._vehicle, subscription)
+        except ValueError as exc:
+            self._warnings.append(f"skipped {topic}: {exc}")
+            self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
+            return None
+        known = definition.known_types
+        wrong = {name for name, kind in types.items() if kind not in known.get(name, {kind})}
+        if wrong and 0 < self._release < _OLDEST:
+            older = f"skipped {', '.join(sorted(wrong))}, which had another type before PX4 1.13"
+            self._warnings.append(f"{topic} [{subscription.multi_id}]: {older}")
+            types = {name: kind for name, kind in types.items() if name not in wrong}
+            wrong = set()
+        if wrong | (lacking := definition.always - types.keys()):
+            names = ", ".join(sorted(wrong | lacking))
+            self._warnings.append(f"{topic} [{subscription.multi_id}]: the definition of {names} is damaged")
+            self.damaged = True
+        if wrong or "timestamp" not in types:
+            return None
+        checksum = 0 if self._subscribed[topic] > 1 else None
+        stream = UlogStream(address, definition, subscription, tuple(types), self.streams.get(address), checksum)
+        if stream.first is None:
+            self.streams[address] = stream
+        else:
+            self._seconds.append(stream)
+        return stream
