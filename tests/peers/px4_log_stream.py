@@ -443,7 +443,7 @@ class Px4LogStream:
     def _send_entry(self, message: Message) -> None:
         """Send a message of the recording, if a stream is active, from the first record that begins in it on."""
         stream = self._stream
-        if stream is None or (stream.expected is None and message.offset == _NO_RECORD):
+        if stream is None or self._stop_from or (stream.expected is None and message.offset == _NO_RECORD):
             return
         if stream.expected is None:
             message = message._replace(offset=0, data=message.data[message.offset :])

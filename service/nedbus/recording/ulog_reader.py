@@ -95,10 +95,10 @@ class UlogReader:
                     self._note(record)
                     continue
                 subscription, payload = record
-                message_id = subscription.message_id
-                if message_id not in streams:
-                    streams[message_id] = self._open(subscription)
-                stream = streams[message_id]
+                try:
+                    stream = streams[subscription.message_id]
+                except KeyError:
+                    stream = streams[subscription.message_id] = self._open(subscription)
                 if stream is not None:
                     if stream.checksum is not None:
                         stream.checksum = crc32(payload, stream.checksum)

@@ -101,10 +101,10 @@ class Formats:
             if number > _MAX_FIELDS or offset > _MAX_SIZE:
                 raise ValueError(f"it has more than {_MAX_FIELDS} fields or {_MAX_SIZE} bytes")
             if not field.rpartition(".")[2].startswith("_padding"):
-                flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_")
+                flat = re.sub(r"\[(\d+)\]", r"_\1", field).replace(".", "_") if "." in field else field
                 if flat in fields:
                     raise ValueError(f"two fields are called {flat}, including those of nested messages")
-                fields[flat] = PayloadField(flat, FieldType(base.base, length), start)
+                fields[flat] = PayloadField(flat, FieldType(base.base, length) if length else base, start)
             size = size if field.startswith("_padding") else offset
         return PayloadLayout(tuple(fields.values()), size, offset - size)
 

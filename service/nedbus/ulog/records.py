@@ -144,6 +144,9 @@ Record = (
 )  # fmt: skip
 
 
+_UNRESOLVED: Final = PayloadLayout((), 0, 0)
+
+
 def read_header(data: bytes) -> Header:
     """Read the 16 bytes before the first record; raise UlogError if they are not those of a ULog."""
     if len(data) < 16 or not data.startswith(b"ULog\x01\x12\x35"):
@@ -192,7 +195,7 @@ def _subscription(content: bytes) -> Subscription:
     name = content[3:].decode("ascii")
     if not _NAME.fullmatch(name):
         raise ValueError
-    return Subscription(message_id, multi_id, name, PayloadLayout((), 0, 0))
+    return Subscription(message_id, multi_id, name, _UNRESOLVED)
 
 
 def _sync(content: bytes) -> Sync:

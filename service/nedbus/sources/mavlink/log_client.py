@@ -203,12 +203,13 @@ class LogStreamClient:
         """Return the commands that are due."""
         state, silence = self.status.state, now - max(self._last_heartbeat, self._last_data)
         is_lost = silence > self._times.link
-        if self._awaited is not None:
-            return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
-        if state in ("header", "streaming"):
-            if not is_lost:
-                return self._check_silence(now)
+        if is_lost and state in ("header", "streaming"):
+            self._awaited = None
             self._enter("ended", "link_lost", now, silence)
+        elif self._awaited is not None:
+            return self._on_timeout(now, is_lost=is_lost) if now >= self._due else []
+        elif state in ("header", "streaming"):
+            return self._check_silence(now)
         if state in ("stopping", "stopped") or not self._is_px4 or is_lost or now < self._due:
             return []
         if self._may_start():
@@ -283,8 +284,10 @@ class LogStreamClient:
         if result == dialect.MAV_RESULT_ACCEPTED:
             if state == "stopping":
                 return self._send("stop", now)
-            was_silent = state in ("header", "streaming")
-            self._enter("starting", "silent" if was_silent else None, now, now - self._last_data)
+            if state in ("header", "streaming"):
+                self._enter("starting", "silent", now, now - self._last_data)
+            elif self.status.reason != "no_data":  # whose attempts go on
+                self._enter("starting", None, now)
             self._awaited, self._has_header, self._due = "data", False, now + self._times.answer
         elif state == "stopping":
             self._enter("stopped", None, now)
@@ -343,10 +346,11 @@ class LogStreamClient:
         elif not self._may_start():
             if silence > max(times.timeout, 2 * patience):
                 self._enter("ended", "silent", now, silence)
+                self._due = now
         elif silence > times.longest_silence:
             self._has_header = False
             self._enter("refused", "taken", now)
-        elif silence > patience and now >= self._due:
+        elif silence > patience and self._last_heartbeat > self._last_data and now >= self._due:
             return self._send("start", now)
         return []
 

@@ -1,0 +1,93 @@
+"""Measure how fast ULog files are read, beside pyulog, and how a replay begins and what memory it takes.
+
+Each log is read in full by nedbus and by pyulog, alternately, and the medians are compared. The last log is then
+repeated up to 200 MB (--megabytes) and replayed without pauses.
+Bars: no slower than pyulog, the first message within 0.3 s, less than 100 MB of resident memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from pyulog import ULog
+from tests.flights.ulogs import LOGS
+
+from nedbus.recording import read_ulog
+
+REPLAY = """
+import resource, sys, time
+from nedbus.sources import parse_source
+start = time.perf_counter()
+messages = iter(parse_source(f"ulog:{sys.argv[1]}?topics=*").open_source(vehicle="1").open().messages)
+next(messages)
+first = time.perf_counter() - start
+count = 1 + sum(1 for _ in messages)
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(first, count, time.perf_counter() - start, peak)
+"""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", nargs="*", type=Path, help="default: those that the tests read")
+    parser.add_argument("--megabytes", type=int, default=200)
+    parser.add_argument("--repeat", type=int, default=5)
+    options = parser.parse_args()
+    logs = options.logs or sorted(LOGS.parent.rglob("*.ulg"))
+    total = [0.0, 0.0]
+    for path in logs:
+        ours, theirs = [], []
+        for _ in range(options.repeat):
+            ours.append(seconds(partial(read_ulog, path, topics=None)))
+            theirs.append(seconds(partial(ULog, str(path))))
+        medians = [statistics.median(ours), statistics.median(theirs)]
+        total = [so_far + median for so_far, median in zip(total, medians, strict=True)]
+        first = measure_replay(path)[0]
+        ratio = medians[0] / medians[1]
+        print(f"{path.name}: {ratio:.2f} of pyulog's time, first message after {first:.3f} s (bar: 0.3 s)")
+    print(f"all logs: {total[0] / total[1]:.2f} of pyulog's time (bar: 1)")
+    with tempfile.TemporaryDirectory() as folder:
+        big = repeat_log(logs[-1], Path(folder) / "big.ulg", options.megabytes * 1_000_000)
+        first, count, duration, peak = measure_replay(big)
+        print(f"{big.stat().st_size / 1e6:.0f} MB: first message after {first:.3f} s, {count:.0f} messages", end="")
+        print(f" in {duration:.0f} s, {peak:.0f} MB of resident memory (bar: below 100 MB)")
+
+
+def seconds(call: Callable[[], object]) -> float:
+    """Return the CPU time of a call [s]."""
+    start = time.process_time()
+    call()
+    return time.process_time() - start
+
+
+def measure_replay(path: Path) -> list[float]:
+    """Replay a log in another process; return the time to its first message, their number, all time and the peak."""
+    command = [sys.executable, "-c", REPLAY, os.fspath(path)]
+    return [float(word) for word in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
+
+
+def repeat_log(path: Path, target: Path, size: int) -> Path:
+    """Write a log whose data are repeated until it has a size."""
+    data = path.read_bytes()
+    at = 16
+    while data[at + 2] != ord("A"):  # the first subscription ends the definitions
+        at += 3 + int.from_bytes(data[at : at + 2], "little")
+    with target.open("wb") as file:
+        file.write(data[:at])
+        while file.tell() < size:
+            file.write(data[at:])
+    return target
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,326 @@
+"""Reassembly of a ULog stream: sequences, gaps and malformed messages, and recordings of a real PX4 (SITL)."""
+
+from __future__ import annotations
+
+import random
+import struct
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from functools import cache
+from typing import Final, NamedTuple
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nedbus.sources.mavlink.log_reassembly import Piece, Reassembly
+from tests.peers.px4_log_stream import STREAMS, Message, datagrams, split_records, stream_message
+
+HEADER: Final = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 3_000_000)
+SIZE: Final = 249
+
+needs_recordings = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+]
+
+
+def add(reassembly: Reassembly, message: Message) -> Piece:
+    return reassembly.add(message.sequence, len(message.data), message.offset, message.data)
+
+
+def begin(reassembly: Reassembly, content: bytes = bytes(SIZE - 16)) -> None:
+    """Begin a stream."""
+    assert add(reassembly, Message(True, 0, 0, HEADER + content)).begins
+
+
+def plain(sequence: int, data: bytes = b"data", offset: int = 0) -> Message:
+    return Message(False, sequence, offset, data)
+
+
+def test_first_message_begins_a_stream_and_its_repetition_does_not() -> None:
+    """Sequence 0 with ULog's magic begins a stream; the same bytes again are a repetition, others a new stream."""
+    reassembly = Reassembly()
+    begin(reassembly, b"a")
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"a")) == Piece("duplicate")
+    add(reassembly, plain(1))
+    assert add(reassembly, Message(True, 0, 0, HEADER + b"b")) == Piece("delivered", HEADER + b"b", begins=True)
+    assert add(reassembly, plain(1)) == Piece("delivered", b"data")
+    assert reassembly.lost == 0
+
+
+def test_same_first_message_begins_a_stream_after_reset() -> None:
+    """After a reboot the header may have the same bytes: it begins a stream all the same."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    reassembly.reset()
+    begin(reassembly)
+
+
+def test_stream_joined_in_the_middle_has_no_definitions() -> None:
+    """Without its header a stream cannot be decoded: nothing is delivered or counted as lost until one begins."""
+    reassembly = Reassembly()
+    for sequence in (0, 70, 3):
+        assert add(reassembly, plain(sequence)) == Piece("no_definitions")
+    assert (reassembly.lost, reassembly.counts["no_definitions"]) == (0, 3)
+    begin(reassembly)
+
+
+def test_trailing_zeros_are_restored() -> None:
+    """MAVLink 2 does not transmit zeros at the end of a payload."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert reassembly.add(1, 6, 0, b"ab").data == b"ab\0\0\0\0"
+    assert reassembly.add(2, 3, 0, [1, 2, 3, 0, 0]).data == b"\1\2\3"
+
+
+def test_gap_delivers_from_the_next_record_on() -> None:
+    """After a gap, bytes before the first record are skipped, and messages in which none begins."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised", gap=True, lost=2)
+    assert add(reassembly, plain(4, offset=255)) == Piece("unsynchronised")
+    assert add(reassembly, plain(6, b"end-begin", offset=4)) == Piece("delivered", b"begin", gap=True, lost=1)
+    assert add(reassembly, plain(7, offset=255)) == Piece("delivered", b"data")
+    assert (reassembly.lost, reassembly.skipped, reassembly.bytes) == (3, 12, SIZE + 9)
+
+
+def test_empty_message_after_a_gap_does_not_synchronise() -> None:
+    """A message without data in which no record begins is no place to go on."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    add(reassembly, plain(2, b"", offset=255))
+    assert add(reassembly, plain(3, offset=255)) == Piece("unsynchronised")
+
+
+def test_late_message_is_lost_and_not_used() -> None:
+    """A late message cannot be told from a repetition: it stays lost."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert add(reassembly, plain(2)).lost == 1
+    assert add(reassembly, plain(1)) == Piece("duplicate")
+    assert add(reassembly, plain(2)) == Piece("duplicate")
+    assert reassembly.lost == 1
+
+
+@pytest.mark.parametrize(("length", "offset"), [(250, 0), (255, 255), (10, 10), (10, 254), (0, 0)])
+def test_malformed_message_is_rejected(length: int, offset: int) -> None:
+    """A length or an offset that cannot be is counted, and leaves a gap."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert reassembly.add(1, length, offset, bytes(SIZE)) == Piece("malformed")
+    assert add(reassembly, plain(2)).lost == 1
+
+
+def test_sequence_wraps() -> None:
+    """The sequence goes on with 0 after 65535, with losses or without."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    for sequence in range(1, 2**16):
+        assert not add(reassembly, plain(sequence)).gap
+    assert add(reassembly, plain(0)) == Piece("delivered", b"data")
+    assert add(reassembly, plain(2)).lost == 1
+    assert reassembly.counts.total() == 2**16 + 2
+
+
+def test_jump_counts_at_most_half_of_the_sequence() -> None:
+    """A step of 32,768 is the largest loss; a larger one is a late message, unless the next ones continue it."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert add(reassembly, plain(2**15)).lost == 2**15 - 1
+    reassembly = Reassembly()
+    begin(reassembly)
+    assert add(reassembly, plain(2**15 + 1)) == Piece("duplicate")
+
+
+def test_stream_resumes_after_an_outage_of_more_than_half_of_the_sequence() -> None:
+    """A long run of successive old numbers is the stream itself, which went on meanwhile: all between is lost."""
+    reassembly = Reassembly()
+    begin(reassembly)
+    pieces = [add(reassembly, plain(sequence)) for sequence in range(40_000, 40_300)]
+    first = next(index for index, piece in enumerate(pieces) if piece.verdict == "delivered")
+    assert first < 256
+    assert pieces[first].lost == reassembly.lost == 40_000 + first - 1
+    assert all(piece == Piece("delivered", b"data") for piece in pieces[first + 1 :])
+
+
+def to_messages(records: Iterable[bytes], size: int = SIZE) -> list[Message]:
+    """Divide a header and records into messages, as PX4 does."""
+    data, starts = bytearray(HEADER), []
+    for record in records:
+        starts.append(len(data))
+        data += record
+    messages = []
+    for sequence, at in enumerate(range(0, len(data), size)):
+        index = bisect_left(starts, at)
+        begins = starts[index] - at if index < len(starts) and starts[index] < at + size else 255
+        messages.append(Message(False, sequence, begins if at else 0, bytes(data[at : at + size])))
+    return messages
+
+
+def deliver(messages: Iterable[Message]) -> tuple[list[tuple[str, bytes]], Reassembly]:
+    """Return the records of the reassembled stream, which a parser splits that trusts all lengths."""
+    reassembly, data = Reassembly(), bytearray()
+    records: list[tuple[str, bytes]] = []
+    for message in messages:
+        piece = add(reassembly, message)
+        if piece.gap or piece.begins:
+            data.clear()
+        data += piece.data[16:] if piece.begins else piece.data
+        records += split_records(data)
+    return records, reassembly
+
+
+class Impaired(NamedTuple):
+    """Messages as they arrive, and the indices of those in the original list that arrive in order."""
+
+    messages: list[Message]
+    in_order: set[int]
+
+
+def impair(
+    messages: Sequence[Message], *, loss: float, burst: int = 1, reorder: float = 0.0, seed: int = 1
+) -> Impaired:
+    """Drop LOGGING_DATA, in bursts, and let some arrive up to eight messages late; what is acknowledged is repeated."""
+    rng, drops, arriving = random.Random(seed), 0, []
+    for index, message in enumerate(messages):
+        if not message.acked and index:
+            drops = burst if not drops and rng.random() < loss / burst else max(0, drops - 1)
+            if drops:
+                continue
+        is_late = not message.acked and index and rng.random() < reorder
+        arriving.append((index + (rng.randint(2, 8) + 0.5 if is_late else 0), index))
+    order = [index for _, index in sorted(arriving)]
+    newest, in_order = -1, set()
+    for index in order:
+        if index > newest:
+            newest = index
+            in_order.add(index)
+    return Impaired([messages[index] for index in order], in_order)
+
+
+def whole_records(messages: Sequence[Message], arrived: set[int]) -> list[tuple[str, bytes]]:
+    """Return the records all of whose bytes are in messages that arrived in order."""
+    data, ends, records = bytearray(), [], []
+    for message in messages:
+        data += message.data
+        ends.append(len(data))
+    at = 16
+    rest = data[16:]
+    for kind, body in split_records(rest):
+        stop = at + 3 + len(body)
+        spanned = range(bisect_left(ends, at + 1), bisect_left(ends, stop) + 1)
+        if arrived.issuperset(spanned):
+            records.append((kind, body))
+        at = stop
+    return records
+
+
+@given(st.data())
+def test_exactly_the_whole_records_are_delivered(data: st.DataObject) -> None:
+    """Whatever is dropped, late or repeated: each record of which no byte is missing, and nothing else."""
+    rng = random.Random(data.draw(st.integers(0, 2**32)))
+    sizes = [rng.choice([1, 5, 40, 300, 900]) for _ in range(data.draw(st.integers(1, 300)))]
+    messages = to_messages(struct.pack("<HB", size, ord("D")) + rng.randbytes(size) for size in sizes)
+    loss, reorder = data.draw(st.sampled_from([0.0, 0.05, 0.3])), data.draw(st.sampled_from([0.0, 0.1]))
+    impaired = impair(messages, loss=loss, burst=rng.randint(1, 5), reorder=reorder, seed=rng.randrange(1000))
+    repeated = [each for each in impaired.messages for _ in range(rng.choice([1, 1, 1, 2]))]
+    records, reassembly = deliver(repeated)
+    assert records == whole_records(messages, impaired.in_order)
+    assert reassembly.lost == max(impaired.in_order) + 1 - len(impaired.in_order)
+    assert reassembly.counts["duplicate"] == len(repeated) - len(impaired.in_order)
+
+
+@cache
+def recorded(name: str) -> list[Message]:
+    """Return the messages of a recorded stream, without repetitions."""
+    found = [
+        stream_message(frame) for _, is_sent, frame in datagrams(STREAMS / f"ulog_stream_{name}.bin.gz") if is_sent
+    ]
+    return [each for each in found if each]
+
+
+def logged(name: str) -> list[bytes]:
+    """Return the data messages in the vehicle's own log, each with its message id."""
+    data, at, found = (STREAMS / f"ulog_stream_{name}.ulg").read_bytes(), 16, []
+    while at + 3 <= len(data):
+        stop = at + 3 + int.from_bytes(data[at : at + 2], "little")
+        if data[at + 2] == ord("D"):
+            found.append(data[at + 3 : stop])
+        at = stop
+    return found
+
+
+class Comparison(NamedTuple):
+    """Data messages in both the stream and the log, those in the stream alone, and gaps: each a number of messages."""
+
+    common: int
+    invented: int
+    missing: list[int]
+
+
+def compare(records: Iterable[tuple[str, bytes]], name: str) -> Comparison:
+    """Find each data message of a stream in the vehicle's own log, in the same order."""
+    places = defaultdict[bytes, list[int]](list)
+    for index, message in enumerate(logged(name)):
+        places[message].append(index)
+    common = invented = 0
+    missing: list[int] = []
+    last: int | None = None
+    for kind, body in records:
+        if kind != "D":
+            continue
+        at = bisect_left(where := places.get(body, []), 0 if last is None else last + 1)
+        if at == len(where):
+            invented += 1
+            continue
+        common += 1
+        if last is not None and where[at] > last + 1:
+            missing.append(where[at] - last - 1)
+        last = where[at]
+    return Comparison(common, invented, missing)
+
+
+@pytest.mark.parametrize(
+    ("name", "messages", "lost", "common"),
+    [("flight1", 23_032, 0, 47_708), ("lossy1", 23_847, 237, 49_054), ("default_topics", 5_969, 11, 18_482)],
+)
+class TestRecordings:
+    """Streams of a real PX4 (SITL, main of 2026-05-14), compared with the log that it wrote at the same time."""
+
+    pytestmark = needs_recordings
+
+    def test_stream_equals_the_vehicles_own_log(self, name: str, messages: int, lost: int, common: int) -> None:
+        """Every data message is in the log, in order; only around gaps does the log have more."""
+        records, reassembly = deliver(recorded(name))
+        compared = compare(records, name)
+        assert (reassembly.counts["delivered"], reassembly.counts.total(), reassembly.lost) == (
+            messages,
+            messages,
+            lost,
+        )
+        assert (compared.common, compared.invented) == (common, 0)
+        assert len(compared.missing) <= lost  # lost messages next to each other leave one gap
+
+
+@pytest.mark.parametrize(
+    ("loss", "burst", "reorder"), [(0.03, 1, 0.0), (0.05, 1, 0.0), (0.05, 20, 0.0), (0.0, 1, 0.02), (0.03, 5, 0.02)]
+)
+class TestImpairedLink:
+    """The same flight with messages dropped and reordered."""
+
+    pytestmark = needs_recordings
+
+    def test_every_whole_message_is_delivered(self, loss: float, burst: int, reorder: float) -> None:
+        """Nothing is invented, decoding resumes with the next whole record, and the loss is counted exactly."""
+        messages = recorded("flight1")
+        impaired = impair(messages, loss=loss, burst=burst, reorder=reorder)
+        records, reassembly = deliver(impaired.messages)
+        assert records == whole_records(messages, impaired.in_order)
+        assert reassembly.lost == len(messages) - len(impaired.in_order)
+        compared = compare(records, "flight1")
+        assert compared.invented == 0
+        lost_bytes = sum(len(each.data) for each in messages) - reassembly.bytes - reassembly.skipped
+        assert lost_bytes <= SIZE * reassembly.lost
+        assert 0 < len(compared.missing) <= reassembly.lost

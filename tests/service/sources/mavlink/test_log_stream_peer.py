@@ -1,0 +1,213 @@
+"""The client and the reassembly over UDP, with the peer that plays a recorded PX4 (SITL)."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from itertools import groupby
+from typing import Any, Final
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from nedbus.sources.mavlink.log_client import Command, LogStreamClient
+from nedbus.sources.mavlink.log_reassembly import Reassembly
+from tests.peers.px4_log_stream import START, STOP, STREAMS, Px4LogStream, Recording, read_recording
+from tests.waits import DEADLINE
+
+from .test_log_client import OTHERS, OURS, Log, Reason
+
+STARTED: Final[list[Reason]] = [("starting", None), ("header", None), ("streaming", None)]
+
+pytestmark = [
+    pytest.mark.logs,
+    pytest.mark.skipif(not STREAMS.exists(), reason=f"no recordings of a PX4's ULog stream: {STREAMS} is not there"),
+]
+
+recording = cache(lambda name: read_recording(STREAMS / f"ulog_stream_{name}.bin.gz"))
+
+
+def recorded_bytes(name: str) -> int:
+    """Return the length of the ULog in a recording."""
+    found: Recording = recording(name)
+    plain = [each.content for each in found.entries if not isinstance(each.content, bytes)]
+    return sum(len(each.data) for each in (*found.header, *plain, *found.tail))
+
+
+class Link:
+    """A client on a UDP port: what it received, and each state with its reason."""
+
+    def __init__(self, *log: Log, acknowledges: bool = True) -> None:
+        self.client = LogStreamClient({"1", *log}, system=OURS[0], component=OURS[1])
+        self.reassembly = Reassembly()
+        self.states: list[Reason] = [("idle", None)]
+        self.bytes = 0
+        self.peer: Px4LogStream
+        self._acknowledges = acknowledges
+        self._mav = dialect.MAVLink(None, *OURS)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.05)
+        self._vehicle: Any = None  # its address
+        self._boot = 0
+
+    @contextmanager
+    def to(self, name: str, **options: Any) -> Iterator[Link]:
+        """Start the vehicle."""
+        with self._socket, Px4LogStream(recording(name), self._socket.getsockname()[1], **options) as self.peer:
+            yield self
+
+    def run(self, until: Callable[[], object]) -> None:
+        """Receive until a condition holds."""
+        end, client = time.monotonic() + DEADLINE, self.client
+        while not until():
+            assert time.monotonic() < end, self.states
+            commands: list[Command] = []
+            with suppress(TimeoutError):
+                frame, self._vehicle = self._socket.recvfrom(2048)
+                for message in self._mav.parse_buffer(frame) or []:
+                    commands += self._handle(message, time.monotonic())
+            self._send(commands + client.tick(time.monotonic()))
+            if client.status[:2] != self.states[-1]:
+                self.states.append(client.status[:2])
+
+    def run_to(self, *states: Reason) -> None:
+        """Receive until there are this many changes of the state, and compare them."""
+        self.run(lambda: len(self.states) > len(states))
+        assert self.states[1:] == [*states]
+
+    def stop(self) -> None:
+        """End the stream."""
+        self.run(self.peer.finished.is_set)
+        self._send(self.client.stop(time.monotonic()))
+        self.run(lambda: self.client.status.state == "stopped")
+
+    def _send(self, commands: list[Command]) -> None:
+        for kind, sequence in commands:
+            message: Any = dialect.MAVLink_logging_ack_message(1, 1, sequence)
+            if kind != "acknowledge":
+                message = dialect.MAVLink_command_long_message(1, 1, START if kind == "start" else STOP, *(0,) * 8)
+            if self._acknowledges or kind != "acknowledge":
+                self._socket.sendto(message.pack(self._mav), self._vehicle)
+
+    def _handle(self, message: Any, now: float) -> list[Command]:
+        client, kind = self.client, message.get_type()
+        if kind == "HEARTBEAT" and message.get_srcComponent() == dialect.MAV_COMP_ID_AUTOPILOT1:
+            return client.on_heartbeat(message.autopilot, now, armed=bool(message.base_mode & 128))
+        if kind == "COMMAND_ACK":
+            ids = message.target_system, message.target_component
+            return client.on_command_ack(message.command, message.result, *ids, now)
+        if kind.startswith("LOGGING_DATA") and client.accepts(message.target_system, message.target_component):
+            fields = message.sequence, message.length, message.first_message_offset, message.data
+            piece = self.reassembly.add(*fields)
+            return client.on_data(message.sequence, now, acked=kind.endswith("ACKED"), begins=piece.begins)
+        if (ms := getattr(message, "time_boot_ms", None)) is not None:
+            if ms < self._boot - 1000:
+                client.on_reboot()
+            self._boot = ms
+        return []
+
+
+def test_stream_arrives_as_recorded() -> None:
+    """At full speed all bytes of the recording arrive, and only its own 11 messages are lost."""
+    with Link("armed").to("default_topics", speed=None) as link:
+        link.stop()
+    assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
+    assert link.peer.commands == [START, STOP]
+    assert (link.reassembly.lost, link.reassembly.counts["duplicate"]) == (11, 0)
+    assert link.reassembly.bytes + link.reassembly.skipped == recorded_bytes("default_topics")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "impairment",
+    [{"loss": 0.03}, {"loss": 0.05}, {"loss": 0.05, "burst": 20}, {"reorder": 0.02}, {"loss": 0.03, "reorder": 0.02}],
+)
+def test_losses_are_counted_as_they_happened(impairment: dict[str, float]) -> None:
+    """Messages that the link drops or delays are the ones counted as lost; what is acknowledged arrives."""
+    with Link("armed").to("flight1", speed=None, seed=7, **impairment) as link:
+        link.stop()
+    assert link.states[1:] == [*STARTED, ("stopping", None), ("stopped", None)]
+    assert link.reassembly.lost == link.peer.dropped + link.peer.late
+    assert link.peer.dropped + link.peer.late > 0
+
+
+def test_refusal_is_reported() -> None:
+    """PX4 denies the stream of a link that is too slow."""
+    with Link().to("default_topics", refusal=dialect.MAV_RESULT_DENIED) as link:
+        link.run_to(("starting", None), ("refused", "bandwidth"))
+
+
+def test_stream_of_another_client_is_not_used() -> None:
+    """Its data arrive on the same link, and are rejected."""
+    with Link().to("default_topics", owner=OTHERS, is_owner_heard=True) as link:
+        link.run(lambda: link.client.rejected > 20)
+    assert link.states[1:] == [("starting", None), ("refused", "taken")]
+    assert set(link.peer.commands) == {START}
+
+
+@pytest.mark.slow
+class TestPx4:
+    """Streams that do not go as planned, in real time."""
+
+    def test_unacknowledged_message_ends_the_stream(self) -> None:
+        """It comes 50 times, then nothing."""
+        with Link(acknowledges=False).to("flight1") as link:
+            link.run_to(("starting", None), ("header", None), ("ended", "stalled"))
+        assert link.reassembly.counts == {"delivered": 1, "duplicate": 49}
+
+    def test_start_without_data_is_repeated(self) -> None:
+        """The logger gives up after 2.5 s; the next START succeeds."""
+        with Link().to("flight1", unsent=1) as link:
+            link.run_to(*STARTED)
+        assert [each for each in link.peer.commands if each == START] == [START, START]
+
+    @pytest.mark.parametrize("is_heard", [True, False])
+    def test_stream_is_taken_over(self, is_heard: bool) -> None:
+        """With log=take the other client's stream ends, and this one begins."""
+        with Link("take").to("flight1", owner=OTHERS, is_owner_heard=is_heard) as link:
+            link.run_to(*STARTED)
+        # An acknowledgement that the other client owes makes STOP last.
+        assert [each for each, _ in groupby(link.peer.commands)] == [START, STOP, START]
+
+    def test_stream_of_an_earlier_process_is_started_anew(self) -> None:
+        """It has the same ids, so the data arrive, without their definitions."""
+        with Link().to("flight1", owner=OURS, is_owner_heard=True) as link:
+            link.run_to(("starting", None), ("refused", "taken"), *STARTED)
+        assert link.reassembly.counts["no_definitions"]
+
+    def test_stop_of_another_client_is_noticed(self) -> None:
+        """The tail is acknowledged, and the stream not started again at once."""
+        with Link("armed").to("flight1") as link:
+            link.run_to(*STARTED)
+            link.peer.cause("foreign_stop")
+            link.run_to(*STARTED, ("ended", "stopped_elsewhere"))
+        assert link.reassembly.lost == 0
+
+    def test_reboot_is_followed_by_a_new_stream(self) -> None:
+        """The header comes again, with another time, and the same data."""
+        with Link("armed").to("flight1") as link:
+            link.run_to(*STARTED)
+            link.peer.cause("reboot")
+            link.run_to(*STARTED, ("idle", None), *STARTED)
+        assert (link.peer.streams, link.reassembly.lost) == (2, 0)
+
+    def test_stream_survives_an_outage(self) -> None:
+        """The vehicle is silent for some seconds: the messages in between are lost, and counted."""
+        with Link("armed").to("flight1") as link:
+            link.run_to(*STARTED)
+            link.peer.cause("vanish")
+            link.run_to(*STARTED, ("ended", "link_lost"))
+            link.peer.cause("return")
+            link.run(lambda: link.reassembly.lost)
+        assert link.states[-1] == ("streaming", None)
+        assert link.peer.commands == [START]
+
+    def test_long_round_trip_aborts_the_header(self) -> None:
+        """At 80 ms the header would take half a minute."""
+        with Link().to("flight1", round_trip=0.08) as link:
+            link.run_to(("starting", None), ("header", None), ("refused", "slow_link"))
+            assert "80 ms" in link.client.status.text or "81 ms" in link.client.status.text
