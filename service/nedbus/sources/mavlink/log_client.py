@@ -133,6 +133,7 @@ class LogStreamClient:
         self._has_header = False  # of the current stream, at least in part: its data can be decoded
         self._header_messages = self._acked_in_row = 0
         self._header_start = self._interval = 0.0  # `_interval`: the longest of late
+        self._header_pause = 0.0  # the longest in the header: one burst of losses says nothing about the round trip
         self._last_heartbeat = self._last_data = self._last_acked = -math.inf
         self._sequence = -1
 
@@ -171,10 +172,12 @@ class LogStreamClient:
         elif begins:
             self._awaited, self._has_header, self._restarts, self.header_seconds = None, True, 0, None
             self._enter("header", None, now)
-            self._header_start, self._last_acked, self._header_messages, self._interval = now, now, 1, 0.0
+            self._header_start, self._last_acked, self._header_messages = now, now, 1
+            self._header_pause = self._interval = 0.0
         elif state == "header" and not acked:
             self._end_header(now)
         elif state == "header" and is_new:
+            self._header_pause = max(now - self._last_acked, self._header_pause)
             self._last_acked, self._header_messages = now, self._header_messages + 1
             return self._judge_link(now) or commands
         elif state in ("refused", "ended") and self._has_header:
@@ -270,13 +273,13 @@ class LogStreamClient:
 
     def _judge_link(self, now: float) -> list[Command]:
         """Stop a stream whose header takes too long, or would."""
-        elapsed = now - self._header_start
-        round_trip = elapsed / (self._header_messages - 1)
-        expected = max(elapsed, round_trip * _EXPECTED if self._header_messages >= _JUDGED else 0.0)
-        if expected <= self._times.header:
+        elapsed, count = now - self._header_start, self._header_messages
+        round_trip = (elapsed - self._header_pause) / max(1, count - 2)
+        expected = elapsed + round_trip * max(0, _EXPECTED - count)
+        if (expected if count >= _JUDGED else elapsed) <= self._times.header:
             return []
         self._has_header = False
-        self._enter("refused", "slow_link", now, max(expected, round_trip * _EXPECTED), 1e3 * round_trip)
+        self._enter("refused", "slow_link", now, expected, 1e3 * round_trip)
         return self._send("stop", now)
 
     def _on_start_result(self, result: int, now: float) -> list[Command]:
