@@ -2,17 +2,36 @@
 
 from __future__ import annotations
 
+import os
+import random
+import subprocess
+import sys
 from pathlib import Path
+from typing import Final
 
 import pytest
 from pyulog import ULog
 
 from nedbus.errors import OutputError
 from nedbus.sources.mavlink.log_file import LogFile
+from tests.flights.ulogs import write_log
 from tests.service.ulog.test_parser import small_log
 
-BEGIN = 1500
+BEGIN: Final = 1500
 """Bytes that hold the definitions and some messages of the small log."""
+KILLS: Final = 50
+PIECE: Final = 249
+"""Bytes of a LOGGING_DATA."""
+SAVE: Final = f"""
+import sys
+from pathlib import Path
+from nedbus.sources.mavlink.log_file import LogFile
+log, file = Path(sys.argv[1]).read_bytes(), LogFile(Path(sys.argv[2]), "1")
+for start in range(0, len(log), {PIECE}):
+    file.write(log[start : start + {PIECE}])
+    print(file.written, flush=True)
+sys.stdin.read()
+"""
 
 
 def test_file_has_whole_records_after_each_write(tmp_path: Path) -> None:
@@ -51,3 +70,25 @@ def test_streams_of_one_second_have_files_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
         LogFile(tmp_path / "file" / "logs", "1")
+
+
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(300)
+def test_killed_process_leaves_a_valid_log(tmp_path: Path) -> None:
+    """Killed with SIGKILL at 50 random moments, the file has every record that was complete, and nothing else."""
+    path = write_log(tmp_path / "flight.ulg", range(0, 200_000_000, 10_000))
+    log, chance = path.read_bytes(), random.Random(1)
+    for number in range(KILLS):
+        folder = tmp_path / f"{number}"
+        command = [sys.executable, "-c", SAVE, os.fspath(path), os.fspath(folder)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            assert process.stdout
+            count = chance.randrange(1, len(log) // PIECE)
+            written = [int(process.stdout.readline()) for _ in range(count)][-1]
+            process.kill()
+        (saved,) = folder.iterdir()
+        content = saved.read_bytes()
+        assert len(content) >= written > count * PIECE - PIECE - 2**12
+        assert log.startswith(content)
+        assert not ULog(str(saved)).file_corruption
