@@ -72,6 +72,7 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
 	$(BIN)/python -m benchmarks.logs
+	$(BIN)/python -m benchmarks.log_stream
 	$(BIN)/python -m benchmarks.metrics
 
 $(READY): pyproject.toml  # what running needs

@@ -196,7 +196,7 @@ class Px4LogStream:
     `refusal`: MAV_RESULT of every START. `answers`: False without a logger: no COMMAND_ACK at all.
     `unsent`: number of STARTs that are accepted without data.
     `owner`: ids of a client that has the stream at first; `is_owner_heard`: it has it on this link.
-    `events`: at times of the recording [s]. `waits`: the recording is held before its own START until one comes.
+    `on_send`: called with each frame. `events`: at times of the recording [s]. `waits`: the recording is held before its own START until one comes.
 
     `commands`: MAV_CMD of those received. `dropped`, `late`: LOGGING_DATA that never arrive, and those that come late.
     `streams`: number of streams that began. `finished`: set when the recording has been sent.
@@ -222,6 +222,7 @@ class Px4LogStream:
         events: Mapping[float, Event] | None = None,
         waits: bool = True,
         deadline: float = 100.0,
+        on_send: Callable[[bytes], object] = lambda _: None,
     ) -> None:
         self.commands: list[int] = []
         self.dropped = self.late = self.streams = 0
@@ -230,7 +231,7 @@ class Px4LogStream:
         self._loss, self._burst, self._reorder, self._random = loss / burst, burst, reorder, random.Random(seed)
         self._round_trip = round_trip if round_trip is not None else _ROUND_TRIP if speed else 0.0
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
-        self._events = deque(sorted((events or {}).items()))
+        self._events, self._on_send = deque(sorted((events or {}).items())), on_send
         self._caused: deque[Event] = deque()
         self._mav = dialect.MAVLink(None, recording.system, dialect.MAV_COMP_ID_AUTOPILOT1)
         self._mav.robust_parsing = True
@@ -488,6 +489,7 @@ class Px4LogStream:
             self._held.append((self._frames + self._random.randint(1, _MAX_LATE), frame, number))
         else:
             self._newest = max(self._newest, number)
+            self._on_send(frame)
             self._socket.sendto(frame, ("127.0.0.1", self._port))
 
     def _release(self, *, everything: bool = False) -> None:
