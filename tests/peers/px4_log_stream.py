@@ -196,7 +196,8 @@ class Px4LogStream:
     `refusal`: MAV_RESULT of every START. `answers`: False without a logger: no COMMAND_ACK at all.
     `unsent`: number of STARTs that are accepted without data.
     `owner`: ids of a client that has the stream at first; `is_owner_heard`: it has it on this link.
-    `on_send`: called with each frame. `events`: at times of the recording [s]. `waits`: the recording is held before its own START until one comes.
+    `events`: at times of the recording [s]. `on_send`: called with each frame.
+    `waits`: the recording is held before its own START until one comes.
 
     `commands`: MAV_CMD of those received. `dropped`, `late`: LOGGING_DATA that never arrive, and those that come late.
     `streams`: number of streams that began. `finished`: set when the recording has been sent.
