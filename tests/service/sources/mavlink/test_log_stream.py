@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import random
+import socket
+import struct
 from collections import Counter, defaultdict
-from contextlib import closing
+from collections.abc import Callable
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, cast
 
 import pytest
+from pymavlink.dialects.v20 import common as dialect
 from pyulog import ULog
 
 from nedbus.client import LogStreamStatus
-from nedbus.sources import LiveSource, SourceMessage, parse_source
+from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import reader
 from nedbus.ulog import Data, UlogParser
 from tests.peers.ports import free_port
-from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording
+from tests.peers.px4_log_stream import START, STREAMS, Px4LogStream, read_recording
 
 from .test_log_reassembly import compare as compare_records
 from .test_log_reassembly import deliver, recorded
@@ -41,8 +47,14 @@ def room(monkeypatch: pytest.MonkeyPatch) -> None:
 class Received:
     """Messages that one source yields until the recording has been sent and nothing more arrives."""
 
-    def __init__(self, options: str, name: str = "ulog_stream_flight1", **peer: Any) -> None:
+    def __init__(
+        self, options: str, name: str = "ulog_stream_flight1", *,
+        attack: Callable[[bytes, int], None] | None = None, **peer: Any
+    ) -> None:  # fmt: skip
         port = free_port()
+        if attack:
+            peer["on_send"] = partial(attack, port=port)
+        self.rejections: list[Rejection] = []
         self.stream: list[SourceMessage] = []
         self.converted: list[SourceMessage] = []
         self.status = LogStreamStatus()
@@ -57,7 +69,9 @@ class Received:
             for item in items:
                 if isinstance(item, SourceMessage):
                     (self.stream if item.source else self.converted).append(item)
-                elif isinstance(item, LogStreamStatus):
+                elif isinstance(item, Rejection):
+                    self.rejections.append(item)
+                elif isinstance(item, LogStreamStatus) and item.vehicle == "1":
                     is_end = self.peer.finished.is_set() and item.received == self.status.received
                     self.status = item
                     self.reasons.add(item.reason)
@@ -150,3 +164,61 @@ def test_refused_stream_names_the_reason(peer: dict[str, Any], reason: str) -> N
     assert not received.stream
     assert len(received.converted) > 1000
     assert any(reason in each for each in received.reasons), received.reasons
+
+
+HOSTILE: Final = [
+    b"\0" * 249,
+    b"ULog\x01\x12\x35\x01" + bytes(8) + b"".join(
+        struct.pack("<HB", len(body), ord(kind)) + body
+        for kind, body in (
+            ("F", b"loop:uint64_t timestamp;loop inner;"),
+            ("F", b"wide:" + b"uint8_t[999999999] a;"),
+            ("F", b"vehicle_status:uint64_t timestamp;float timestamp;"),
+            ("A", struct.pack("<BH", 0, 1) + b"loop"),
+            ("A", struct.pack("<BH", 0, 2) + b"wide"),
+            ("A", struct.pack("<BH", 0, 3) + b"vehicle_status"),
+            ("A", struct.pack("<BH", 0, 4) + b"unknown"),
+            ("D", struct.pack("<HQ", 1, 1)),
+        )
+    ),
+    struct.pack("<HBH", 2000, ord("D"), 9) + bytes(240),
+]  # fmt: skip
+
+
+def test_hostile_vehicle_harms_no_other() -> None:
+    """A vehicle that answers START with invalid streams is rejected and reported; another one's stream is complete."""
+    rng, mav, sent = random.Random(5), dialect.MAVLink(None, 66, 1), Counter[str]()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as hostile:
+        hostile.bind(("127.0.0.1", 0))
+        hostile.setblocking(False)
+
+        def attack(frame: bytes, port: int) -> None:
+            """Send an invalid message beside a valid one."""
+            message: Any = dialect.MAVLink_heartbeat_message(2, dialect.MAV_AUTOPILOT_PX4, 0, 0, 3, 3)
+            mav.srcSystem = 66
+            if (number := sent["frames"]) % 50:
+                mav.srcSystem = rng.choice((66, 66, 67))  # 67 was never asked
+                content = HOSTILE[number % 3] if number > 100 else HOSTILE[1]
+                sequence = rng.choice((0, 1, number % 2**16, rng.randrange(2**16)))
+                target = rng.choice(((245, 191), (245, 191), (1, 1)))
+                offset, length = rng.choice((0, 0, 255, rng.randrange(256))), rng.choice((len(content), 255))
+                data = [*content[:249].ljust(249, b"\0")]
+                message = dialect.MAVLink_logging_data_message(*target, sequence, min(length, 255), offset, data)
+            hostile.sendto(message.pack(mav), ("127.0.0.1", port))
+            with suppress(BlockingIOError):
+                for command in mav.parse_buffer(hostile.recv(2048)) or []:
+                    if command.get_type() == "COMMAND_LONG":
+                        answer = dialect.MAVLink_command_ack_message(command.command, 0, 0, 0, 245, 191)
+                        hostile.sendto(answer.pack(mav), ("127.0.0.1", port))
+                        sent[str(command.command)] += 1
+            sent["frames"] += 1
+
+        received = Received("log=armed", "ulog_stream_default_topics", attack=attack)
+    ours = [each for each in received.stream if each.address.vehicle == "1"]
+    assert (len(ours), len(received.stream)) == (18_482, 18_482)
+    reasons = {(each.where, each.reason) for each in received.rejections}
+    assert sent[str(START)]
+    assert any("not requested" in reason for _, reason in reasons)
+    assert any("loop cannot be decoded" in reason for _, reason in reasons), reasons
+    assert any("two fields are called timestamp" in reason for _, reason in reasons), reasons
+    assert len(reasons) < 110
