@@ -31,6 +31,8 @@ from tests.flights.ulogs import LOGS
 
 STREAMS: Final = LOGS.parent / "px4" / "ulog_stream"
 """Recordings of streams, and the vehicle's own logs of the same flights."""
+SHORT: Final = Path(__file__).parents[1] / "data" / "log_stream.bin.gz"
+"""The header of `ulog_stream_flight1` and the 2 s after it."""
 
 START, STOP = dialect.MAV_CMD_LOGGING_START, dialect.MAV_CMD_LOGGING_STOP
 HEARTBEAT: Final = 0
@@ -228,7 +230,7 @@ class Px4LogStream:
         self.commands: list[int] = []
         self.dropped = self.late = self.streams = 0
         self.finished = threading.Event()
-        self._recording, self._port, self._speed, self._is_ready = recording, port, speed, is_ready
+        self.recording, self._port, self._speed, self._is_ready = recording, port, speed, is_ready
         self._loss, self._burst, self._reorder, self._random = loss / burst, burst, reorder, random.Random(seed)
         self._round_trip = round_trip if round_trip is not None else _ROUND_TRIP if speed else 0.0
         self._refusal, self._answers, self._unsent, self._waits = refusal, answers, unsent, waits
@@ -308,7 +310,7 @@ class Px4LogStream:
                         self._take(message, time.monotonic())
 
     def _idle_time(self) -> float:
-        entries = self._recording.entries
+        entries = self.recording.entries
         if (self._stream and self._stream.pending) or not self._has_room():
             return 0.0005
         if self._is_held or self._index == len(entries):
@@ -331,7 +333,7 @@ class Px4LogStream:
 
     def _boot_ns(self) -> int:
         """Return the time of the vehicle, from its recorded answers to TIMESYNC."""
-        clock = self._recording.clock
+        clock = self.recording.clock
         index = min(max(bisect(clock, (self._clock, 0)), 1), len(clock) - 1)
         (before, first), (after, second) = clock[index - 1 : index + 1]
         return first + round((self._clock - before) / (after - before) * (second - first))
@@ -352,7 +354,7 @@ class Px4LogStream:
             stream.pending.popleft()
             stream.sends, stream.acknowledged = 0, None
             if not stream.pending:
-                self._clock = max(self._clock, self._recording.header_end)
+                self._clock = max(self._clock, self.recording.header_end)
                 return
         if stream.sends and now < stream.sent + _REPEAT:
             return
@@ -386,7 +388,7 @@ class Px4LogStream:
 
     def _begin(self, ids: tuple[int, int]) -> _Stream:
         """Return a stream with the whole header, and with the definitions of topics that appeared since."""
-        recording, stream = self._recording, _Stream(ids)
+        recording, stream = self.recording, _Stream(ids)
         for each in recording.header:
             stream.append(each)
         for index, record in recording.definitions:
@@ -403,8 +405,8 @@ class Px4LogStream:
 
     def _append_tail(self, stream: _Stream) -> None:
         """Complete the record that was begun, then send what PX4 sends after STOP."""
-        tail = self._recording.tail
-        messages = [each for _, each in self._recording.entries[self._index :] if isinstance(each, Message)]
+        tail = self.recording.tail
+        messages = [each for _, each in self.recording.entries[self._index :] if isinstance(each, Message)]
         if messages and tail:
             tail = [tail[0]._replace(offset=0, data=tail[0].data[tail[0].offset :]), *tail[1:]]
         for each in messages if stream.expected is not None else []:
@@ -418,11 +420,11 @@ class Px4LogStream:
     def _play(self, now: float) -> None:
         """Send what is due of the recording; hold it while the logger waits, or the client is slow."""
         elapsed, self._checked = now - self._checked, now
-        limit = self._recording.start if self._is_held else math.inf
+        limit = self.recording.start if self._is_held else math.inf
         if self._stream and self._stream.pending:
-            limit = max(self._clock, self._recording.header_end)
+            limit = max(self._clock, self.recording.header_end)
         until = min(limit, self._clock + elapsed * self._speed if self._speed else math.inf)
-        entries = self._recording.entries[self._index : self._index + _BATCH]
+        entries = self.recording.entries[self._index : self._index + _BATCH]
         for when, content in entries:
             is_blocked = isinstance(content, Message) and self._stream and self._stream.pending
             if when > until or is_blocked or not self._has_room():
