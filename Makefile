@@ -71,8 +71,8 @@ bench: $(DEV)  ## measure: beside the peers, many vehicles, busy and stuck reade
 	$(BIN)/python -m benchmarks.stuck
 	$(BIN)/python -m benchmarks.pacing
 	$(BIN)/python -m benchmarks.idle
-	$(BIN)/python -m benchmarks.logs
-	$(BIN)/python -m benchmarks.log_stream
+	$(BIN)/python -m benchmarks.ulog.files
+	$(BIN)/python -m benchmarks.ulog.stream
 	$(BIN)/python -m benchmarks.metrics
 
 $(READY): pyproject.toml  # what running needs

@@ -8,6 +8,7 @@ import math
 import re
 import socket
 import ssl
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -532,7 +533,7 @@ def packets_of(system: int, *messages: object) -> list[bytes]:
 
 
 def test_what_comes_on_a_mavlink_link() -> None:
-    """Nothing, what is no MAVLink, heartbeats only, positions, a port that is taken: told apart, by system id."""
+    """Each state of a link has its finding, by system id: packets, messages, positions, the ULog stream, the port."""
     heartbeat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
     position = mavlink.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0)
     found(listen_to(), "mavlink", "wrong", "no packet within")
@@ -541,6 +542,13 @@ def test_what_comes_on_a_mavlink_link() -> None:
     findings = listen_to(*packets_of(7, heartbeat), *packets_of(8, heartbeat, position))
     assert "requests it" in found(findings, "mavlink", "warning", "system 7: HEARTBEAT only").advice
     found(findings, "mavlink", "ok", r"system 8: LOCAL_POSITION_NED at \d+ Hz")
+    assert "?log=1" in found(findings, "mavlink", "ok", "system 7: a PX4, on a link that carries").advice
+    (backend,) = struct.unpack("<f", struct.pack("<i", 1))
+    parameter = mavlink.MAVLink_param_value_message(b"SDLOG_BACKEND", backend, mavlink.MAV_PARAM_TYPE_INT32, 1, 0)
+    data = mavlink.MAVLink_logging_data_message(255, 190, 7, 1, 0, [0] * 249)
+    findings = listen_to(*packets_of(7, heartbeat, parameter), *packets_of(8, heartbeat, data))
+    found(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
+    found(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")

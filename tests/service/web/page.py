@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager, contextmanager
 from html import unescape
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
@@ -21,7 +21,7 @@ from bokeh.models import ColumnDataSource, Model
 from bokeh.models.widgets import Div
 
 import nedbus
-from nedbus.client import Monitor, Sample, stream_state
+from nedbus.client import LogStreamStatus, Monitor, Sample, stream_state
 from nedbus.events import Account
 from nedbus.recording import RecordingWriter
 from nedbus.web import Where, serve_live
@@ -78,7 +78,13 @@ class Sky:
                 self.add(address, **fields)
 
     def look(
-        self, *, alive: list[Address] | None = None, link: str = "", own: str = "", is_behind: bool = False
+        self,
+        *,
+        alive: list[Address] | None = None,
+        link: str = "",
+        own: str = "",
+        is_behind: bool = False,
+        logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
     ) -> Picture:
         """Look at all vehicles now, as the page does twice a second."""
         healths = self.monitor.snapshot(round(self.time * 1e9))
@@ -88,7 +94,7 @@ class Sky:
         }
         self.account.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
-        return self.fleet.update(self.time, healths, states, alive=alive, link=link, own=own)
+        return self.fleet.update(self.time, healths, states, alive=alive, link=link, own=own, logs=logs)
 
     def row(self, vehicle: str = "wing", **known: Any) -> Row:
         row = self.look(**known).row(vehicle)

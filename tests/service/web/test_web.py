@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import nedbus
-from nedbus.client import RejectionReport
+from nedbus.client import LogStreamStatus, RejectionReport
 from nedbus.transport import Session, open_router
 from nedbus.web.column_data import NAMES, Track, Tracks
 from nedbus.web.fleet import TRUTH
@@ -173,6 +173,17 @@ class Page(Shown):
 
 def sources(page: Shown) -> list[ColumnDataSource]:
     return models_of(page.document, ColumnDataSource)
+
+
+def test_log_stream_is_shown_with_its_vehicle(sky: Sky) -> None:
+    """The chosen vehicle has a line about its ULog stream, whose text is from a peer."""
+    page = Page(sky)
+    sky.fly(3)
+    page.look()
+    assert "ULog stream" not in page.text
+    page.look(logs={"wing": LogStreamStatus(vehicle="wing", state="refused", reason="<b>another client has it")})
+    assert "ULog stream" in page.text
+    assert "refused, &lt;b&gt;another client has it" in page.text
 
 
 def test_every_part_says_the_same(sky: Sky) -> None:

@@ -15,6 +15,12 @@ _POSE_FRAMES: Final = {1: 1, 20: 2}  # MAV_FRAME to `pose_frame`: local NED, loc
 _VELOCITY_FRAMES: Final = {**_POSE_FRAMES, 12: 3}  # body FRD
 _ARMED, _HIL = 128, 32  # bits of base_mode
 _SENSORS: Final = [f"onboard_control_sensors_{each}" for each in ("present", "enabled", "health")]
+_MAX_DELAY: Final = 1000  # ms that a datagram may be late; an older one means a reboot
+
+
+def is_reboot(time_boot_ms: int, newest: int | None) -> bool:
+    """Return whether the vehicle rebooted since its newest time."""
+    return newest is not None and time_boot_ms < newest - _MAX_DELAY
 
 
 def _number(value: int, unit: float, *unknown: int) -> float | None:

@@ -11,13 +11,13 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
+from .fields import is_reboot
 from .link import Peer
 from .log_client import Command, LogStreamClient
 from .log_reassembly import Reassembly
 from .reader import AUTOPILOT, Received
 
 _KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
-_REBOOT_STEP: Final = 1000  # ms by which time_boot_ms steps back in a reboot; less is a datagram out of order
 _COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}
 
 
@@ -74,7 +74,7 @@ class LogReceiver:
             commands = vehicle.client.on_command_ack(message.command, message.result, *target, now)
             self._act(received.system, commands)
         elif vehicle is not None and (ms := getattr(message, "time_boot_ms", None)) is not None:
-            if ms < vehicle.newest - _REBOOT_STEP:
+            if is_reboot(ms, vehicle.newest):
                 vehicle.client.on_reboot()
                 vehicle.newest = ms
             vehicle.newest = max(ms, vehicle.newest)

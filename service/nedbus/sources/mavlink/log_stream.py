@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +29,8 @@ _WINDOW: Final = 1.0  # s over which rate and delay are measured
 _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
+
+_Route = tuple[Subscription, Address, Definition[Any]]
 
 
 class LogStream:
@@ -58,7 +60,7 @@ class LogStream:
     def _restart(self) -> None:
         """Forget the definitions: those of the next stream may differ."""
         self._parser = UlogParser(verify=False)
-        self._routes: dict[int, tuple[Subscription, Address, Definition[Any]] | None] = {}
+        self._routes: dict[int, _Route | None] = {}
         self._damages: set[str] = set()
 
     @property
@@ -147,11 +149,9 @@ class LogStream:
             self._file.close()
             self._file = None
 
-    def _find_route(
-        self, subscription: Subscription
-    ) -> Iterator[Rejection] | Any:  # a generator that returns the route
+    def _find_route(self, subscription: Subscription) -> Generator[Rejection, None, _Route | None]:
         """Find address and definition of a subscription; None if it is not selected, or cannot be published."""
-        route = None
+        route: _Route | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
                 route = subscription, address_of(self._name, subscription), definition_of(subscription)

@@ -120,7 +120,7 @@ class _LinkSession:
         if vehicle is None:
             vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
         self._peers[system] = received.peer
-        vehicle.track_sequence(received.sequence, now)
+        vehicle.track_sequence(received.sequence, now, counted=received.piece.lost if received.piece else 0)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
             log.add_timesync(message.tc1 / 1e9, message.ts1 / 1e9, now)

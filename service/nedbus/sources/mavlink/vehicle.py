@@ -17,11 +17,10 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
 from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address
 
-from .fields import CONVERSIONS, sensors_of
+from .fields import CONVERSIONS, is_reboot, sensors_of
 
 _log = logging.getLogger(__name__)
 
-_MAX_DELAY: Final = 1000  # ms that a datagram may be late; an older one means a reboot
 _VALUE_TIMEOUT: Final = 2.0  # s for which a received value is part of the estimate
 _STATUS_TIMEOUT: Final = 5.0  # s; without a request, PX4 sends ESTIMATOR_STATUS once a second
 _SILENCE_TIMEOUT: Final = 3.0  # s without messages after which all state is reset
@@ -99,8 +98,8 @@ class Vehicle:
         self._pending = [*self._rates] * _FIRST_ROUNDS
         self._next_round = now + _REQUEST_INTERVAL
 
-    def track_sequence(self, sequence: int, now: float) -> None:
-        """Count the messages lost before this one, of any type."""
+    def track_sequence(self, sequence: int, now: float, *, counted: int = 0) -> None:
+        """Count the messages lost before this one, of any type, without those that the ULog stream has counted."""
         if now - self._last_message > _SILENCE_TIMEOUT:
             self._reset(now)
         self._last_message = now
@@ -108,7 +107,7 @@ class Vehicle:
         if step > 128:  # out of order: it was counted as lost
             self.lost = max(0, self.lost - 1)
         elif step:  # else a duplicate
-            self.lost += step - 1
+            self.lost = max(0, self.lost + step - 1 - counted)
             self._sequence = sequence
 
     def next_request(self, now: float) -> tuple[int, float] | None:
@@ -225,7 +224,7 @@ class Vehicle:
         ms: int | None = getattr(message, "time_boot_ms", self._newest)
         if ms is None:
             return None
-        if self._newest is not None and ms < self._newest - _MAX_DELAY:
+        if is_reboot(ms, self._newest):
             self._rebooted = True
             self.lost = 0  # the sequence restarted too, so the count is wrong
             self._newest = None

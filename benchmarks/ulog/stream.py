@@ -15,9 +15,8 @@ import time
 from pymavlink.dialects.v20 import common as dialect
 from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording, stream_message, unpack
 
+from benchmarks.processes import cpu_seconds, end, expect, free_port, nedbus_process, start, tell
 from nedbus.ulog import Data, UlogParser, address_of
-
-from .processes import cpu_seconds, end, expect, free_port, nedbus_process, start, tell
 
 RATE = 200_000  # bytes of ULog per second
 NATURAL = 69_800  # that of the recording in real time

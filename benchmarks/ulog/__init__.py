@@ -1,0 +1,1 @@
+"""Reading ULog files, and receiving the ULog stream."""
