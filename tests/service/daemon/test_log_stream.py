@@ -56,10 +56,13 @@ def test_stream_in_another_process(run_nedbus: Start, tmp_path: Path) -> None:
         sample = next(each for each in positions if each.source == "mavlink-ulog")
         assert sample.missing == frozenset()
         assert sample.message.delta_heading is not None
+        (saved,) = tmp_path.glob("1_*.ulg")
+        why = run_command("why", str(saved))  # while the file grows
+        assert why.exit_code in (0, 1), why.err
+        assert "damaged" not in why.err
         service.signal(signal.SIGTERM)
         assert service.wait() == 0, service.err
         assert [each for each in peer.commands if each in (START, STOP)][-1] == STOP
-    (saved,) = tmp_path.glob("1_*.ulg")
     assert {address.topic for address in read_ulog(saved, topics=None).topics} >= {"vehicle_local_position", "event"}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -139,6 +140,22 @@ def test_unordered_timestamps_keep_the_logs_order(tmp_path: Path, timestamps: li
     assert [each.fields["timestamp"] for each in messages] == timestamps
     assert [round(each.due * 1e6) + 10 for each in messages] == due
     assert len(run.warnings) == 1
+
+
+@pytest.mark.parametrize("age", [50_000_000, 108_000_000])
+def test_old_latched_message_delays_nothing(tmp_path: Path, age: int) -> None:
+    """A log begins with a message of some time ago, as of home_position: no delay of the flight, and no warning."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    struct.pack_into("<Q", writer.data, 8, 300_000_000)  # the start of logging
+    writer.put("F", b"parameter_update:uint64_t timestamp;")
+    writer.put("A", struct.pack("<BH", 0, 99) + b"parameter_update")
+    writer.put("D", struct.pack("<HQ", 99, 300_000_000 - age))
+    for time in range(300_000_000, 310_000_000, 20_000):
+        writer.add(VLP, message(time))
+    run = open_log(writer.write(tmp_path / "a.ulg"), "?topics=*")
+    assert [each.due for each in run.messages] == pytest.approx([0.0, *(number / 50 for number in range(500))])
+    assert run.warnings == ()
 
 
 def test_bool_that_is_neither_0_nor_1_is_rejected_by_the_model(tmp_path: Path) -> None:
