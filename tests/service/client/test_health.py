@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Mapping
 
@@ -173,6 +174,16 @@ def test_slow_stream_is_stale_later() -> None:
     """A stream is stale after 3 s without a message, but not if it has one every 5 s."""
     assert follow(*(index * 0.01 for index in range(300))).snapshot(0).stale_after == 3.0
     assert follow(*(index * 5.0 for index in range(10))).snapshot(0).stale_after == pytest.approx(10.0)
+
+
+def test_topic_of_events_is_never_stale() -> None:
+    """A topic without a file has no known rate: it is stale only if it came at least once a second."""
+    for period, expected in ((0.01, 3.0), (5.0, math.inf)):
+        stream = StreamHealth("vehicle_command")
+        for index in range(300):
+            stream.add(message(round(index * period * 1e6)), received=round(index * period * SECOND))
+        assert stream.snapshot(0).stale_after == expected
+    assert StreamHealth("vehicle_command").snapshot(0).stale_after == math.inf
 
 
 def sample(vehicle: str, timestamp: int = 0) -> Sample:

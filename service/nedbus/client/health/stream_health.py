@@ -24,6 +24,7 @@ _MIN_STEPS: Final = 5  # steps before gaps are counted
 _SMOOTHING: Final = 0.05  # smoothing factor of the usual step and the usual rate
 _MAX_MEASURED: Final = 1000  # intervals and latencies per window
 _WINDOW: Final = 1_000_000_000  # ns
+_SELDOM: Final = 1.0  # Hz; a topic without a file that comes less often may be one of events
 _STALE: Final = 3.0  # s without a message until a stream is stale and has no rate
 _COUNTER_MODULUS: Final = 256  # modulus of reset counters
 _LATENCY_BUCKETS: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)  # s, bucket limits
@@ -68,6 +69,8 @@ class Health:
         """Seconds without a message until this stream is stale: at least 3, infinity if it may pause forever."""
         if self.on_change:
             return max(_STALE, 2 / self.nominal) if self.nominal else math.inf
+        if not self.nominal and (self.usual_rate or 0) < _SELDOM:
+            return math.inf
         return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
 
 
