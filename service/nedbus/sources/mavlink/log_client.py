@@ -51,7 +51,7 @@ LogReason = Literal[
 _TEXTS: Final[Mapping[LogReason, str]] = {
     "not_px4": "only PX4 has a ULog stream, and this autopilot is {}",
     "armed": "the vehicle is armed: the ULog stream starts after disarming, or in flight with log=armed",
-    "taken": "PX4 rejected the ULog stream: another client has it (log=take ends that client's stream), or PX4 logs to"
+    "taken": "PX4 rejected the ULog stream: {} has it (log=take ends that client's stream), or PX4 logs to"
     " files only (set SDLOG_BACKEND to 3 and reboot the vehicle)",
     "bandwidth": "PX4 denied the ULog stream: the rate of this MAVLink instance is below 5000 B/s; raise MAV_x_RATE, or"
     " option -r of `mavlink start`",
@@ -119,6 +119,7 @@ class LogStreamClient:
         times: LogStreamTimes = LogStreamTimes(),
     ) -> None:
         self._log, self._ids, self._times = log, (system, component), times
+        self._owner = "another client"
         self.rejected = 0
         self.header_seconds: float | None = None
         self._is_px4 = self._armed = False
@@ -139,9 +140,13 @@ class LogStreamClient:
 
     def accepts(self, target_system: int, target_component: int) -> bool:
         """Return whether LOGGING_DATA or LOGGING_DATA_ACKED is for this client."""
-        is_accepted = self._asked and (target_system, target_component) == self._ids
-        self.rejected += not is_accepted
-        return is_accepted
+        is_for_us = (target_system, target_component) == self._ids
+        if not is_for_us and target_system:
+            self._owner = f"system {target_system} component {target_component}"
+            if self.status.reason == "taken":
+                self.status = self.status._replace(text=_TEXTS["taken"].format(self._owner))
+        self.rejected += not (self._asked and is_for_us)
+        return self._asked and is_for_us
 
     def on_heartbeat(self, autopilot: int, now: float, *, armed: bool) -> list[Command]:
         """Take a HEARTBEAT of the autopilot: MAV_AUTOPILOT, and whether base_mode is armed."""
@@ -235,6 +240,7 @@ class LogStreamClient:
     def _enter(self, state: LogState, reason: LogReason | None, now: float, *values: object) -> None:
         """Change the state, and set the time of the next START unless an answer is awaited."""
         if (state, reason) != self.status[:2]:
+            values = (self._owner,) if reason == "taken" else values
             self.status = LogStatus(state, reason, _TEXTS[reason].format(*values) if reason else "")
         if self._awaited is None:
             is_slow = reason in ("bandwidth", "unsupported", "slow_link")

@@ -49,9 +49,10 @@ class LogReceiver:
         message, kind, now = received.message, received.message.get_type(), received.time
         vehicle = self._vehicles.get(received.system)
         if kind in _KINDS:
-            if (message.target_system, message.target_component) != self._ids:
-                return received
-            if vehicle is None or not vehicle.client.accepts(message.target_system, message.target_component):
+            target = message.target_system, message.target_component
+            if vehicle is None or not vehicle.client.accepts(*target):
+                if target != self._ids:
+                    return received
                 return Rejection(f"{self._name} system {received.system}", f"{kind} of a stream that was not requested")
             begins = False
             if has_room:

@@ -117,7 +117,7 @@ class LogStream:
         status, address = self._client.status, Address(self._name, DEFAULT_TOPIC)
         if not self.is_streaming:
             self._carried.clear()
-        if status == self._logged:
+        if status[:2] == self._logged[:2]:
             return
         self._logged = status
         if status.state == "streaming":

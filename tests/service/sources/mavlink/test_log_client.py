@@ -234,6 +234,15 @@ class TestOwnership:
         assert set(session.commands) == {"start"}
         assert session.client.status.state == "stopped"
 
+    def test_client_that_has_the_stream_is_named(self, session: Session) -> None:
+        """Its data on the same link show its ids."""
+        session.wait(0.1)
+        session.answer(START, TAKEN)
+        assert "another client has it" in session.client.status.text
+        assert not session.client.accepts(255, 190)
+        assert "system 255 component 190 has it" in session.client.status.text
+        assert session.client.status[:2] == ("refused", "taken")
+
     def test_stream_of_another_client_is_taken_over_on_request(self) -> None:
         """log=take: STOP, its acceptance, a pause, START; acknowledgements go on meanwhile."""
         session = Session("take")
