@@ -8,6 +8,7 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import closing, suppress
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, cast
@@ -18,10 +19,12 @@ from pyulog import ULog
 
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
-from nedbus.sources.mavlink import reader
+from nedbus.sources.mavlink import log_receiver, reader
+from nedbus.sources.mavlink.log_client import LogStreamClient, LogStreamTimes
 from nedbus.ulog import Data, UlogParser
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
+from tests.waits import DEADLINE
 
 from .test_log_reassembly import compare as compare_records
 from .test_log_reassembly import deliver, recorded
@@ -41,9 +44,11 @@ def recorded_flight(test: Any) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def room(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let messages wait: a flight is sent here as fast as the thread that reads the link takes it."""
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let messages wait, as a flight is sent as fast as it is read, and let the header and answers take long."""
+    times = LogStreamTimes(answer=DEADLINE, link=DEADLINE, header=10 * DEADLINE)
     monkeypatch.setattr(reader, "_MAX_WAITING", 1_000_000)
+    monkeypatch.setattr(log_receiver, "LogStreamClient", partial(LogStreamClient, times=times))
 
 
 Attack = Callable[[bytes, int], None]
@@ -250,7 +255,7 @@ def test_hostile_vehicle_harms_no_other() -> None:
 
         received = Received("log=armed", attack=attack)
     ours = [each for each in received.stream if each.address.vehicle == "1"]
-    assert len(ours) == len(received.stream) == len(sent_messages())
+    assert len(ours) == len(received.stream) == len(sent_messages()), received.reasons
     reasons = {(each.where, each.reason) for each in received.rejections}
     assert sent[str(START)]
     assert any("not requested" in reason for _, reason in reasons)
