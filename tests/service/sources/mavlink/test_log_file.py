@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ from pyulog import ULog
 from nedbus.errors import OutputError
 from nedbus.sources.mavlink.log_file import LogFile
 from tests.flights.ulogs import write_log
+from tests.peers.processes import unmeasured
 from tests.service.ulog.test_parser import small_log
 
 BEGIN: Final = 1500
@@ -23,14 +25,20 @@ KILLS: Final = 50
 PIECE: Final = 249
 """Bytes of a LOGGING_DATA."""
 SAVE: Final = f"""
-import sys
+import os, sys, time
 from pathlib import Path
 from nedbus.sources.mavlink.log_file import LogFile
-log, file = Path(sys.argv[1]).read_bytes(), LogFile(Path(sys.argv[2]), "1")
-for start in range(0, len(log), {PIECE}):
-    file.write(log[start : start + {PIECE}])
-    print(file.written, flush=True)
-sys.stdin.read()
+log = Path(sys.argv[1]).read_bytes()
+for folder in sys.stdin:
+    if not (pid := os.fork()):
+        print(os.getpid(), flush=True)
+        file = LogFile(Path(folder.strip()), "1")
+        for start in range(0, len(log), {PIECE}):
+            file.write(log[start : start + {PIECE}])
+            print(file.written, flush=True)
+        time.sleep(3600)
+    os.waitpid(pid, 0)
+    print("killed", flush=True)
 """
 
 
@@ -77,18 +85,24 @@ def test_streams_of_one_second_have_files_of_their_own(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_killed_process_leaves_a_valid_log(tmp_path: Path) -> None:
     """Killed with SIGKILL at 50 random moments, the file has every record that was complete, and nothing else."""
-    path = write_log(tmp_path / "flight.ulg", range(0, 200_000_000, 10_000))
+    path = write_log(tmp_path / "flight.ulg", range(0, 20_000_000, 10_000))
     log, chance = path.read_bytes(), random.Random(1)
-    for number in range(KILLS):
-        folder = tmp_path / f"{number}"
-        command = [sys.executable, "-c", SAVE, os.fspath(path), os.fspath(folder)]
-        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-            assert process.stdout
-            count = chance.randrange(1, len(log) // PIECE)
+    command = [sys.executable, "-c", SAVE, os.fspath(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=unmeasured()
+    ) as process:
+        assert process.stdin
+        assert process.stdout
+        for number in range(KILLS):
+            print(tmp_path / f"{number}", file=process.stdin, flush=True)
+            pid, count = int(process.stdout.readline()), chance.randrange(1, len(log) // PIECE)
             written = [int(process.stdout.readline()) for _ in range(count)][-1]
-            process.kill()
-        (saved,) = folder.iterdir()
-        content = saved.read_bytes()
-        assert len(content) >= written > count * PIECE - PIECE - 2**12
-        assert log.startswith(content)
-        assert not ULog(str(saved)).file_corruption
+            os.kill(pid, signal.SIGKILL)
+            while not process.stdout.readline().endswith("killed\n"):  # behind half a line, maybe
+                pass
+            (saved,) = (tmp_path / f"{number}").iterdir()
+            content = saved.read_bytes()
+            assert len(content) >= written > count * PIECE - PIECE - 2**12
+            assert log.startswith(content)
+            assert not ULog(str(saved)).file_corruption
+        process.stdin.close()
