@@ -8,7 +8,7 @@ from typing import Any
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 
 from nedbus.events import ALL, KEPT, KINDS, RECENT, WINDOW, Event
 from nedbus_msgs import Address
@@ -582,9 +582,11 @@ FLAGGED = ("_invalid", "heading_not_good", "_not_global", "dead_reckoning", "fai
 
 
 @given(STEPS)
+@example([("send", {"xy_valid"}), ("send", set()), ("lose", 1), *[("send", set()), ("send", {"xy_valid"})] * 2])
 def test_events_are_consistent(steps: list[tuple[str, Any]]) -> None:
     """An end follows a begin or an initial condition, at most once since the boot, whatever arrives.
 
+    The end of flapping may follow another end, as the changes in between are only counted.
     Nothing ends before it began, and evidence precedes the event.
     """
     flight = Flight()
@@ -609,5 +611,6 @@ def test_events_are_consistent(steps: list[tuple[str, Any]]) -> None:
                 begun[key] = event
             elif event.change == "end":
                 known = begun.pop(key, None)
-                assert known is not None or (key not in initial and event.lasted is None)
+                is_summary = event.text.endswith("suppressed changes")
+                assert known is not None or is_summary or (key not in initial and event.lasted is None)
                 initial |= {key} if known is None else set()
