@@ -126,6 +126,20 @@ def test_unexplained_layouts_are_asked_for_more_and_more_rarely() -> None:
     assert asked == [0.0, 2.0, 7.0, 17.0, 47.0, 107.0, 167.0, 227.0]
 
 
+def test_reader_may_wait_while_a_lookup_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader waits for lookups at any moment, also just before the thread of one runs."""
+    lookup, start = LayoutLookup(lambda _: {}), threading.Thread.start
+
+    def wait_and_start(thread: threading.Thread) -> None:
+        lookup.wait()
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", wait_and_start)
+    with pytest.raises(nedbus.DecodeError):
+        lookup.definition("VehicleCommand")
+    lookup.wait()
+
+
 def test_only_layouts_that_are_needed_are_remembered() -> None:
     """A reply may describe thousands of layouts: those not in use do not displace one that is."""
     known = {"VehicleLocalPosition": {number: {"timestamp": "uint64", "x": "float32"} for number in range(9, 2000)}}

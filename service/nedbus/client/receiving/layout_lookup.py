@@ -92,8 +92,9 @@ class LayoutLookup:
         if self._unknown and self._now() >= self._next_request and not self._closed:
             self._next_request = float("inf")  # until this query ends
             unknown, self._unknown = self._unknown, set()
-            self._thread = threading.Thread(target=self._run, args=(unknown,), name="nedbus-layouts", daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, args=(unknown,), name="nedbus-layouts", daemon=True)
+            thread.start()
+            self._thread = thread  # started, since `wait` joins it without the lock
 
     def _is_known(self, name: str, layout: int | None) -> bool:
         return name in self._defined if layout is None else layout in self._newer.get(name, ())
