@@ -13,7 +13,14 @@ import struct
 import time
 
 from pymavlink.dialects.v20 import common as dialect
-from tests.peers.px4_log_stream import STREAMS, Px4LogStream, read_recording, stream_message, unpack
+from tests.peers.px4_log_stream import (  # fmt: skip
+    STREAMS,
+    Px4LogStream,
+    is_heartbeat,
+    read_recording,
+    stream_message,
+    unpack,
+)
 
 from benchmarks.processes import cpu_seconds, end, expect, free_port, nedbus_process, start, tell
 from nedbus.ulog import Data, UlogParser, address_of
@@ -70,6 +77,11 @@ def measure(form: str, seconds: float) -> str:
     arrivals, port, endpoint = Arrivals(), free_port(), f"tcp/127.0.0.1:{free_port()}"
     recording = read_recording(STREAMS / "ulog_stream_flight1.bin.gz")
     speed = RATE / NATURAL
+    recording.entries = [  # telemetry at its natural rate
+        each
+        for number, each in enumerate(recording.entries)
+        if not isinstance(each.content, bytes) or is_heartbeat(each.content) or number % round(speed) == 0
+    ]
     with nedbus_process("serve", "-l", endpoint, "-s", f"mavlink:udpin:127.0.0.1:{port}{form}") as service:
         reader = start("-c", READER, endpoint)
         try:
