@@ -381,7 +381,7 @@ class Px4LogStream:
             self._answer(START, dialect.MAV_RESULT_TEMPORARILY_REJECTED, request.ids)
         else:
             self._answer(START, dialect.MAV_RESULT_ACCEPTED, request.ids)
-            if request.during_stop or self._unsent:  # its first message reaches nobody, and is given up
+            if request.during_stop or self._unsent:  # its first message is not delivered, and is given up
                 self._unsent, self._busy_until = max(0, self._unsent - 1), now + _BLOCKED
             else:
                 self._stream = self._begin(request.ids)

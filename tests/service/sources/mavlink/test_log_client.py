@@ -493,7 +493,7 @@ class TestSilence:
 
     @pytest.mark.parametrize("seconds", [4.0, 60.0, 600.0])
     def test_outage_of_the_link_does_not_end_the_stream(self, session: Session, seconds: float) -> None:
-        """PX4 streams on without a client; nothing is sent while nobody is there."""
+        """PX4 goes on without a client; the client sends nothing while the link is silent."""
         session.start()
         session.wait(seconds, heartbeats=False)
         assert session.states[-1] == ("ended", "link_lost")
@@ -552,7 +552,7 @@ class TestStop:
         assert session.commands == ["start", "stop", "stop"]
 
     def test_stop_without_an_answer_ends(self, session: Session) -> None:
-        """After three attempts nobody is there to answer."""
+        """A vehicle that is gone gets three attempts, and no more."""
         session.start()
         session.take(session.client.stop(session.now))
         session.wait(3.5)
