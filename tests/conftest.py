@@ -38,6 +38,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for fixture, mark in (("start", "process"), ("endpoint", "router")):
             if fixture in getattr(item, "fixturenames", ()):
                 item.add_marker(mark)
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(600))  # thrice their time on four busy cores, under coverage
         if "open_router" in vars(getattr(item, "module", item)):  # most of these tests open one themselves
             item.add_marker("router")
 

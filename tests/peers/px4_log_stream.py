@@ -32,7 +32,10 @@ from tests.flights.ulogs import LOGS
 STREAMS: Final = LOGS.parent / "px4" / "ulog_stream"
 """Recordings of streams, and the vehicle's own logs of the same flights."""
 SHORT: Final = Path(__file__).parents[1] / "data" / "log_stream.bin.gz"
-"""The header of `ulog_stream_flight1` and the 2 s after it."""
+"""The header of `ulog_stream_flight1`, but for parameters and counters, and the 2 s after it.
+
+A short header: on a machine that is very busy a long one is refused, as on a slow link.
+"""
 
 START, STOP = dialect.MAV_CMD_LOGGING_START, dialect.MAV_CMD_LOGGING_STOP
 HEARTBEAT: Final = 0
