@@ -197,3 +197,54 @@ def test_yaw_of_the_attitude_replaces_the_heading(vehicle: Vehicle) -> None:
     vehicle.handle(dialect.MAVLink_attitude_message(0, 0, 0, 1.25, 0, 0, 0), 100.0)
     vehicle.handle(dialect.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 65535), 100.0)
     assert estimate(vehicle, 1, 100.0)["heading"] == pytest.approx(1.25)
+
+
+NAN, U16 = math.nan, 2**16 - 1
+UNKNOWN = {  # a message with the values by which MAVLink's common.xml marks unknown ones, and what is known in it
+    "gps": (
+        dialect.MAVLink_gps_raw_int_message(10**6, 3, 1, 1, 1, U16, U16, U16, U16, 255, 0, 0, 0, 0, 0, U16),
+        {"fix_type", "latitude_deg", "longitude_deg", "altitude_msl_m"},
+    ),
+    "silent receiver": (dialect.MAVLink_gps_raw_int_message(10**6, 0, 0, 0, 0, U16, U16, U16, U16, 255), {"fix_type"}),
+    "battery": (
+        dialect.MAVLink_battery_status_message(0, 0, 0, 2**15 - 1, [U16] * 10, -1, -1, -1, -1, 0, 0, [0] * 4),
+        set[str](),
+    ),
+    "further cells": (
+        dialect.MAVLink_battery_status_message(
+            0, 0, 0, 2**15 - 1, [16_000] + [U16] * 9, -1, -1, -1, -1, 0, 0, [U16] * 4
+        ),
+        {"voltage_v"},
+    ),
+    "home": (
+        dialect.MAVLink_home_position_message(1, 1, 1, NAN, NAN, NAN, [NAN] * 4, NAN, NAN, NAN),
+        {"lat", "lon", "alt", "valid_hpos", "valid_alt"},
+    ),
+    "landed": (dialect.MAVLink_extended_sys_state_message(0, 0), set[str]()),
+    "status": (
+        dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 0, 3),
+        {"arming_state", "hil_state", "system_type", "system_id", "component_id"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_values_that_mean_unknown_are_not_provided(name: str) -> None:
+    """The fields of a message whose values MAVLink defines as unknown are missing, not measured."""
+    message, known = UNKNOWN[name]
+    vehicle = new_vehicle("*")
+    vehicle.handle(position(1000), 100.0)
+    said = vehicle.handle(message, 100.0)
+    assert said is None or isinstance(said, SourceMessage)
+    assert {*(said.fields if said else ())} - {"timestamp"} == known
+    if name == "further cells":
+        assert said is not None
+        assert said.fields["voltage_v"] == 16.0
+
+
+@pytest.mark.parametrize(("clearance", "is_valid"), [(-1.0, False), (NAN, False), (0.0, True), (2.5, True)])
+def test_no_measured_clearance_is_no_distance(vehicle: Vehicle, clearance: float, is_valid: bool) -> None:
+    """ALTITUDE.bottom_clearance is negative without a measurement."""
+    vehicle.handle(dialect.MAVLink_altitude_message(10**6, 1, 2, 3, 4, NAN, clearance), 100.0)
+    fields = estimate(vehicle, 1000, 100.0)
+    assert (fields["dist_bottom_valid"], "dist_bottom" in fields) == (is_valid, is_valid)

@@ -38,10 +38,11 @@ def _global_position(message: Any) -> dict[str, object]:
 def _home(message: Any) -> dict[str, object]:
     """Return the home position, which is sent only with a valid global position."""
     angles = quaternion_to_euler(message.q) if math.isfinite(sum(message.q)) else (None,) * 3
+    local = (each if math.isfinite(each) else None for each in (message.x, message.y, message.z))
     return {
         "lat": message.latitude / 1e7, "lon": message.longitude / 1e7, "alt": message.altitude / 1e3,
-        "x": message.x, "y": message.y, "z": message.z, "valid_hpos": True, "valid_alt": True,
-        **dict(zip(("roll", "pitch", "yaw"), angles, strict=True)),
+        "valid_hpos": True, "valid_alt": True,
+        **dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), (*local, *angles), strict=True)),
     }  # fmt: skip
 
 
@@ -82,7 +83,8 @@ def sensors_of(message: Any) -> dict[str, object]:
 
 def _battery(message: Any) -> dict[str, object]:
     """Return the state of a battery without its cells: if they are not measured, the first one holds the total."""
-    cells = [each for each in message.voltages if each != _U16] + [each for each in message.voltages_ext if each]
+    cells = [each for each in message.voltages if each != _U16]
+    cells += [each for each in message.voltages_ext if each not in (0, _U16)]
     return {
         "voltage_v": sum(cells) / 1e3 if cells else None, "current_a": _number(message.current_battery, 100, -1),
         "discharged_mah": _number(message.current_consumed, 1, -1),
