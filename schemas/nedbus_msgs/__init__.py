@@ -1,5 +1,6 @@
 """The contract of nedbus: messages, layouts, topics and wire format; no I/O, no Zenoh."""
 
+from .clock import is_unix_time
 from .codecs.cdr import decode_with, encode_with
 from .codecs.msgpack import PAYLOAD_LIMIT, Codec, codec_of, describe
 from .errors import (
@@ -61,6 +62,7 @@ from .topics import (
     check_prefix,
     check_vehicle,
     get_topic,
+    is_vehicle_input,
     rejected_key_expr,
     ros2_topic_of,
     schema_key,
@@ -80,9 +82,9 @@ __all__ = [
     "address_of_rejected_key", "bases_of_msg", "check_prefix", "check_vehicle", "codec_of",
     "dds_type", "decode", "decode_with", "define", "define_msg", "definition_of", "definition_text", "describe",
     "describe_flags", "encode", "encode_with", "encoding_of", "enu_to_ned", "euler_to_quaternion",
-    "field_type", "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "json_schema_of",
-    "layout_table_of", "message_doubts", "message_name_of", "message_of_type_hash", "ned_to_enu", "provenance_of",
-    "quaternion_to_euler", "read_msg", "rejected_key_expr", "ros2_topic_of", "ros2_type", "ros2_types",
+    "field_type", "flu_to_frd", "frd_to_flu", "get_topic", "hash_of", "hash_of_msg", "is_unix_time", "is_vehicle_input",
+    "json_schema_of", "layout_table_of", "message_doubts", "message_name_of", "message_of_type_hash", "ned_to_enu",
+    "provenance_of", "quaternion_to_euler", "read_msg", "rejected_key_expr", "ros2_topic_of", "ros2_type", "ros2_types",
     "schema_key", "schema_of", "split_ros2_topic", "status_key", "to_global", "to_local", "upgrade_fields",
     "upgrade_with", "variances_enu_to_ned", "variances_ned_to_enu", "vehicle_name", "wrap", "yaw_enu_to_ned",
     "yaw_ned_to_enu",

@@ -22,7 +22,8 @@ _CHUNK = re.compile(r"[A-Za-z0-9_-]+")
 _VEHICLE_LENGTH: Final = 64
 _RATE: Final = "/@rate/"  # between the key of a stream and its downsampled rate [messages per second]
 _ROS2_TOPIC = re.compile(r"([a-z][a-z0-9_]*?)(?:_v\d+)?(?:_?(\d{1,3}))?")
-_PX4_PATH: Final = ("fmu", "out")
+_OUT: Final = ("fmu", "out")
+_IN: Final = ("fmu", "in")
 _INSTANCES: Final = 256  # uORB's multi_id in a log is a uint8
 
 
@@ -206,12 +207,12 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
     """Split the name of a ROS 2 topic into namespace, uORB topic and instance.
 
     `px4_1/fmu/out/estimator_local_position_0` has namespace `px4_1` and instance 0.
-    The `_v1` of a versioned topic is ignored.
+    `/fmu/in/...` are inputs of the same vehicle. The `_v1` of a versioned topic is ignored.
 
     Raises AddressError for a name that is not a topic of PX4's.
     """
     *path, name = topic.strip("/").split("/")
-    if tuple(path[-2:]) == _PX4_PATH:
+    if tuple(path[-2:]) in (_OUT, _IN):
         path = path[:-2]
     found = None if name in TOPICS else _ROS2_TOPIC.fullmatch(name)
     uorb, number = found.groups() if found else (name, None)
@@ -220,11 +221,16 @@ def split_ros2_topic(topic: str) -> tuple[str, str, int | None]:
     return "/".join(path), uorb, None if number is None else int(number)
 
 
+def is_vehicle_input(topic: str) -> bool:
+    """Return whether the name of a ROS 2 topic is that of an input of a vehicle, `/fmu/in/...`."""
+    return tuple(topic.split("/")[-3:-1]) == _IN
+
+
 def ros2_topic_of(address: Address, namespace: str) -> str:
     """Return the ROS 2 topic of an address, without a leading slash; an empty namespace means none."""
     plain = address.instance is None or (address.instance == 0 and get_topic(address.topic).plain_first)
     topic = address.topic if plain else f"{address.topic}_{address.instance}"
-    return "/".join(filter(None, (namespace.strip("/"), *_PX4_PATH, topic)))
+    return "/".join(filter(None, (namespace.strip("/"), *_OUT, topic)))
 
 
 def vehicle_name(vehicle: str | int) -> str:

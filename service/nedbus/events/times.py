@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
+from nedbus_msgs import is_unix_time
+
 from .event import Event
 
 _CLOCK: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?::([0-5]\d(?:\.\d+)?))?")
-_MAX_UTC: Final = 1e11  # s since the epoch, about three thousand years
-_MIN_UNIX: Final = 1e9  # s; a greater time since boot is Unix time, which some simulators use
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class Times:
             return event.time
         if event.boot is None:
             return None
-        utc = event.boot + (0.0 if event.boot > _MIN_UNIX else self.offsets.get(event.vehicle, math.nan))
-        return utc if 0 <= utc < _MAX_UTC else None  # false for NaN and for damaged times
+        utc = event.boot + (0.0 if is_unix_time(event.boot * 1e6) else self.offsets.get(event.vehicle, math.nan))
+        return utc if is_unix_time(utc * 1e6) else None
 
     def clock(self, event: Event) -> str:
         """Return the clock of an event: "host", "vehicle" (UTC from its messages), or "boot" (since boot)."""

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nedbus.errors import AddressError, ConfigError
-from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion
+from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
 from nedbus_msgs.arrays import MessageArray
 
 from .arrays import Library, Pandas, Polars, Streams, missing_of, read_streams, to_dataframe
@@ -100,7 +100,8 @@ def align(
         offset = utc_of(flight, vehicle=vehicle)
         columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
         if offset:
-            columns["utc"] = (times + offset.offset_us).astype("M8[us]")
+            unix = offset.unix_us(times)
+            columns["utc"] = np.where(is_unix_time(unix), unix.astype("M8[us]"), np.datetime64("NaT"))
     absent: dict[str, npt.NDArray[np.bool_]] = {}
     for name, (messages, lacking) in streams.items():
         rows, following, weight = _look_up(stamps[name], times, "own" if [name] == reference else method)

@@ -175,6 +175,11 @@ class Flight:
             self._file.close()
 
     @property
+    def boot_utc(self) -> int:
+        """Unix time of the boot according to the log's information [us]; 0 if unknown."""
+        return self._file.boot_utc if isinstance(self._file, UlogTopics) else 0
+
+    @property
     def warnings(self) -> list[str]:
         """Damage found and messages left out so far."""
         return [*self._file.warnings, *self._invalid]

@@ -11,19 +11,33 @@ from typing import Any, NamedTuple, Self
 from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 
 from nedbus.errors import AddressError, SourceError
-from nedbus_msgs import BY_TOPIC, Address, Definition, Layout, define_msg, read_msg, ros2_types, split_ros2_topic
+from nedbus_msgs import (
+    BY_TOPIC,
+    Address,
+    Definition,
+    Layout,
+    define_msg,
+    is_vehicle_input,
+    read_msg,
+    ros2_types,
+    split_ros2_topic,
+)
 
 from .mcap_chunks import READ_ERRORS, ChunkFile, records_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedStream:
-    """One channel: its address, the layout of its messages, and the fields its source did not provide."""
+    """One channel: its address, the layout of its messages, and the fields its source did not provide.
+
+    `is_input`: messages to the vehicle, `/fmu/in/...`.
+    """
 
     address: Address
     definition: Definition[Any]
     layout: Layout
     missing: frozenset[str]
+    is_input: bool = False
 
 
 class RecordedMessage(NamedTuple):
@@ -141,7 +155,8 @@ class RecordingReader:
         except (AddressError, ValueError) as exc:
             self._file.warn(f"skipped {channel.topic}: {exc}")
             return None
-        return RecordedStream(address, definition, layout, frozenset(channel.metadata.get("missing", "").split()))
+        missing = frozenset(channel.metadata.get("missing", "").split())
+        return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 
     def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
         """Return the definition and layout of a schema; raise ValueError if no layout matches."""

@@ -33,12 +33,14 @@ class UlogTopics:
     """Topics of a log.
 
     `warnings`: damage and skipped parts; `damaged`: True if damage may have cost messages.
+    `boot_utc`: Unix time of the boot [us], 0 if the log has none.
     Logs have no checksums: damage to the values of a message goes undetected.
     """
 
     topics: dict[Address, UlogTopic]
     warnings: list[str]
     damaged: bool
+    boot_utc: int
 
 
 def read_ulog(
@@ -59,4 +61,4 @@ def read_ulog(
         table: npt.NDArray[np.void] = np.frombuffer(joined, np.dtype(stream.subscription.layout.dtype))
         columns = {name: table[name] for name in stream.names}
         found[stream.address] = UlogTopic(stream.address, stream.definition, columns)
-    return UlogTopics(found, reader.warnings, reader.damaged)
+    return UlogTopics(found, reader.warnings, reader.damaged, reader.boot_utc)

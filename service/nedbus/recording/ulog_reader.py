@@ -58,7 +58,8 @@ class UlogStream:
 class UlogReader:
     """Read the messages of a log in the log's order; the memory does not grow with the log.
 
-    The options are those of `read_ulog`. `start`: when logging began [us]. `position`: bytes read so far.
+    The options are those of `read_ulog`. `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if
+    the log has none so far. `position`: bytes read so far.
     `streams`: those with a message so far. `damaged`: True if damage may have cost messages so far.
     """
 
@@ -68,7 +69,7 @@ class UlogReader:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
         self._parser = UlogParser(verify=True)
-        self._release = self._places = self.start = self.position = 0
+        self._release = self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, UlogStream | None] = {}
         self._seconds: list[UlogStream] = []
@@ -133,6 +134,8 @@ class UlogReader:
             self.start = record.timestamp
         elif isinstance(record, Information) and record.key == "ver_sw_release" and isinstance(record.value, int):
             self._release = record.value >> 16
+        elif isinstance(record, Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int):
+            self.boot_utc = record.value
         elif isinstance(record, Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
             self._system_id = str(record.value)
         elif isinstance(record, Subscription):

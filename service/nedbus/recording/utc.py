@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from nedbus.client import Sample
-from nedbus_msgs import ANY, Selection, vehicle_name
+from nedbus_msgs import ANY, Selection, is_unix_time, vehicle_name
 from nedbus_msgs.arrays import MessageArray, to_array
 
 from .arrays import Flight, missing_of
@@ -19,16 +19,16 @@ from .flight_files import matching, require_one_vehicle
 
 _FIELDS: Final = ("time_utc_usec", "estimated_offset")  # a GNSS receiver's UTC, or the offset to a companion's clock
 _RELATIVE: Final = "timestamp_time_relative"  # us from the message's timestamp to the receiver's UTC
-_PLAUSIBLE: Final = (946_684_800_000_000, 4_102_444_800_000_000)  # us; 2000 to 2100, other clocks have no date
 _TOLERANCE: Final = 1_000_000  # us; messages this close to the median agree
 _AGREEING: Final = 0.9  # fraction that must agree; fewer indicate several boots or a clock step
 
 
 @dataclass(frozen=True, slots=True)
 class UtcOffset:
-    """Offset from a vehicle's `timestamp` to Unix time [us], and its source.
+    """Offset from a vehicle's time since boot to Unix time [us], and its source.
 
-    `source`: the stream; timesync_status is the clock of a companion computer, and only as accurate as that clock.
+    `source`: the stream, "boot_time_utc_us" of a log, or "timestamp" if timestamps are Unix time already, as those that
+    uXRCE-DDS has synchronized. timesync_status is the clock of a companion computer, and only as accurate as that.
     `offset_us`: the median over its messages. A GNSS fix is some tenths of a second older than its message.
     `count`: the number of messages within one second of the median; `spread_us`: their maximum minus minimum.
     """
@@ -39,8 +39,12 @@ class UtcOffset:
     spread_us: int
 
     def at(self, timestamp: int) -> datetime:
-        """Return the UTC of a `timestamp` of this vehicle from the same boot."""
-        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(timestamp) + self.offset_us)
+        """Return the UTC of a `timestamp` of this vehicle from the same boot, which may be Unix time already."""
+        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=int(self.unix_us(int(timestamp))))
+
+    def unix_us(self, timestamps: Any) -> Any:
+        """Return the Unix time [us] of a timestamp, or of an array of them."""
+        return timestamps + self.offset_us * ~np.asarray(is_unix_time(timestamps))
 
 
 def utc_of(
@@ -51,9 +55,9 @@ def utc_of(
     For live samples: `utc = nedbus.utc_of(bus.latest("*", vehicle="7"))`, then `utc.at(sample.message.timestamp)` for
     any sample until the vehicle reboots.
 
-    The source is a GNSS receiver with a `time_utc_usec` other than 0, or a companion's clock in `timesync_status`,
-    accepted only with a date after 2000. The offset is unknown if over 10 % of the messages are more than a second off
-    their median.
+    The source is a GNSS receiver with a `time_utc_usec` other than 0, a companion's clock in `timesync_status`, or a
+    log's `boot_time_utc_us`, accepted only with a date from 2000 to 2100; Unix timestamps are used as they are.
+    The offset is unknown if over 10 % of the messages are more than a second off their median.
 
     Raises AddressError for several vehicles unless `vehicle` names one, and the errors of `read`.
     """
@@ -69,11 +73,15 @@ def utc_of(
         addresses = matching(path, opened.addresses, Selection(vehicle=vehicle))
         require_one_vehicle(path, addresses, vehicle)
         used = [each for each in addresses if not opened.definitions[each].types.keys().isdisjoint(_FIELDS)]
-        return _find_utc({address.stream: messages for address, (messages, _) in opened.read(used).items()})
+        streams = opened.read(used or addresses[:1])
+        return _find_utc({address.stream: messages for address, (messages, _) in streams.items()}, opened.boot_utc)
 
 
-def _find_utc(streams: Mapping[str, MessageArray]) -> UtcOffset | None:
+def _find_utc(streams: Mapping[str, MessageArray], boot_utc: int = 0) -> UtcOffset | None:
     """Return the offset from the best of these streams, None if no stream provides one."""
+    unix = sum(int(np.sum(is_unix_time(messages["timestamp"]))) for messages in streams.values())
+    if unix > sum(map(len, streams.values())) / 2:
+        return UtcOffset("timestamp", 0, unix, 0)
     for field in _FIELDS:
         for name, messages in sorted(streams.items()):
             names = set(messages.dtype.names or ()) - missing_of(messages)
@@ -84,9 +92,9 @@ def _find_utc(streams: Mapping[str, MessageArray]) -> UtcOffset | None:
                 utc = times - value
             else:
                 utc = value - messages[_RELATIVE] if _RELATIVE in names else value
-            offsets = (utc - times)[(utc >= _PLAUSIBLE[0]) & (utc < _PLAUSIBLE[1])]
+            offsets = (utc - times)[is_unix_time(utc) & ~is_unix_time(times)]
             middle = int(np.median(offsets)) if len(offsets) else 0
             near = offsets[np.abs(offsets - middle) <= _TOLERANCE]
             if len(near) and len(near) >= _AGREEING * len(offsets):
                 return UtcOffset(name, middle, len(near), int(np.ptp(near)))
-    return None
+    return UtcOffset("boot_time_utc_us", boot_utc, 1, 0) if is_unix_time(boot_utc) else None

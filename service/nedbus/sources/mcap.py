@@ -15,6 +15,7 @@ from .source import ReplayRun, SourceContext, SourceMessage
 
 _MAX_GAP: Final = 60 * 10**9  # ns; a longer step is a pause or a damaged time, and is skipped
 _REORDERED: Final = 8192  # messages in the reorder buffer
+_INPUT: Final = "mcap-input"  # `sample.source` of messages to a vehicle
 
 
 class McapSource:
@@ -80,7 +81,8 @@ class McapSource:
             return SourceMessage(due, address, {}, error=f"message {number} of the recording: {exc}")
         for name in recorded.stream.missing & definition.all_fields:
             fields.pop(name, None)
-        return SourceMessage(due, address, fields, definition=definition)
+        source = _INPUT if recorded.stream.is_input else None
+        return SourceMessage(due, address, fields, definition=definition, source=source)
 
 
 def _in_order(messages: Iterable[tuple[int, RecordedMessage]]) -> Iterator[tuple[int, RecordedMessage]]:

@@ -56,12 +56,14 @@ DROPPED: Final = {  # fields of older layouts that PX4 took out again, and the m
 }
 FLIGHTS: Final = [next(LOGS.parent.glob(f"*/{name}.ulg"), LOGS / f"{name}.ulg") for name in STREAMS]
 UTC: Final = {  # source of UTC, and the date of the boot
+    "gps_loss": ("boot_time_utc_us", "2026-11-21T20:31:26"),
+    "fmuv6c_1.17_selector_whipsaw": ("boot_time_utc_us", "2026-04-08T16:21:05"),
     "twelve_messages": ("timesync_status", "2026-11-22T23:08:32"),
     "cuav_1.16_gps_interference": ("timesync_status", "2026-01-13T05:53:53"),
     "cubeorange_1.12_small": ("vehicle_gps_position", "2021-04-21T06:30:38"),
     "nxp_v0_ekf_failure": ("sensor_gps/0", "2025-02-10T13:55:42"),
     "sitl_1.13_three_topics": ("sensor_gps/0", "2022-04-29T08:45:26"),
-    "sitl_1.15_events": ("sensor_gps/0", "1970-01-01T00:00:00"),  # its timestamps are Unix time
+    "sitl_1.15_events": ("timestamp", "1970-01-01T00:00:00"),  # which is Unix time already
 }
 
 pytestmark = [
@@ -189,7 +191,7 @@ def test_log_is_the_same_after_conversion(flight: Path, tmp_path: Path) -> None:
 
 @each_flight
 def test_utc_is_what_a_log_tells(flight: Path) -> None:
-    """UTC comes from a GNSS receiver or a companion's clock; without either it is absent."""
+    """UTC comes from a GNSS receiver, a companion's clock or the log's information; without these it is absent."""
     found = nedbus.utc_of(flight)
     told = found and (found.source, f"{found.at(0):%Y-%m-%dT%H:%M:%S}")
     assert told == UTC.get(flight.stem)

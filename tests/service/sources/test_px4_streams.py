@@ -32,9 +32,9 @@ def test_key_and_attachment_round_trip() -> None:
         assert Attachment.parse(bytes(attachment)) == attachment
 
 
-def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16") -> str:
+def key(*, domain: int = 0, namespace: str = "", layout: str = "1.16", way: str = "out") -> str:
     """Return the key of vehicle_local_position, as PX4 writes it."""
-    topic = f"{namespace and namespace + '/'}fmu/out/{VLP}"
+    topic = f"{namespace and namespace + '/'}fmu/{way}/{VLP}"
     return str(TopicKey(domain, topic, dds_type(ROS2_TYPE), type_hash(layout)))
 
 
@@ -86,3 +86,12 @@ def test_sequence_that_goes_back_repeatedly_is_rejected(streams: StreamRegistry)
     assert streams.accept(stream, Attachment(1, 0, GID), 106.1) == (0, True)
     with pytest.raises(NotAcceptedError, match="sequence number 1 is a duplicate"):
         streams.accept(stream, Attachment(1, 0, GID), 106.2)
+
+
+@pytest.mark.parametrize("namespace", ["", "px4_1"])
+def test_input_belongs_to_its_vehicle(streams: StreamRegistry, namespace: str) -> None:
+    """/fmu/in/... has the vehicle of /fmu/out/...; a companion that restarts is not a reboot of the vehicle."""
+    stream = streams.hear(key(namespace=namespace, way="in"), 100.0)
+    assert (str(stream.address), stream.is_input) == (f"{namespace or 1}/{VLP}", True)
+    for sequence in (10, 1):
+        assert streams.accept(stream, Attachment(sequence, 0, GID), 100.0) == (0, False)

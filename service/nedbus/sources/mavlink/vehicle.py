@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address
+from nedbus_msgs import DEFAULT_TOPIC, FLAG_FIELDS, TOPICS, Address, is_unix_time
 
 from .fields import CONVERSIONS, is_reboot, sensors_of
 
@@ -173,7 +173,7 @@ class Vehicle:
                 self._keep("origin", math.inf, xy_global=True, z_global=True, **known)
                 self._arrivals[ORIGIN] = math.inf  # it is sent once for each request
             case "ALTITUDE":
-                is_known = math.isfinite(message.bottom_clearance)
+                is_known = math.isfinite(message.bottom_clearance) and message.bottom_clearance >= 0
                 bottom = {"dist_bottom": message.bottom_clearance} if is_known else {}
                 self._keep("bottom", now + _VALUE_TIMEOUT, dist_bottom_valid=is_known, **bottom)
             case "ODOMETRY":
@@ -188,7 +188,7 @@ class Vehicle:
                 self._keep("global status", now + _STATUS_TIMEOUT, **on_globe, **known)
             case "SYS_STATUS":
                 self._keep("sensors", now + _STATUS_TIMEOUT, **sensors_of(message))
-            case "SYSTEM_TIME" if timestamp is not None and message.time_unix_usec > _LONG_AGO:
+            case "SYSTEM_TIME" if timestamp is not None and is_unix_time(message.time_unix_usec):
                 self._keep("utc", now + _STATUS_TIMEOUT, boot=message.time_unix_usec - timestamp)
 
     def _keep(self, name: str, until: float, **fields: object) -> None:

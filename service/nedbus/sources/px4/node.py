@@ -45,6 +45,7 @@ _MAX_PENDING_BYTES: Final = 4096  # per payload
 _RING_SIZE: Final = 16_384  # samples waiting for the thread
 _MAX_SUBSCRIPTIONS: Final = 1000  # topics; a vehicle has a handful
 _JOIN_TIMEOUT: Final = 3.0  # s
+_INPUT: Final = "px4-zenoh-input"  # `sample.source` of messages to a vehicle
 _TOO_FAST: Final = "queue", "messages arrive faster than they are decoded"
 _TOO_LARGE: Final = "size", f"a payload of more than {_MAX_PENDING_BYTES} bytes, or a key that is too long"
 
@@ -132,7 +133,8 @@ class Px4ZenohNode:
         if rebooted:
             extra = about("rebooted", address, source="px4-zenoh")
             _log.warning("%s: the publisher restarted, as the vehicle rebooted", key, extra=extra)
-        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition)
+        source = _INPUT if stream.is_input else None
+        return SourceMessage(0.0, stream.address, fields, lost, rebooted, definition=definition, source=source)
 
     def _find_form(self, stream: Px4Stream) -> Form:
         form = self._streams.form_of(stream)

@@ -21,6 +21,7 @@ from nedbus_msgs import (
     Layout,
     dds_type,
     get_topic,
+    is_vehicle_input,
     message_of_type_hash,
     ros2_types,
     split_ros2_topic,
@@ -68,6 +69,7 @@ class Px4Stream:
     `restarted`: another publisher took over, and its first message is not counted yet.
     `reboots`: number of reboots of its vehicle that it has been through.
     `is_bridged`: messages from `nedbus ros2` arrived on it.
+    `is_input`: its messages go to the vehicle, from a node that does not reboot with it.
     """
 
     key: TopicKey
@@ -86,6 +88,7 @@ class Px4Stream:
     rebooted: float = -math.inf
     reboots: int = 0
     is_bridged: bool = False
+    is_input: bool = False
 
     def has_alike(self) -> bool:
         """Return whether several sessions publish with the same gid, which makes their messages indistinguishable."""
@@ -182,7 +185,7 @@ class StreamRegistry:
                 lost = step - 1
             stream.sequence = attachment.sequence
         stream.received, stream.restarted = now, False
-        return lost, restarted and self._is_first_to_reboot(stream)
+        return lost, restarted and not stream.is_input and self._is_first_to_reboot(stream)
 
     def report(self, now: float) -> Absence:
         """Return messages that are not carried, and topics that are silent while others of the same node arrive."""
@@ -203,7 +206,8 @@ class StreamRegistry:
                 raise NotAcceptedError(f"more than {_MAX_STREAMS} keys: choose a domain, as in px4-zenoh:?domain=0")
             namespace, topic, instance = split_ros2_topic(key.topic)
             address = Address(self._vehicle_of(key.domain, namespace), topic, instance)
-            stream = self._streams[str(key)] = Px4Stream(key, address, self._why_not_carried(key, topic))
+            stream = Px4Stream(key, address, self._why_not_carried(key, topic), is_input=is_vehicle_input(key.topic))
+            self._streams[str(key)] = stream
         return stream
 
     def _claim(self, stream: Px4Stream, attachment: Attachment | None, now: float) -> None:

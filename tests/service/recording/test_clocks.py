@@ -1,0 +1,57 @@
+"""The clock of timestamps, and the vehicle of inputs, in files of three kinds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+import nedbus
+from nedbus.sources import read_account
+from nedbus_msgs import DEFAULT_TOPIC, is_unix_time
+from tests.flights.replays import open_replay
+
+DATA: Final = Path(__file__).parents[2] / "data"
+UNIX: Final = DATA / "uxrce_unix_time.mcap"
+BOOT: Final = DATA / "boot_time_utc_us.ulg"
+INPUTS: Final = DATA / "fmu_in_topics.mcap"
+
+
+@pytest.mark.parametrize(
+    ("path", "utc", "source"),
+    [(UNIX, "2025-10-09 08:53:19.997000", "timestamp"), (BOOT, "2025-09-08 13:31:04", "boot_time_utc_us")],
+)
+def test_every_caller_has_the_same_utc(path: Path, utc: str, source: str) -> None:
+    """`utc_of`, `align` and the events agree, for Unix timestamps of uXRCE-DDS and for a log that has its boot time."""
+    found = nedbus.utc_of(path)
+    assert found is not None
+    first = nedbus.read(path)["timestamp"][0]
+    assert (found.source, str(found.at(first))) == (source, f"{utc}+00:00")
+    assert nedbus.align(path, utc=True)["utc"][0] == np.datetime64(utc.replace(" ", "T"))
+    event: Any = SimpleNamespace(vehicle="1", boot=first / 1e6)
+    assert read_account(path).times.utc(event) == pytest.approx(found.unix_us(int(first)) / 1e6)
+
+
+def test_clocks_may_be_mixed() -> None:
+    """Of two clocks in one stream each timestamp is taken as it is: UTC where it is known, no date of 1970 or 2081."""
+    messages = nedbus.read(UNIX)
+    messages["timestamp"][:100] = np.arange(100) * 20_000 + 1_000_000  # before the time is synchronized
+    table = nedbus.align({DEFAULT_TOPIC: messages}, utc=True)
+    assert np.isnat(table["utc"][:100]).all()
+    assert is_unix_time(table["utc"][100:].astype(np.int64)).all()
+
+
+def test_inputs_belong_to_their_vehicle() -> None:
+    """/fmu/in/... of an offboard bag is of the vehicle of /fmu/out/..., and its messages are labelled as inputs."""
+    inputs = {"offboard_control_mode", "trajectory_setpoint", "vehicle_visual_odometry"}
+    assert {name: len(each) for name, each in nedbus.read(INPUTS, ["*"]).items()} == dict.fromkeys(
+        inputs | {DEFAULT_TOPIC}, 50
+    )
+    messages = list(open_replay(f"mcap:{INPUTS}?vehicle=7&topics=*").messages)
+    assert {each.address.vehicle for each in messages} == {"7"}
+    assert {each.address.topic for each in messages if each.source == "mcap-input"} == inputs
+    assert nedbus.utc_of(INPUTS) is None
+    assert len(nedbus.align(INPUTS)) == 50
