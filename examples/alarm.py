@@ -6,7 +6,8 @@ from contextlib import suppress
 
 import nedbus
 
-GOOD = {"xy_valid": True, "z_valid": True, "v_xy_valid": True, "v_z_valid": True, "dead_reckoning": False}
+VALID = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid")
+GOOD = {**dict.fromkeys(VALID, True), "dead_reckoning": False}
 
 
 def states(vehicle: str) -> Iterator[str]:
@@ -19,11 +20,13 @@ def states(vehicle: str) -> Iterator[str]:
     with bus, bus.subscribe(vehicle=vehicle) as subscription:
         while True:  # the subscription outlives its service, and its router: it goes on when they are back
             try:
-                message = subscription.receive(timeout=1.0).message
+                sample = subscription.receive(timeout=1.0)
             except nedbus.NoDataError:
                 yield "ALARM: nothing arrived for 1 s"
             else:
-                doubts = [f"{flag} is {not good}" for flag, good in GOOD.items() if getattr(message, flag) != good]
+                known = {flag: getattr(sample.message, flag) for flag in GOOD.keys() - sample.missing}
+                doubts = [f"{flag} is {known[flag]}" for flag, good in GOOD.items() if known.get(flag, good) != good]
+                doubts += [f"{flag} is unknown" for flag in VALID if flag not in known]
                 yield f"ALARM: {', '.join(doubts).lower()}" if doubts else "good"
 
 

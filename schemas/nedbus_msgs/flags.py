@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final
 
 from .messages.vehicle_local_position import VehicleLocalPosition
@@ -21,12 +21,15 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     """Describe the flags that cast doubt on messages, given each flag's share of messages with it set (0 to 1).
 
     "xy z invalid, dead reckoning" applies to all messages, "xy invalid 20 %" to some of them; "ok" if there is none.
-    A flag without a share is ignored.
+    The validity of a quantity without a share is unknown: "vz unknown", or "validity unknown" if no flag has one.
     """
     bad = {name: 1.0 - shares[name] for name in _VALID if name in shares}
     bad |= {name: shares[name] for name in _WARNINGS if name in shares}
     invalid = [label for name, label in _VALID.items() if bad.get(name, 0.0) >= 1.0]
+    unknown = [label for name, label in _VALID.items() if name not in shares]
     texts = [f"{' '.join(invalid)} invalid"] if invalid else []
+    if unknown:
+        texts.append(f"{'validity' if len(unknown) == len(_VALID) else ' '.join(unknown)} unknown")
     for name, share in bad.items():
         text = _WARNINGS.get(name) or f"{_VALID[name]} invalid"
         if 0.0 < share < 1.0:
@@ -36,6 +39,6 @@ def describe_flags(shares: Mapping[str, float]) -> str:
     return ", ".join(texts) or "ok"
 
 
-def message_doubts(message: VehicleLocalPosition) -> str:
-    """Describe the flags that cast doubt on one message; "ok" if there is none."""
-    return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS})
+def message_doubts(message: VehicleLocalPosition, missing: Collection[str] = ()) -> str:
+    """Describe the flags that cast doubt on one message, which lacks the `missing` fields; "ok" if there is none."""
+    return describe_flags({name: float(getattr(message, name)) for name in DOUBT_FLAGS if name not in missing})

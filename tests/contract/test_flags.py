@@ -25,8 +25,9 @@ def test_doubts_are_validity_and_dead_reckoning() -> None:
     ("shares", "text"),
     [
         (GOOD, "ok"),
-        ({}, "ok"),
-        ({"heading_good_for_control": 0.0, "xy_global": 0.0, "dist_bottom_valid": 0.0}, "ok"),
+        ({}, "validity unknown"),
+        (GOOD | {"heading_good_for_control": 0.0, "xy_global": 0.0, "dist_bottom_valid": 0.0}, "ok"),
+        ({"z_valid": 0.0, "v_xy_valid": 1.0, "dead_reckoning": 1.0}, "z invalid, xy vz unknown, dead reckoning"),
         (GOOD | {"xy_valid": 0.0}, "xy invalid"),
         (GOOD | {"xy_valid": 0.0, "z_valid": 0.0, "dead_reckoning": 1.0}, "xy z invalid, dead reckoning"),
         (dict.fromkeys(GOOD, 0.0), "xy z vxy vz invalid"),

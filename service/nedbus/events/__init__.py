@@ -6,7 +6,7 @@ the finding (`detectors.py` or `position.py`).
 
 from .account import KEPT, Account
 from .event import ALL, KINDS, SEVERITIES, WINDOW, Condition, Event, Severity, State
-from .faults import VALID, Expectation, faults_of, merge_vehicles
+from .faults import VALID, Expectation, faults_of, merge_vehicles, unknown_text
 from .report import ACCOUNT_PARAMETER, FORGOTTEN, AccountReport, VehicleReport, by_vehicle, from_json, report_of
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
@@ -17,5 +17,5 @@ __all__ = [
     "ACCOUNT_PARAMETER", "ALL", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MODES", "RECENT", "SEVERITIES", "VALID",
     "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Severity", "Span", "State", "Story",
     "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json", "merge_vehicles", "report_of",
-    "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age", "to_clock",
+    "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age", "to_clock", "unknown_text",
 ]  # fmt: skip

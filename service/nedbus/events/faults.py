@@ -59,6 +59,11 @@ def merge_vehicles(reports: Iterable[AccountReport]) -> dict[str, tuple[float, V
     return {name: (report.now, report.vehicles[name]) for name, report in by_vehicle(reports).items()}
 
 
+def unknown_text(quantities: Sequence[str]) -> str:
+    """Return the fault of a vehicle that does not send whether these quantities are valid."""
+    return f"the validity of {', '.join(quantities)} is unknown, as the vehicle does not send it"
+
+
 def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: Expectation) -> Iterator[str]:
     invalid = [each for each in expected.valid if VALID[each] in vehicle.flags]
     if vehicle.is_silent:
@@ -71,6 +76,8 @@ def _faults_of_vehicle(name: str, vehicle: VehicleReport, now: float, expected: 
         yield f"{vehicle.text}{since_text(vehicle.since, now)}"
     elif expected.valid and not vehicle.has_position:
         yield "publishes no position"
+    elif unknown := [each for each in expected.valid if VALID[each] in vehicle.unknown]:
+        yield unknown_text(unknown)
 
 
 def _recent_faults(reports: Sequence[AccountReport], expected: Expectation) -> Iterator[str]:

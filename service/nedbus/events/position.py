@@ -54,6 +54,12 @@ class PositionDetector(ChangeDetector):
         step = self._unexplained_step() if has_moved and self._state[0] else None
         return None if step is None and self._jump is None else self._track_jump(step)
 
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """The flags that the last message did not provide."""
+        last, absent = zip(_COMPARED, self._state, strict=False), self._missing
+        return tuple(name for name, value in last if value is None or name in absent)
+
     def reset(self) -> None:
         """Discard the state after a reboot of the vehicle."""
         super().reset()

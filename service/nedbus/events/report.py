@@ -33,6 +33,7 @@ class VehicleReport:
 
     `flags`: validity flags of its position that are false, each with the time since when. `topics`: published topics.
     `has_position`: True if it publishes a position. `held`: active conditions whose begin is not among the events.
+    `unknown`: flags that its position does not provide.
     """
 
     severity: Literal["bad", "watch", "info"]
@@ -43,6 +44,7 @@ class VehicleReport:
     topics: tuple[str, ...] = ()
     has_position: bool = False
     held: tuple[Condition, ...] = ()
+    unknown: tuple[str, ...] = ()
 
     @property
     def is_silent(self) -> bool:
@@ -102,7 +104,7 @@ def report_of(account: Account, service: str, host: str, now: float, *, within: 
         size += 500 * len(unreported)
         vehicles[name] = VehicleReport(
             state.severity, state.text, state.since, kinds, flags, tuple(sorted(vehicle.topics))[:_MAX_TOPICS],
-            vehicle.main is not None, unreported if size < _MAX_BYTES else (),
+            vehicle.main is not None, unreported if size < _MAX_BYTES else (), vehicle.unknown,
         )  # fmt: skip
     return AccountReport(service, host, now, vehicles, tuple(events))
 

@@ -175,6 +175,12 @@ class Vehicle:
         if not found.initial and not self._is_flapping(event):
             self._report(event)
 
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """The flags that the position estimate in use does not provide."""
+        detector = None if self.main is None else self._detectors[self.main]
+        return detector.unknown if isinstance(detector, PositionDetector) else ()
+
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)

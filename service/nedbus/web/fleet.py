@@ -101,7 +101,9 @@ class Row:
         """True while valid positions arrive."""
         last = self.main.stream.last
         fresh = self.main.state.name not in ("disconnected", "gone", "stale")
-        return fresh and last is not None and is_position(self.main.address) and bool(last.message.xy_valid)
+        if not fresh or last is None or not is_position(self.main.address):
+            return False
+        return bool(last.message.xy_valid) or "xy_valid" in last.provenance.missing
 
 
 @dataclass(frozen=True, slots=True)

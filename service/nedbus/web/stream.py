@@ -20,7 +20,8 @@ LONG: Final = 900, 1.0
 COLUMNS: Final = ("time", "east", "north", "height", "speed", "eph", "epv", "error", "doubtful")
 """Columns of a history, NaN where the message was not valid.
 
-`time`: ms since the Unix epoch or the start of a recording; `doubtful`: 1 while dead reckoning, else 0.
+`time`: ms since the Unix epoch or the start of a recording.
+`doubtful`: 1 while dead reckoning or of unknown validity, else 0.
 `speed`: horizontal [m/s]. The others are in m: `height` above the vehicle's own origin, `error` from the ground truth.
 """
 
@@ -75,17 +76,18 @@ class Origin:
 
     projection: MapProjection | None = None
 
-    def place(self, message: VehicleLocalPosition) -> Place:
-        """Return the position in a message; NaN where it is not valid."""
+    def place(self, message: VehicleLocalPosition, missing: frozenset[str] = frozenset()) -> Place:
+        """Return the position in a message; NaN where it is not valid. Fields that are `missing` are unknown."""
         position = to_global(message)
         north, east = message.x, message.y
         if position:
             self.projection = self.projection or MapProjection(message.ref_lat, message.ref_lon)
             north, east = self.projection.project(position.latitude, position.longitude)
-        if not message.xy_valid:
+        if not (message.xy_valid or "xy_valid" in missing):
             north = east = math.nan
         altitude = (message.ref_alt if message.z_global else 0.0) - message.z
-        return Place(east, north, altitude if message.z_valid else math.nan, bool(position))
+        has_height = message.z_valid or "z_valid" in missing
+        return Place(east, north, altitude if has_height else math.nan, bool(position))
 
 
 class PageStream:
@@ -116,7 +118,7 @@ class PageStream:
         elif before is not None:
             self._tracker.add(before.message)  # the tracker must see the last message before a jump
         self._state, self._sampled = state, time
-        self._add_point(sample.message, time, truth)
+        self._add_point(sample.message, time, truth, sample.provenance.missing)
 
     def places_at(self, times: list[float]) -> list[Place | None]:
         """Return the last valid position at each time [s]; None before the beginning of the histories."""
@@ -127,8 +129,10 @@ class PageStream:
         found = (points[number - 1, 1:3].tolist() if number else None for number in numbers)
         return [None if place is None else Place(place[0], place[1], math.nan, True) for place in found]
 
-    def _add_point(self, message: VehicleLocalPosition, time: float, truth: PageStream | None) -> None:
-        track, place = self._tracker.add(message), self.origin.place(message)
+    def _add_point(
+        self, message: VehicleLocalPosition, time: float, truth: PageStream | None, missing: frozenset[str]
+    ) -> None:
+        track, place = self._tracker.add(message), self.origin.place(message, missing)
         if track.reset & {"xy", "z"} or track.discontinued or track.origin_changed:
             gap = [time * 1e3, *[math.nan] * (len(COLUMNS) - 1)]  # interrupts the line
             self.minute.write(gap)
@@ -136,10 +140,10 @@ class PageStream:
             self._sampled_long = -math.inf
         if math.isfinite(place.north):
             self.valid = place
-        height = -message.z if message.z_valid else math.nan
-        speed = math.hypot(message.vx, message.vy) if message.v_xy_valid else math.nan
+        height = -message.z if message.z_valid or "z_valid" in missing else math.nan
+        speed = math.hypot(message.vx, message.vy) if message.v_xy_valid or "v_xy_valid" in missing else math.nan
         error = _distance(place, message, truth)
-        doubtful = float(message.dead_reckoning)
+        doubtful = float(message.dead_reckoning or "xy_valid" in missing)
         point = [time * 1e3, place.east, place.north, height, speed, message.eph, message.epv, error, doubtful]
         self.minute.write(point)
         if time - self._sampled_long >= self.long.step:

@@ -149,6 +149,14 @@ def test_flags_are_shares() -> None:
     assert health.flags_ever == {**dict.fromkeys(DOUBT_FLAGS, 0.0), "xy_valid": 0.5, "dead_reckoning": 0.5}
 
 
+def test_flags_that_are_not_provided_have_no_share() -> None:
+    """Neither false nor true: a share is that of the messages whose source provides the flag."""
+    stream = StreamHealth(VLP)
+    stream.add(message(1, x=0.0, y=0.0, xy_valid=True), received=0, missing={"z_valid", "dead_reckoning"})
+    stream.add({"timestamp": 2, "xy_valid": False}, received=1)
+    assert stream.snapshot(1).flags == {"xy_valid": 0.5, "v_xy_valid": 0.0, "v_z_valid": 0.0}
+
+
 def test_latency_and_loss() -> None:
     """Latency has the median and maximum of the second; losses are the total."""
     stream = StreamHealth(VLP)

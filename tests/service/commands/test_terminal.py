@@ -113,7 +113,7 @@ def test_line_leaves_out_columns_in_order(lines: Callable[[int], Lines]) -> None
         head, line = lines(width)(one).splitlines()
         assert len(head) <= width
         assert len(line) <= width
-        assert all(text in line for text in ("1/veh", "-1234.5", "  z vxy vz invalid", "[3 lost]"))
+        assert all(text in line for text in ("1/veh", "-1234.5", "  z vxy vz unknown", "[3 lost]"))
         columns = [name for name in ("Z m", "VZ m/s", "HDG deg", "EPH m", "STATE") if name in head]
         if not seen or seen[-1] != columns:
             seen.append(columns)
@@ -129,7 +129,7 @@ def test_heading_is_above_its_columns(lines: Callable[[int], Lines]) -> None:
         if head:
             headed.append(number)
             state = head[0].index("STATE")
-        assert line.index("z vxy vz invalid") == state
+        assert line.index("z vxy vz unknown") == state
     assert headed == [0, 22, 40, 62]
     of_fields = lines(150)(sample(nedbus.Address("1", VLP)), ["x", "eph"]).splitlines()
     assert of_fields[0].split() == ["VEHICLE/TOPIC", "TIME", "s", "x", "eph", "STATE"]

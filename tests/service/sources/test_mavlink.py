@@ -8,8 +8,10 @@ import os
 import random
 import re
 import socket
+import threading
 import tty
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import count, islice
 from pathlib import Path
@@ -25,6 +27,8 @@ from nedbus.sources.mavlink.vehicle import ORIGIN
 from tests.flights.first_message import upgrade
 from tests.flights.messages import VLP
 from tests.flights.replays import open_replay
+from tests.peers.command_line import run_command
+from tests.peers.http_pages import Pages
 from tests.peers.listening import Listener, status_of_source
 from tests.peers.ports import free_port
 from tests.peers.processes import Process, Start
@@ -114,6 +118,41 @@ def estimates(number: int) -> list[dict[str, float]]:
     chosen = islice((each for each in run.messages if each.address.topic == VLP), 0, 20 * number, 20)
     flags = ("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "dist_bottom_valid", "xy_global")
     return [{name: getattr(upgrade(each.fields), name) for name in (*ROW, *flags)} for each in chosen]
+
+
+def test_unknown_validity_is_neither_valid_nor_invalid(run_nedbus: Start, port: int, endpoint: str) -> None:
+    """A vehicle without ESTIMATOR_STATUS, as ArduPilot by default: every command calls its validity unknown."""
+    pages = Pages(free_port())
+    run_nedbus("serve", "--connect", endpoint, "--http", pages.where, "-s", f"mavlink:udpin:127.0.0.1:{port}")
+    asked = {
+        "list": "validity unknown", "info": "validity unknown", "echo --once": "validity unknown",
+        "hz --count 2": "validity unknown",
+        "health --expect 9 --valid xy": "the validity of xy is unknown, as the vehicle does not send it",
+    }  # fmt: skip
+    done = threading.Event()
+
+    def send() -> None:
+        with Autopilot(port) as vehicle:
+            for number in count():
+                if done.wait(0.05):
+                    return
+                with suppress(ConnectionError):  # before the service listens
+                    vehicle.send(
+                        dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), local_position(1000 + 50 * number)
+                    )
+
+    with ThreadPoolExecutor(1) as pool:
+        sending = pool.submit(send)
+        try:
+            wait_for(lambda: pages.values("nedbus_messages_published_total", topic=VLP), what="positions")
+            for command, text in asked.items():
+                shown = run_command(*command.split(), "-c", endpoint)
+                assert text in shown.out + shown.err, (command, shown)
+                assert "invalid," not in shown.out, command
+            assert pages.values("nedbus_stream_flag_ratio") == []
+        finally:
+            done.set()
+        sending.result(DEADLINE)
 
 
 def test_flight_reaches_readers(run_nedbus: Start, fly: Fly, bus: nedbus.Bus, port: int) -> None:

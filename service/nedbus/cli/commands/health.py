@@ -13,7 +13,7 @@ from nedbus.cli.options import JsonOption, command
 from nedbus.cli.output.streams import MAX_TEXT, counted, to_text, write, write_stderr
 from nedbus.client import Bus, Sample, SourceStatus, to_age
 from nedbus.errors import ConfigError, NedbusError
-from nedbus.events import VALID, Expectation, faults_of
+from nedbus.events import VALID, Expectation, faults_of, unknown_text
 from nedbus_msgs import ANY, DEFAULT_TOPIC, Message, check_vehicle
 
 _HOST: Final = socket.gethostname()
@@ -145,9 +145,12 @@ class _Check:
                     yield f"service {name} keeps no history of its vehicles: update nedbus there"
         for sample in others:
             if sample.topic == DEFAULT_TOPIC and (not expected.expect or sample.vehicle in expected.expect):
-                invalid = [each for each in expected.valid if not getattr(sample.message, VALID[each])]
-                if invalid:
+                unknown = [each for each in expected.valid if VALID[each] in sample.missing]
+                known = [each for each in expected.valid if each not in unknown]
+                if invalid := [each for each in known if not getattr(sample.message, VALID[each])]:
                     yield f"vehicle {sample.vehicle}: {', '.join(invalid)} not valid"
+                if unknown:
+                    yield f"vehicle {sample.vehicle}: {unknown_text(unknown)}"
 
 
 def _ages(sources: Iterable[SourceStatus]) -> dict[str, float]:

@@ -98,7 +98,8 @@ def _cells(sample: Sample[Any], fields: Sequence[str]) -> dict[str, str]:
 
 def _to_state(sample: Sample[Any]) -> str:
     """Return the doubts about a sample, or "ok"; then its age if it is old, and the number lost before it."""
-    return (message_doubts(sample.message) if _is_position(sample.message) else "ok") + _notes(sample)
+    is_position = _is_position(sample.message)
+    return (message_doubts(sample.message, sample.missing) if is_position else "ok") + _notes(sample)
 
 
 def _is_position(message: Message) -> bool:

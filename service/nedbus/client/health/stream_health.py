@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 import time
 from bisect import bisect_left
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Final, cast
@@ -37,7 +37,7 @@ class Health:
     """Health of one stream; values are None while there are too few messages to measure them.
 
     Over the last full second: `rate` [Hz], `jitter` (standard deviation of arrival intervals) [s], `latency` (median)
-    and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1.
+    and `latency_max` [s], and `flags`, the share of messages with each flag set, 0 to 1, without unknown ones.
     Since the start: `messages`, `lost` in transit, `gaps` (steps of PX4's time above three times the usual step),
     `out_of_order`, `reboots` (PX4's time stepped back by more than 1 s), `resets` per quantity, and `flags_ever`.
     `nominal`: PX4's rate of this topic [Hz], 0 if it has none; logs and links are usually slower.
@@ -74,6 +74,20 @@ class Health:
         return max(_STALE, 2 / self.usual_rate) if self.usual_rate else _STALE
 
 
+class _Shares:
+    """Number of messages in which each flag was set, and in which it was known."""
+
+    def __init__(self) -> None:
+        self._set, self._known = Counter[str](), Counter[str]()
+
+    def add(self, flag: str, *, is_set: bool) -> None:
+        self._known[flag] += 1
+        self._set[flag] += is_set
+
+    def measured(self) -> dict[str, float]:
+        return {flag: self._set[flag] / self._known[flag] for flag in DOUBT_FLAGS if flag in self._known}
+
+
 @dataclass(slots=True, eq=False)
 class _Window:
     """Measurements of one second, or longer for a slow stream."""
@@ -82,7 +96,7 @@ class _Window:
     messages: int = 0
     intervals: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASURED))
-    flags: dict[str, int] = field(default_factory=lambda: dict.fromkeys(DOUBT_FLAGS, 0))
+    flags: _Shares = field(default_factory=_Shares)
 
     @property
     def mean(self) -> float:
@@ -130,19 +144,26 @@ class StreamHealth:
         self._usual_step = 0.0  # us between two messages
         self._usual_rate: float | None = None
         self._steps = 0
-        self._flag_counts = dict.fromkeys(DOUBT_FLAGS, 0)
+        self._flags = _Shares()
         self._counters: tuple[int, ...] = ()
         self._resets: dict[Quantity, int] = dict.fromkeys(RESET_COUNTERS if self._is_position else (), 0)
         self.latencies = Histogram(_LATENCY_BUCKETS)
         self._window = self._last_window = _Window(0)
 
     def add(
-        self, message: Message | Mapping[str, object], *, received: int, latency: float | None = None, lost: int = 0
+        self,
+        message: Message | Mapping[str, object],
+        *,
+        received: int,
+        latency: float | None = None,
+        lost: int = 0,
+        missing: Collection[str] = (),
     ) -> None:
-        """Add a valid message, or its fields by name, received at time `received` [ns]."""
+        """Add a valid message without its `missing` fields, or its fields by name, received at `received` [ns]."""
         names = _FIELDS if self._is_position else _FIELDS[:1]
         if isinstance(message, Mapping):
             timestamp, *seen = (cast("int", message.get(name, 0)) for name in names)
+            missing = DOUBT_FLAGS - message.keys() if self._is_position else ()
         else:
             timestamp, *seen = (getattr(message, name) for name in names)
         if received - self._window.start >= _WINDOW:
@@ -164,9 +185,9 @@ class StreamHealth:
             window.latencies.append(latency)
             self.latencies.add(latency)
         for flag, is_set in zip(DOUBT_FLAGS, seen, strict=False):
-            if is_set:
-                window.flags[flag] += 1
-                self._flag_counts[flag] += 1
+            if flag not in missing:
+                window.flags.add(flag, is_set=bool(is_set))
+                self._flags.add(flag, is_set=bool(is_set))
 
     def snapshot(self, now: int | None = None) -> Health:
         """Return the health at time `now` [ns]."""
@@ -187,8 +208,8 @@ class StreamHealth:
             gaps=self._gaps,
             out_of_order=self._out_of_order,
             reboots=self._reboots,
-            flags=_shares(window.flags, window.messages) if self._is_position else None,
-            flags_ever=_shares(self._flag_counts, self._messages) if self._is_position else None,
+            flags=window.flags.measured() if self._is_position and window.messages else None,
+            flags_ever=self._flags.measured() if self._is_position and self._messages else None,
             usual_rate=self._usual_rate,
             resets=dict(self._resets),
             on_change=self._topic.on_change,
@@ -240,7 +261,8 @@ class Monitor:
         if known:
             stream = stream or StreamHealth(sample.topic)
             now = time.monotonic_ns() if received is None else received
-            stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost)
+            lacking = sample.provenance.missing
+            stream.add(sample.message, received=now, latency=sample.latency, lost=sample.lost, missing=lacking)
         elif len(self._streams) >= _MAX_STREAMS:
             del self._streams[next(iter(self._streams))]
         self._streams[address] = stream
@@ -259,7 +281,3 @@ class Monitor:
     def forget(self, address: Address) -> None:
         """Remove a stream; it starts over if it comes back."""
         self._streams.pop(address, None)
-
-
-def _shares(counts: dict[str, int], total: int) -> dict[str, float] | None:
-    return {flag: count / total for flag, count in counts.items()} if total else None

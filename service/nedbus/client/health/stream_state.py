@@ -59,7 +59,7 @@ def stream_state(health: Health, *, alive: bool | None = None, connected: bool =
 
 def describe_stream(health: Health, state: StreamState) -> str:
     """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
-    doubts = describe_flags(health.flags) if health.flags else "ok"
+    doubts = "ok" if health.flags is None else describe_flags(health.flags)
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
     events = [f"{count} {name}" for count, name in counts if count]
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
@@ -68,5 +68,5 @@ def describe_stream(health: Health, state: StreamState) -> str:
 def health_of_last(sample: Sample[Message]) -> Health:
     """Return the health of a stream with only its last message known; the age is by the wall clock."""
     stream = StreamHealth(sample.topic)
-    stream.add(sample.message, received=0)
+    stream.add(sample.message, received=0, missing=sample.missing)
     return stream.snapshot(0 if sample.sent is None else max(0, time.time_ns() - sample.sent))
