@@ -18,6 +18,7 @@ EARTH_RADIUS: Final = 6_371_000.0
 """Radius of PX4's sphere [m]."""
 
 Vector = tuple[float, float, float]
+_Quaternion = tuple[float, float, float, float]
 
 
 def ned_to_enu(vector: Vector) -> Vector:
@@ -66,12 +67,23 @@ def variances_enu_to_ned(variances: Vector) -> Vector:
     return north, east, up
 
 
+def quaternion_ned_to_enu(q: Sequence[float]) -> _Quaternion:
+    """Convert an attitude (w, x, y, z): PX4's rotation from FRD to NED becomes ROS's from FLU to ENU."""
+    w, x, y, z = (value * math.sqrt(0.5) for value in q)
+    return w + z, x + y, x - y, w - z
+
+
+def quaternion_enu_to_ned(q: Sequence[float]) -> _Quaternion:
+    """Convert an attitude (w, x, y, z): ROS's rotation from FLU to ENU becomes PX4's from FRD to NED."""
+    return quaternion_ned_to_enu(q)  # both changes of frame are half turns
+
+
 def wrap(angle: float) -> float:
     """Wrap an angle to [-pi, pi]; NaN for NaN and infinities."""
     return math.remainder(angle, math.tau) if math.isfinite(angle) else math.nan
 
 
-def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+def euler_to_quaternion(roll: float, pitch: float, yaw: float) -> _Quaternion:
     """Return the rotation from body FRD to NED (w, x, y, z) for roll, pitch and heading."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(angle / 2), math.sin(angle / 2)) for angle in (roll, pitch, yaw))
     return (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -16,9 +17,12 @@ from nedbus_msgs import (
     NoOrigin,
     VehicleLocalPosition,
     enu_to_ned,
+    euler_to_quaternion,
     flu_to_frd,
     frd_to_flu,
     ned_to_enu,
+    quaternion_enu_to_ned,
+    quaternion_ned_to_enu,
     to_global,
     to_local,
     variances_enu_to_ned,
@@ -172,3 +176,25 @@ def test_yaw_round_trip(yaw: float) -> None:
     east, north, _ = ned_to_enu((math.cos(yaw), math.sin(yaw), 0.0))
     assume(abs(east) + abs(north) > 0)
     assert abs(wrap(math.atan2(north, east) - enu)) < 1e-12
+
+
+def rotate(q: Sequence[float], vector: tuple[float, float, float]) -> tuple[float, ...]:
+    """Return a vector rotated by a unit quaternion (w, x, y, z)."""
+    w, x, y, z = q
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return tuple(sum(a * b for a, b in zip(row, vector, strict=True)) for row in rows)
+
+
+@given(angles, angles, angles)
+def test_attitude_rotates_as_before(roll: float, pitch: float, yaw: float) -> None:
+    """A converted attitude turns a vector in FLU to where the original turns the same vector in FRD, and back."""
+    q = euler_to_quaternion(roll, pitch, yaw)
+    enu = quaternion_ned_to_enu(q)
+    for vector in ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.5, -1.0, 3.0)):
+        north, east, down = rotate(q, vector)
+        assert rotate(enu, frd_to_flu(vector)) == pytest.approx(ned_to_enu((north, east, down)), abs=1e-9)
+    assert quaternion_enu_to_ned(enu) == pytest.approx(q)

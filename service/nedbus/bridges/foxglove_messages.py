@@ -17,7 +17,14 @@ from foxglove.messages import (
     Vector3,
 )
 
-from nedbus_msgs import MapProjection, VehicleLocalPosition, ned_to_enu, to_global, yaw_ned_to_enu
+from nedbus_msgs import (
+    MapProjection,
+    VehicleLocalPosition,
+    ned_to_enu,
+    quaternion_ned_to_enu,
+    to_global,
+    yaw_ned_to_enu,
+)
 
 _MAP: Final = "map"
 _MAX_APART: Final = 500_000  # us between a position and the attitude paired with it
@@ -54,9 +61,9 @@ def orientation_of(message: VehicleLocalPosition, attitude: Any = None) -> tuple
     Taken from a VehicleAttitude within 0.5 s of the position, else from the heading; without either, facing east.
     """
     if attitude is not None and abs(attitude.timestamp - message.timestamp) <= _MAX_APART:
-        w, x, y, z = (each * math.sqrt(0.5) for each in attitude.q)
-        if math.isfinite(w + x + y + z):  # from ENU to NED, q, and from FLU to FRD, multiplied out
-            return x + y, x - y, w - z, w + z
+        w, x, y, z = quaternion_ned_to_enu(attitude.q)
+        if math.isfinite(w + x + y + z):
+            return x, y, z, w
     yaw = yaw_ned_to_enu(message.heading)
     half = yaw / 2 if math.isfinite(yaw) else 0.0
     return 0.0, 0.0, math.sin(half), math.cos(half)
