@@ -15,6 +15,7 @@
     │   ├── ListenError (OSError)            cannot listen on the endpoint: the port is taken, ...
     │   ├── NoDataError (TimeoutError)       nothing arrived in time
     │   ├── ClosedError (RuntimeError)       the bus was closed
+    │   ├── ReceiveError (RuntimeError)      a subscription that its session or its thread ended
     │   └── ForkError (RuntimeError)         this process was forked from one that was connected
     └── the data
         ├── DecodeError (ValueError)         a payload that is not a valid message
@@ -44,7 +45,7 @@ from nedbus_msgs import (
 __all__ = [
     "AddressError", "AddressInUseError", "ClosedError", "ConfigError", "ConnectError", "DecodeError", "EncodeError",
     "ForkError", "InvalidMessageError", "LayoutError", "ListenError", "NedbusError", "NoDataError", "OutputError",
-    "PkiError", "SourceError", "UnknownLayoutError",
+    "PkiError", "ReceiveError", "SourceError", "UnknownLayoutError",
 ]  # fmt: skip
 
 
@@ -139,6 +140,13 @@ class ClosedError(NedbusError, RuntimeError):
 
     def __init__(self) -> None:
         super().__init__("this object or its bus was closed: connect again")
+
+
+class ReceiveError(NedbusError, RuntimeError):
+    """Raised when a subscription ended although neither it nor its bus was closed."""
+
+    def __init__(self, what: str, reason: str) -> None:
+        super().__init__(f"{what}: receiving has ended ({reason}): close the bus, and connect and subscribe again")
 
 
 class ForkError(NedbusError, RuntimeError):

@@ -48,7 +48,8 @@ class _SubscriptionBase(Generic[M_co]):
 class Subscription(_SubscriptionBase[M_co]):
     """Iterator over received samples; `bus.subscribe(...)` returns one.
 
-    Iteration waits for the next sample and ends when the subscription or the bus is closed.
+    Iteration waits for the next sample and ends when the subscription or the bus is closed; it raises ReceiveError if
+    the session or the receiving thread fails.
     The subscription closes itself when it is no longer referenced and when the process exits.
     """
 
@@ -61,7 +62,8 @@ class Subscription(_SubscriptionBase[M_co]):
     def receive(self, timeout: float | None = None) -> Sample[M_co]:
         """Wait for the next sample and return it.
 
-        Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed.
+        Raises NoDataError if none arrives within `timeout` seconds, ClosedError if the subscription is closed,
+        ReceiveError if it has failed.
         """
         return self._next(self._queue.pop, timeout)
 
@@ -103,7 +105,7 @@ class Subscription(_SubscriptionBase[M_co]):
             self._receiver.receive()  # newer samples may be in the ring
         while True:
             if self._queue.ended:
-                raise ClosedError
+                raise self._queue.end_error
             item = pop()
             if item is not None:
                 return item
@@ -181,7 +183,7 @@ class AsyncSubscription(_SubscriptionBase[M_co]):
                 while True:
                     self._arrival.clear()
                     if self._queue.ended:
-                        raise ClosedError
+                        raise self._queue.end_error
                     item = pop()
                     if item is not None:
                         return item

@@ -181,6 +181,56 @@ def test_closed_subscription_ends_iteration(endpoint: str, client: nedbus.Bus, m
         subscription.receive(1.0)
 
 
+@pytest.mark.parametrize("mode", BOTH)
+@pytest.mark.parametrize("forms", [iter, nedbus.Subscription.rows, nedbus.Subscription.batches])
+def test_dead_session_raises_in_iteration(
+    endpoint: str, mode: Mode, forms: Callable[[nedbus.Subscription[Any]], Iterator[object]]
+) -> None:
+    """A session that ends by itself, before or during a wait, ends no iteration without an error."""
+    with nedbus.connect(endpoint) as bus:
+        subscription = bus.subscribe(VLP, mode=mode)
+        closer = threading.Thread(target=bus._zenoh.close)
+        closer.start()
+        for _ in range(2):
+            with pytest.raises(nedbus.ReceiveError, match=r"its Zenoh session was closed.*subscribe again"):
+                list(forms(subscription))
+        closer.join()
+        subscription.close()
+        with pytest.raises(nedbus.ReceiveError):
+            subscription.receive(1.0)
+
+
+def test_dead_session_raises_in_asyncio(endpoint: str) -> None:
+    """`async for` ends without an error only after a close."""
+
+    async def scenario() -> None:
+        async with nedbus.connect_async(endpoint) as bus, bus.subscribe(VLP) as subscription:
+            closing = asyncio.create_task(asyncio.to_thread(bus._blocking._zenoh.close))
+            with pytest.raises(nedbus.ReceiveError, match="its Zenoh session was closed"):
+                async for _ in subscription:
+                    pass
+            with pytest.raises(nedbus.ReceiveError):
+                async for _ in subscription.rows():
+                    pass
+            await closing
+
+    asyncio.run(scenario())
+
+
+def test_failed_pump_raises_in_iteration(client: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unexpected error of the receiving thread reaches the reader, with its text."""
+
+    def fail(_: Receiver) -> None:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(Receiver, "_receive", fail)
+    subscription = client.subscribe(VLP)
+    with pytest.raises((nedbus.NoDataError, nedbus.ReceiveError)):
+        subscription.receive(0.01)  # starts the thread
+    with pytest.raises(nedbus.ReceiveError, match="unexpected RuntimeError: out of luck"):
+        list(subscription)
+
+
 def test_closed_publisher_is_gone(client: nedbus.Bus, bus: nedbus.Bus) -> None:
     """A closed publisher is not listed, does not reply, refuses to publish, and frees its address."""
     publisher = client.publisher(VLP, vehicle="1")

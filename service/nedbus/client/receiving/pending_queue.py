@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from nedbus.client.sample import Counts, Mode, Sample
+from nedbus.errors import ClosedError, NedbusError, ReceiveError
 from nedbus.log_event import about
 from nedbus.transport import RawSample
 from nedbus_msgs import AddressError
@@ -68,6 +69,7 @@ class PendingQueue:
             raise AddressError("mode", mode, f"one of {', '.join(get_args(Mode))}")
         self.newest_only = mode == "latest"
         self.ended = False
+        self._failure = ""  # reason of an end that the user did not cause
         self.on_gap: Callable[[], object] | None = None
         self.on_wake: Callable[[], object] | None = None
         """Called on any thread when a sample may be ready, to wake a reader on an event loop."""
@@ -168,11 +170,21 @@ class PendingQueue:
         for request in ready:
             request.reply()
 
-    def end(self) -> None:
-        """End the queue: readers get ClosedError, and all acknowledgement requests are answered."""
+    def end(self, failure: str = "") -> None:
+        """End the queue: readers get the `end_error`, and all acknowledgement requests are answered.
+
+        `failure`: the reason, unless the user closed the subscription.
+        """
+        if not self.ended:
+            self._failure = failure
         self.ended = True
         self.acknowledge(drained=True)
         self.wake()
+
+    @property
+    def end_error(self) -> NedbusError:
+        """The error of readers after the end."""
+        return ReceiveError(self.name, self._failure) if self._failure else ClosedError()
 
     def wake(self) -> None:
         """Wake one waiting thread, or the next one to wait, and the event loop."""

@@ -152,11 +152,9 @@ class Receiver:
                     time.sleep(_BUSY_PAUSE)
                 with self._receiving:
                     self._receive()
-        except BaseException:
+        except BaseException as exc:  # noqa: BLE001 - readers raise it; they must not wait for a dead pump
             _log.exception("%s: unexpected error, subscription ended", self._name, extra=about("error"))
-            raise
-        finally:
-            self._queue.end()  # readers must not wait for a dead pump
+            self._queue.end(f"unexpected {type(exc).__name__}: {exc}")
 
     def _receive(self, *, if_empty: bool = False) -> None:
         """Wait for a sample and drain the ring into the queue; end the queue if the subscriber is gone.
@@ -174,7 +172,7 @@ class Receiver:
                 batch.append(item)
                 drain(handler, batch)
         except zenoh.ZError:
-            self._queue.end()
+            self._queue.end("its Zenoh session was closed")  # no effect after `close`
             return
         finally:
             self._idle = False
