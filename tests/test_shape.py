@@ -64,3 +64,10 @@ def test_no_python_code_runs_on_threads_of_zenoh() -> None:
         code = path.read_text()
         assert not re.search(r"handlers\.Callback|indirect=", code), path
         assert "declare_advanced_publisher" not in code or "publisher.undeclare(" not in code, path
+
+
+def test_settable_clock_has_one_reader() -> None:
+    """Only `nedbus.clock` reads the clock that can be set: events, silence and overload are judged by a steady one."""
+    for path in PRODUCT:
+        found = re.search(r"\btime\.time(_ns)?\(|datetime\.(now|utcnow|today)\(|date\.today\(", path.read_text())
+        assert not found or path.name == "clock.py", f"{path}: use nedbus.clock"

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import zenoh
 
+from nedbus import clock
 from nedbus.client import Bus, Sample, Subscription
 from nedbus.errors import NedbusError, NoDataError
 from nedbus.log_event import about
@@ -234,7 +235,7 @@ class Ros2Bridge:
         definition, layout, _ = self._types[sample.topic]
         payload = encode_with(definition, definition.downgrade(sample.message.__dict__, layout), layout)
         publisher.sequence += 1
-        attachment = bytes(Attachment(publisher.sequence, time.time_ns(), publisher.gid))
+        attachment = bytes(Attachment(publisher.sequence, clock.utc_ns(), publisher.gid))
         with while_open():
             publisher.publisher.put(payload, attachment=attachment)
 

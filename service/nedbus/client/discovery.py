@@ -17,6 +17,7 @@ import zenoh
 from pydantic import Field, TypeAdapter, ValidationError, ValidatorFunctionWrapHandler, field_validator
 from pydantic_core import PydanticUseDefault
 
+from nedbus import clock
 from nedbus.client.closing import Finalizer
 from nedbus.client.health.stream_health import Health
 from nedbus.client.receiving.layout_lookup import Schemas
@@ -315,7 +316,7 @@ class Rejections:
         except (AddressError, ValueError, RecursionError):
             return None
         reason = content.get("reason") if isinstance(content, dict) else None
-        return RejectionReport(address, str(reason)[:_MAX_TEXT], time.time_ns()) if reason else None
+        return RejectionReport(address, str(reason)[:_MAX_TEXT], clock.utc_ns()) if reason else None
 
 
 def _parse(replies: Iterable[RawSample], *, limit: int = _MAX_REPLY_BYTES) -> Iterator[tuple[str, object]]:

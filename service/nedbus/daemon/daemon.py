@@ -7,13 +7,13 @@ import os
 import re
 import socket
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from typing import Final, Literal
 
+from nedbus import clock
 from nedbus.client import HEARTBEAT, Housekeeping, PublisherRegistry, QueryServer, ServiceStatus, SourceStatus
 from nedbus.errors import ConnectError
 from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
@@ -45,7 +45,7 @@ class Daemon:
     def __init__(self, settings: Settings, *, version: str) -> None:
         self._settings = settings
         self.version = version
-        self.started = time.time()
+        self.started = clock.steady()
         self._stop = threading.Event()
         self._changed = threading.Event()
         self._workers: Sequence[Worker] = ()
@@ -74,8 +74,8 @@ class Daemon:
             service=self.id,
             host=socket.gethostname(),
             version=self.version,
-            started=self.started,
-            now=time.time(),
+            started=self.started + clock.to_utc(),
+            now=clock.utc(),
             role=self.role,
             endpoints=self.endpoints,
             refused=tuple(sorted(vehicle for vehicle, refused in self.refused.items() if refused)),
@@ -116,12 +116,14 @@ class Daemon:
         states = {main: measured[str(main)] for main in mains if str(main) in measured}
         is_cut = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
-        self.account.update(time.time(), states, link=link)
+        self.account.update(clock.steady(), states, link=link)
         return self.account
 
     def report(self, *, within: float = 0.0) -> AccountReport:
         """Return the events of the last `within` seconds and the current state of each vehicle."""
-        return report_of(self.look(), self.id, socket.gethostname(), time.time(), within=within)
+        return report_of(
+            self.look(), self.id, socket.gethostname(), clock.steady(), within=within, to_utc=clock.to_utc()
+        )
 
     def _answer(self, parameter: Callable[[str], str | None]) -> dict[str, object]:
         """Answer a query with the status, or with the events if it has the parameter for them."""

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
 
+from nedbus import clock
 from nedbus.client import Histogram, LogStreamStatus, Publisher, PublisherRegistry, StreamHealth, StreamStatus
 from nedbus.errors import AddressInUseError, InvalidMessageError
 from nedbus.events import Account
@@ -139,7 +140,7 @@ class SourceOutput:
         self.durations.add(time.perf_counter() - start)
         self.published += 1
         stream.health.add(fields, received=self._now_ns(), lost=message.lost)
-        self._account.add(message.address, fields, time.time(), lost=message.lost)
+        self._account.add(message.address, fields, clock.steady(), lost=message.lost)
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:
         """Publish a message of a replay; claim its address first if it was unknown at the start."""
@@ -210,7 +211,7 @@ class SourceOutput:
             extra = about("rejected", rejection.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         if rejection.address is not None:
-            self._account.reject(rejection.address, reason, time.time())
+            self._account.reject(rejection.address, reason, clock.steady())
             self._registry.reject(rejection.address, {"source": self._text, "where": where, "reason": reason})
 
     def note(self, absence: Absence) -> None:
@@ -260,7 +261,7 @@ class SourceOutput:
             extra = about("rejected", message.address, source=self._name, reason=reason)
             _log.warning("%s: %s", self._name, text, extra=extra)
         report = {"source": self._text, "reason": reason, "fields": dict(message.fields)}
-        self._account.reject(message.address, reason, time.time())
+        self._account.reject(message.address, reason, clock.steady())
         self._registry.reject(message.address, report)
 
 

@@ -11,6 +11,7 @@ from typing import Final, TypeVar
 
 import zenoh
 
+from nedbus import clock
 from nedbus.client import ServiceStatus, SourceStatus, find_accounts, find_services
 from nedbus.events import AccountReport
 from nedbus.transport import (
@@ -181,9 +182,9 @@ def _subscribe(session: Session, key_expr: str) -> Callable[[], Iterable[RawSamp
 
 def _ask_services(session: Session, prefix: str) -> list[Service]:
     """Return the answering services; they read their clocks within the round-trip time."""
-    before = time.time()
+    before, start = clock.utc(), time.monotonic()
     statuses = find_services(session, prefix=prefix, timeout=_QUERY_TIMEOUT)
-    error = (time.time() - before) / 2
+    error = (time.monotonic() - start) / 2
     services = []
     for status in statuses[:_MAX_SERVICES]:
         now = status.now if status.now is not None and abs(status.now) < _MAX_TIME else None  # NaN is not
@@ -194,7 +195,7 @@ def _ask_services(session: Session, prefix: str) -> list[Service]:
 def _age_of(sample: RawSample) -> float | None:
     """Return the age of a sample by its publisher's clock [s]; None without a timestamp."""
     stamp = sample.timestamp
-    return None if stamp is None else time.time() - stamp.get_time_as_ntp64().as_nanos() / 1e9
+    return None if stamp is None else clock.utc() - stamp.get_time_as_ntp64().as_nanos() / 1e9
 
 
 def _parse_each(parse: Callable[[str], T], keys: Iterable[str]) -> list[T]:

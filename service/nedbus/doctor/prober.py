@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import socket
 import ssl
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from nedbus import clock
 from nedbus.errors import ConfigError, NedbusError
 from nedbus.pki import Certificate
 from nedbus.settings import Settings
@@ -181,7 +181,7 @@ def _judge_validity(check: str, subject: str, whose: str, pem: bytes) -> tuple[F
         return Finding(check, subject, "unknown", "the expiry of the certificate is not checked", str(exc)), None
     except ValueError as exc:
         return Finding(check, subject, "wrong", f"not a valid certificate: {exc}"), None
-    now = dt.datetime.now(dt.UTC)
+    now = clock.now()
     days = certificate.days_left(now)
     state: State = "ok"
     note = advice = ""

@@ -24,6 +24,8 @@ _NONE: Final[frozenset[str]] = frozenset()
 class Account:
     """The events of all vehicles. Thread-safe: one thread may add samples while others update and read.
 
+    All times are of one clock that is never set, or of a file: a step would end or hide conditions.
+
     `events`: the most recent events, in the order they were reported. `reported`: the total number of events.
     `counts`: the number of events by vehicle and severity.
     """
@@ -80,7 +82,7 @@ class Account:
             self._update_reader(time, dropped, is_behind=is_behind)
             if self.overload is not None:
                 self._settled = time + MAX_SILENCE  # delayed messages need time to arrive
-            if time < self._settled <= time + MAX_SILENCE:  # false if the clock was set back
+            if time < self._settled:
                 self.settle(time)
                 return
             self._common.settle(time)
@@ -130,7 +132,7 @@ class Account:
             if self.overload is None:
                 text = "the reader is slower than the data: messages are dropped"
                 self._common.emit(Finding("overload", "begin", "watch", text), "", time)
-        elif self.overload is not None and not 0 <= time - self._last_overload <= PAUSE:
+        elif self.overload is not None and time - self._last_overload > PAUSE:
             text = f"the reader keeps up again: {dropped} messages were dropped"
             ended = Finding("overload", "end", "info", text, numbers={"messages": dropped})
             self._common.emit(ended, "", time, changed=self._last_overload)

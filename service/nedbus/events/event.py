@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal, get_args
 
 from pydantic import Field
@@ -27,8 +27,8 @@ class Event:
     """One event of a vehicle.
 
     `kind`: a key of KINDS. `change`: "begin" or "end" of a condition, or "once".
-    `time`: seconds by the account's clock: since the epoch by the clock of this host (live), or since the start of a
-    file. `boot`: seconds since the vehicle's boot, None if no message has given it.
+    `time`: seconds by the account's clock: the steady clock of this host (live), Unix time (in a report), or since the
+    start of a file. `boot`: seconds since the vehicle's boot, None if no message has given it.
     `numbers`: values by name, in SI units and NED. `names`: flags, sensors, or the values before and after.
     `lasted`: duration of a condition that ends [s], None if it began before the first message.
     `evidence`: possible causes: events at most WINDOW seconds earlier, and conditions that are still active.
@@ -52,6 +52,11 @@ class Event:
         """A key that is equal for the same event in the reports of two services."""
         return self.kind, self.time, self.names
 
+    def later(self, seconds: float) -> Event:
+        """Return this event and its evidence on a clock that is ahead by `seconds`."""
+        evidence = tuple(each.later(seconds) for each in self.evidence)
+        return replace(self, time=max(0.0, self.time + seconds), evidence=evidence)
+
     @property
     def is_notable(self) -> bool:
         """True if a story includes it: a begin or single event of severity bad or watch, or a change of mode."""
@@ -74,6 +79,10 @@ class Condition:
     begin: Event
     initial: bool = False
     on_ground: Literal["bad", "watch", "info"] | None = None
+
+    def later(self, seconds: float) -> Condition:
+        """Return this condition on a clock that is ahead by `seconds`."""
+        return replace(self, since=max(0.0, self.since + seconds), begin=self.begin.later(seconds))
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,8 +78,13 @@ class AccountReport:
 _REPORT: Final = TypeAdapter(AccountReport)
 
 
-def report_of(account: Account, service: str, host: str, now: float, *, within: float) -> AccountReport:
-    """Return a report of the last `within` seconds; if it is full, each vehicle keeps its most recent events."""
+def report_of(
+    account: Account, service: str, host: str, now: float, *, within: float, to_utc: float = 0.0
+) -> AccountReport:
+    """Return a report of the last `within` seconds; if it is full, each vehicle keeps its most recent events.
+
+    `now`: by the account's clock [s]; `to_utc`: what its times need to become Unix time [s].
+    """
     recent = [event for event in account.events_since(0)[0] if event.time > now - within]
     share = max(_MIN_EVENTS, _MAX_EVENTS // max(1, len({event.vehicle for event in recent})))
     counts: Counter[str] = Counter()
@@ -97,16 +102,19 @@ def report_of(account: Account, service: str, host: str, now: float, *, within: 
     for name, vehicle in list(account.vehicles.items()):
         state = account.state(name, now)
         held = list(vehicle.conditions.items())
-        flags = {flag: each.since for (kind, flag), each in held if kind.endswith("_invalid") and flag}
+        flags = {
+            flag: max(0.0, each.since + to_utc) for (kind, flag), each in held if kind.endswith("_invalid") and flag
+        }
         kinds = tuple(dict.fromkeys(each.kind for each in state.conditions))
         bad = (each for _, each in held if each.severity != "info")
         unreported = tuple(dict.fromkeys(each for each in bad if each.begin.identity not in reported))
         size += 500 * len(unreported)
         vehicles[name] = VehicleReport(
-            state.severity, state.text, state.since, kinds, flags, tuple(sorted(vehicle.topics))[:_MAX_TOPICS],
-            vehicle.main is not None, unreported if size < _MAX_BYTES else (), vehicle.unknown,
+            state.severity, state.text, None if state.since is None else max(0.0, state.since + to_utc), kinds, flags,
+            tuple(sorted(vehicle.topics))[:_MAX_TOPICS], vehicle.main is not None,
+            tuple(each.later(to_utc) for each in unreported) if size < _MAX_BYTES else (), vehicle.unknown,
         )  # fmt: skip
-    return AccountReport(service, host, now, vehicles, tuple(events))
+    return AccountReport(service, host, now + to_utc, vehicles, tuple(each.later(to_utc) for each in events))
 
 
 def by_vehicle(reports: Iterable[AccountReport]) -> dict[str, AccountReport]:

@@ -17,7 +17,6 @@ from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAU
 from .times import to_age
 
 _REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
-_MAX_AHEAD: Final = 1.0  # s that an event may be ahead of an update; more means that the clock was set back
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
 _MAX_TOPICS: Final = 20  # named in one event
@@ -113,7 +112,7 @@ class Vehicle:
             self._rejected = _Burst()
         for key, events in list(self._changes.items()):
             last = events[-1]
-            if key in self._suppressed and not 0 <= time - last.time <= PAUSE:
+            if key in self._suppressed and time - last.time > PAUSE:
                 count = self._suppressed.pop(key)
                 self._report(replace(last, text=f"{last.text}, the last of {count} suppressed changes"))
             if time - last.time > WINDOW:
@@ -138,7 +137,7 @@ class Vehicle:
         found = [each for each in self.conditions.values() if each.on_ground != "info" or self.armed is not False]
         kinds = {each.kind for each in found}
         for event in reversed(self.recent):
-            if event.change == "once" and time - RECENT < event.time <= time + _MAX_AHEAD:
+            if event.change == "once" and time - RECENT < event.time:
                 found.append(Condition(event.kind, event.severity, event.text, event.time, event))
             elif event.change == "begin" and (event.kind, event.names) in self._suppressed and event.kind not in kinds:
                 kinds.add(event.kind)
@@ -255,7 +254,7 @@ class _Burst:
             self.topics.add(topic)
 
     def is_over(self, time: float) -> bool:
-        return self.count > 0 and not -_MAX_AHEAD <= time - self.end <= PAUSE
+        return self.count > 0 and time - self.end > PAUSE
 
 
 def _rank(topics: tuple[str, ...], address: Address) -> tuple[int, int]:

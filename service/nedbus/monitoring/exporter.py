@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from prometheus_client.core import Metric
 
+from nedbus import clock
 from nedbus.client import Bus, LogStreamStatus, Sample, find_services
 from nedbus.errors import NedbusError
 from nedbus.events import report_of
@@ -160,7 +161,8 @@ class Exporter:
     def _vehicles(self) -> Page:
         if not self._bus.connected:
             return Page.verdict(self._faults(), "")
-        return vehicles_page(report_of(self.account, "export", socket.gethostname(), time.time(), within=0.0))
+        host, now = socket.gethostname(), clock.steady()
+        return vehicles_page(report_of(self.account, "export", host, now, within=0.0, to_utc=clock.to_utc()))
 
     def _status(self) -> Page:
         streams = {str(address): asdict(health) for address, (health, _) in self._observer.measure().items()}

@@ -7,7 +7,6 @@ Labels: `vehicle`, `topic` as shown by `nedbus list` (estimator_local_position/0
 from __future__ import annotations
 
 import platform
-import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from prometheus_client import ProcessCollector, core, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
+from nedbus import clock
 from nedbus.client import Health, Histogram, SourceStatus
 from nedbus.daemon import STATES, Daemon, SourceMeasures
 from nedbus.events import SEVERITIES, Account
@@ -199,7 +199,7 @@ def stream_metrics(streams: Sequence[MeasuredStream], *, messages: str) -> Itera
 
 def vehicle_metrics(account: Account, streams: Iterable[MeasuredStream]) -> Iterator[core.Metric]:
     """Yield the vehicle metrics; a vehicle without an active stream has event counts but no state."""
-    now, vehicles = time.time(), list(account.vehicles)
+    now, vehicles = clock.steady(), list(account.vehicles)
     active = {stream.labels[0] for stream in streams if stream.active}
     states = {name: account.state(name, now) for name in vehicles if name in active}
     kinds = {name: sorted({condition.kind for condition in state.conditions}) for name, state in states.items()}
@@ -220,7 +220,7 @@ def service_metrics(daemon: Daemon) -> Iterator[core.Metric]:
     sources = _by_label(daemon.measures)
     yield build_info(daemon.version)
     yield from make_metrics({
-        "nedbus_start_time_seconds": [((), daemon.started)],
+        "nedbus_start_time_seconds": [((), daemon.started + clock.to_utc())],
         "nedbus_sessions": [((daemon.role,), daemon.sessions)],
         "nedbus_sessions_max": [] if daemon.max_sessions is None else [((daemon.role,), daemon.max_sessions)],
         "nedbus_vehicle_refused": [((vehicle,), is_refused) for vehicle, is_refused in daemon.refused.items()],

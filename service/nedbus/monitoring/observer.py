@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from nedbus import clock
 from nedbus.client import Bus, Health, Histogram, Monitor, RejectionReport, Sample, stream_state
 from nedbus.events import Account
 from nedbus_msgs import Address, Selection
@@ -23,7 +23,7 @@ _MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one belongs
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: seconds since the Unix epoch; `alive`: the published addresses.
+    `time`: by the steady clock [s], as the times of `rejected`; `alive`: the published addresses.
     `link`, `behind`: the fault of the link and of this reader, "" if there is none.
     """
 
@@ -36,7 +36,7 @@ class Snapshot:
 
 
 class Observer:
-    """Subscribe to a selection and keep an `account` of the events and states of its vehicles, by this host's clock.
+    """Subscribe to a selection and keep an `account` of the events and states of its vehicles, by the steady clock.
 
     The thread that reads `subscription` passes each sample to `add`. `poll` and `measure` may be called in any thread;
     call `poll` about twice a second.
@@ -56,9 +56,10 @@ class Observer:
         """Add a sample just read; the account ignores the cached last sample of a stream that ended long ago."""
         with self._lock:
             is_known = self._monitor.add(sample)
-        if is_known or sample.latency is None or sample.latency <= _MAX_AGE:
-            received, missing = sample.received / 1e9, sample.provenance.missing
-            self.account.add(sample.address, sample.message, received, missing=missing, lost=sample.lost)
+        now = clock.steady()
+        if is_known or sample.sent is None or now - sample.sent / 1e9 <= _MAX_AGE:
+            missing = sample.provenance.missing
+            self.account.add(sample.address, sample.message, now, missing=missing, lost=sample.lost)
 
     def measure(self) -> dict[Address, tuple[Health, Histogram | None]]:
         """Return the current health and latencies of each stream."""
@@ -68,15 +69,16 @@ class Observer:
 
     def poll(self) -> Snapshot:
         """Poll streams, rejections and the link, and record changes in the account."""
-        now, connected = time.time(), self._bus.connected
+        now, connected = clock.steady(), self._bus.connected
         dropped, waiting = self.subscription.counts.dropped, self.subscription.waiting
         with self._lock:
             healths = self._monitor.snapshot()
-        rejected = [report for report in self._rejections.take() if self._selection.matches(report.address)]
+        taken = [report for report in self._rejections.take() if self._selection.matches(report.address)]
+        rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
-            self.account.reject(report.address, report.reason, report.received / 1e9)
+            self.account.reject(report.address, report.reason, now)
         alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
-        self._disconnected = min(self._disconnected, now) if connected else now
+        self._disconnected = self._disconnected if connected else now
         settled = now - self._disconnected > _SETTLING_TIME
         states = {
             main: stream_state(healths[main], alive=main in alive).name if settled else "unknown"

@@ -21,6 +21,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from nedbus import clock
 from nedbus.errors import PkiError
 from nedbus.whole_file import whole_file
 
@@ -215,7 +216,7 @@ def _sign(
     """Return the certificate of a key; without an issuer, that of a CA, signed by itself."""
     is_authority = issuer is None
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now = dt.datetime.now(dt.UTC)
+    now = clock.now()
     until = now + dt.timedelta(days=days)
     allowed = {"key_cert_sign", "crl_sign"} if is_authority else {"digital_signature"}
     usage = x509.KeyUsage(**{usage: usage in allowed for usage in _USAGES})

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import re
 import ssl
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from nedbus import clock
 from nedbus.errors import ConfigError
 
 _LABEL: Final = re.compile(r"-----BEGIN ([A-Z0-9 ]+)-----")
@@ -68,7 +68,7 @@ class Tls:
         if not authority.get_ca_certs():
             return f"{self.ca} is not the certificate of an authority: it cannot sign others"
         until = max(ssl.cert_time_to_seconds(str(each["notAfter"])) for each in authority.get_ca_certs())
-        return f"{self.ca} has expired" if until < time.time() else None
+        return f"{self.ca} has expired" if until < clock.utc() else None
 
 
 def check_pem(path: str | Path, kind: str) -> None:

@@ -17,7 +17,7 @@ _TENTH: Final = 0.1  # s; time resolution of the page's URL
 class Chronicle:
     """The events of an account and those `before` it; re-evaluated only after new events.
 
-    `start`: start of a recording in seconds since the Unix epoch, None if unknown.
+    `start`: Unix time of a recording's start, or what to add to the times of live events [s]; None if unknown.
     """
 
     def __init__(self, account: Account, *, before: Sequence[Event] = (), times: Times | None = None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from bokeh.server.server import Server
 from tornado.ioloop import IOLoop, PeriodicCallback
 from tornado.web import HTTPError, RequestHandler
 
+from nedbus import clock
 from nedbus.client import Bus
 from nedbus.errors import ListenError
 from nedbus.events import ALL
@@ -100,9 +100,9 @@ class LiveFleet:
         self.fleet = Fleet()
         self._exporter = Exporter(
             bus, selection, version=version, on_poll=self._update,
-            on_sample=lambda sample: self.fleet.add(sample, time.time()),
+            on_sample=lambda sample: self.fleet.add(sample, clock.steady()),
         )  # fmt: skip
-        now = time.time()
+        now = clock.utc()
         remembered = [
             event
             for report in bus.accounts(within=PAST)
@@ -114,6 +114,7 @@ class LiveFleet:
 
     def _update(self, snapshot: Snapshot) -> None:
         account = self._exporter.account
+        self.chronicle.start = round(clock.to_utc(), 1)  # a time axis is drawn anew when it changes
         self.fleet.reject(snapshot.rejected)
         states = {vehicle: account.state(vehicle, snapshot.time) for vehicle in list(account.vehicles)}
         own = snapshot.behind.replace("this reader", "this page")

@@ -103,17 +103,6 @@ def test_damaged_time_is_no_reboot(sent: Sent) -> None:
     assert Times(offsets={"1": 1e9}).text(event) == "9000000000000.000"
 
 
-def test_clock_that_is_set_back_hides_no_silence(sent: Sent) -> None:
-    """After the host's clock was set back, silence is still reported, and earlier events do not stay recent."""
-    sent(10_000.0)
-    sent.account.update(10_000.0, {MAIN: "ok"}, dropped=5)
-    sent.account.reject(MAIN, "a rule", 10_000.0)
-    sent.account.update(4_000.0, {MAIN: "stale"}, dropped=5)
-    for second in range(4_001, 4_020):
-        sent.account.update(float(second), {MAIN: "stale"}, dropped=5)
-    assert {("silent", "begin"), ("rejected", "end"), ("overload", "end")} <= set(sent.told)
-
-
 def test_what_held_at_first_is_over_at_a_reboot(sent: Sent) -> None:
     """A vehicle that was not valid, reboots and is valid, has no active condition."""
     for second in range(3):

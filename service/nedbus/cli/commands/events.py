@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from nedbus import clock
 from nedbus.cli.follow import follow
 from nedbus.cli.options import CsvOption, DurationOption, FileArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
@@ -201,7 +202,7 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         nonlocal seen
         observer.poll()
         new, seen = observer.account.events_since(seen)
-        show(new)
+        show(event.later(clock.to_utc()) for event in new)
         for name, each in list(observer.account.vehicles.items()):
             if name not in known and each.main is not None:
                 known.add(name)

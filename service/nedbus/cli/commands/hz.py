@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, Final
 
+from nedbus import clock
 from nedbus.cli.follow import follow
 from nedbus.cli.options import ALL, CountOption, CsvOption, DurationOption, JsonOption, command, require_one
 from nedbus.cli.output.streams import csv_line, write
@@ -92,7 +92,7 @@ def _to_row(address: Address, health: Health, state: StreamState) -> list[str]:
 
 def _to_fields(address: Address, health: Health, state: StreamState) -> dict[str, Any]:
     head = {"vehicle": address.vehicle, "topic": address.topic, "instance": address.instance}
-    return {"time": time.time(), **head, "state": state.name, "reason": state.reason, **asdict(health)}
+    return {"time": clock.utc(), **head, "state": state.name, "reason": state.reason, **asdict(health)}
 
 
 def _to_csv(fields: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from nedbus import clock
 from nedbus import pki as certificates
 from nedbus.cli.options import JsonOption, command, require_one
 from nedbus.cli.output.streams import counted, write, write_stderr
@@ -78,7 +79,7 @@ def enroll(
 @command
 def list_(folder: FolderArgument, *, within: WithinOption = RENEW_WITHIN, as_json: JsonOption = False) -> None:
     """List the certificates of a folder and their expiry."""
-    now = dt.datetime.now(dt.UTC)
+    now = clock.now()
     rows: list[dict[str, Any]] = [
         {
             "file": str(entry.path),
@@ -114,7 +115,7 @@ def renew(
 
     The old certificates stay valid until they expire.
     """
-    now = dt.datetime.now(dt.UTC)
+    now = clock.now()
     entries = certificates.list_certificates(folder)
     if unknown := sorted({*(names or ())} - {entry.name for entry in entries}):
         raise PkiError(f"{folder} has no certificate of {unknown[0]!r}: 'nedbus pki list' shows all names")

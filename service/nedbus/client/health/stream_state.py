@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
+from nedbus import clock
 from nedbus.client.sample import Sample
 from nedbus.events import to_age
 from nedbus_msgs import Message, describe_flags
@@ -69,4 +69,4 @@ def health_of_last(sample: Sample[Message]) -> Health:
     """Return the health of a stream with only its last message known; the age is by the wall clock."""
     stream = StreamHealth(sample.topic)
     stream.add(sample.message, received=0, missing=sample.missing)
-    return stream.snapshot(0 if sample.sent is None else max(0, time.time_ns() - sample.sent))
+    return stream.snapshot(0 if sample.sent is None else max(0, clock.utc_ns() - sample.sent))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from nedbus import clock
 from nedbus_msgs import DEFAULT, Address, Message, Provenance, codec_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
@@ -65,7 +65,7 @@ class Batch:
 
 def make_batch(arrivals: Sequence[Arrival], decoder: Decoder, *, lost: int) -> Batch:
     """Decode arrivals of one type into a batch; the decoder counts invalid ones, which are omitted."""
-    received = time.time_ns()
+    received = clock.utc_ns()
     codec = decoder.resolve(arrivals[0][0])  # may wait for a layout lookup
     definition = codec.definition if codec else DEFAULT
     blank = bytes(codec_of(definition).size)  # invalid stand-in for payloads of other layouts, decoded separately below

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
+from nedbus import clock
 from nedbus.client.sample import Sample
 from nedbus.log_event import about
 from nedbus.transport import RawSample
@@ -178,7 +178,7 @@ class Decoder:
         except DecodeError as exc:
             self.reject(stream.key, exc)
             return None
-        return Sample(message, stream.address, time.time_ns(), raw.timestamp, lost, self.provenance(arrival))
+        return Sample(message, stream.address, clock.utc_ns(), raw.timestamp, lost, self.provenance(arrival))
 
     def resolve(self, stream: KeyState) -> Codec[Any] | None:
         """Return the codec of a key, looked up if its message is unknown; None if no publisher describes the message.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from nedbus import clock
 from nedbus.errors import OutputError
 
 _FILE_HEADER: Final = 16  # bytes
@@ -65,7 +65,7 @@ class LogFile:
 
 def _create(folder: Path, vehicle: str) -> tuple[Path, BinaryIO]:
     """Create a file that does not exist yet, and its folder."""
-    name = f"{vehicle}_{datetime.now(UTC):%Y-%m-%d_%H-%M-%S}"
+    name = f"{vehicle}_{clock.now():%Y-%m-%d_%H-%M-%S}"
     path = folder / f"{name}.ulg"
     try:
         folder.mkdir(parents=True, exist_ok=True)
