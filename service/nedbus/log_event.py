@@ -50,7 +50,7 @@ EVENTS: Final[Mapping[str, Event]] = {
     "stale": Event("a live stream received no message for 3 s: it is no longer published"),
     "silent": Event("a vehicle announces a topic, but sends no messages on it while others arrive"),
     "rejected": Event("a message from a source is not published: it cannot be decoded, or violates a rule"),
-    "duplicate": Event("another process publishes the same stream"),
+    "duplicate": Event("another process publishes the same stream, or another MAVLink sender has the same system id"),
     "rebooted": Event("a vehicle rebooted"),
     "log-stream": Event("the ULog stream of a vehicle begins, ends or is refused, or its file is opened or given up"),
     "unsupported": Event("a vehicle does not send a requested message"),

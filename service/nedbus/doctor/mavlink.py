@@ -14,7 +14,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.errors import SourceError
-from nedbus.sources import Link, open_link
+from nedbus.sources import Link, Senders, open_link, why_ignored
 
 from .finding import Finding, limit_findings, list_names
 
@@ -57,7 +57,7 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
     """Listen to a link for `listen` seconds and yield the findings; raise ConfigError for an invalid link."""
     try:
         with closing(open_link(link, baud=_BAUD)) as opened:
-            senders, systems = _listen(opened, listen)
+            senders, systems, faults = _listen(opened, listen)
     except SourceError as exc:
         is_taken = isinstance(exc.__cause__, OSError) and exc.__cause__.errno == errno.EADDRINUSE
         advice = "check address, port or device, and permissions"
@@ -68,10 +68,15 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
     if not senders:
         advice = "check that the vehicle sends to this host and port ('mavlink status' in PX4's shell), and firewalls"
         yield Finding("mavlink", link, "wrong", f"no packet within {listen:g} s", advice)
-    elif not systems:
+    elif not systems and not faults:
         seen = f"{senders.total()} packets from {list_names(sorted(senders))}, none of them MAVLink"
         advice = "check the baud rate, or use a port that no other program sends to"
         yield Finding("mavlink", link, "wrong", seen, advice)
+    yield from limit_findings(
+        Finding("mavlink", f"{link} system {system} component {component}", "wrong", fault)
+        for (system, component), fault in sorted(faults.items())
+        if system not in systems or not why_ignored(system, component)
+    )
     yield from limit_findings(
         _judge_system(f"{link} system {number}", link, system.counts, listen)
         for number, system in sorted(systems.items())
@@ -83,8 +88,13 @@ def check_mavlink(link: str, listen: float) -> Iterator[Finding]:
     )
 
 
-def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System]]:
-    """Count packets by sender, and read what each system sends; ask each PX4 for SDLOG_BACKEND."""
+def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System], dict[tuple[int, int], str]]:
+    """Count packets by sender, and read what each autopilot sends; ask each PX4 for SDLOG_BACKEND.
+
+    The third result has the faults of senders by their ids.
+    """
+    faults: dict[tuple[int, int], str] = {}
+    both = Senders()
     senders: Counter[str] = Counter()
     systems: dict[int, _System] = {}
     end, next_heartbeat = time.monotonic() + seconds, 0.0
@@ -105,13 +115,18 @@ def _listen(link: Link, seconds: float) -> tuple[Counter[str], dict[int, _System
                 parser = _new_parser()
             for message in parser.parse_buffer(data) or []:
                 if not message.get_type().startswith(("BAD_DATA", "UNKNOWN")):  # these have no header
-                    system = systems.setdefault(message.get_srcSystem(), _System())  # 255 at most
+                    ids = message.get_srcSystem(), message.get_srcComponent()
+                    ignored = why_ignored(*ids)
+                    if fault := f"ignored: {ignored}" if ignored else both.add(ids[0], peer, now):
+                        faults[ids] = fault
+                    if ignored:
+                        continue
+                    system = systems.setdefault(ids[0], _System())
                     system.add(message)
                     if message.get_type() == "HEARTBEAT" and system.is_px4 and system.backend is None:
-                        ids = message.get_srcSystem(), message.get_srcComponent()
                         ask = dialect.MAVLink_param_request_read_message(*ids, _BACKEND.encode(), -1)
                         link.send(ask.pack(sender), peer)
-    return senders, systems
+    return senders, systems, faults
 
 
 def _judge_system(name: str, link: str, counts: Counter[str], seconds: float) -> Finding:

@@ -4,10 +4,12 @@ from .account import KEPT_OF_FILE, FileAccount, follow, read_account, times_of
 from .conversion import convert
 from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 from .mavlink.link import Link, open_link, parse_link
+from .mavlink.senders import Senders, why_ignored
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
 
 __all__ = [
     "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Link", "LiveSource", "Rejection", "ReplayRun",
-    "ReplaySource", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "convert", "follow",
-    "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "times_of",
+    "ReplaySource", "Senders", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "convert",
+    "follow", "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "times_of",
+    "why_ignored",
 ]  # fmt: skip

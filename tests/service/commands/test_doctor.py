@@ -514,21 +514,23 @@ def test_damaged_certificates_are_refused(pki: Path) -> None:
                 continue
 
 
-def listen_to(*packets: bytes) -> list[Finding]:
-    """Look at a link while these packets arrive on it."""
+def listen_to(*packets: bytes, senders: int = 1) -> list[Finding]:
+    """Look at a link while these packets arrive on it, from each of the senders."""
     port = free_port()
-    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)) for _ in range(senders)]
 
         def send() -> None:
-            for packet in packets:
-                sender.sendto(packet, ("127.0.0.1", port))
+            for sender in sockets:
+                for packet in packets:
+                    sender.sendto(packet, ("127.0.0.1", port))
 
         with repeating(send):
             return look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{port}", listen=0.5)
 
 
-def packets_of(system: int, *messages: object) -> list[bytes]:
-    encoder = mavlink.MAVLink(None, system, 1)
+def packets_of(system: int, *messages: object, component: int = 1) -> list[bytes]:
+    encoder = mavlink.MAVLink(None, system, component)
     return [each.pack(encoder) for each in messages]  # type: ignore[attr-defined] # pymavlink has no types
 
 
@@ -549,6 +551,13 @@ def test_what_comes_on_a_mavlink_link() -> None:
     findings = listen_to(*packets_of(7, heartbeat, parameter), *packets_of(8, heartbeat, data))
     found(findings, "mavlink", "warning", "system 7: SDLOG_BACKEND is 1")
     found(findings, "mavlink", "warning", "system 8: sends its ULog stream to system 255 component 190")
+    findings = listen_to(*packets_of(7, position, component=0), *packets_of(8, heartbeat, component=100))
+    found(findings, "mavlink", "wrong", "system 7 component 0: ignored: id 0 addresses all")
+    found(findings, "mavlink", "wrong", "system 8 component 100: ignored: not an autopilot")
+    assert not any(each.state == "ok" for each in findings if each.check == "mavlink")
+    findings = listen_to(*packets_of(7, position), *packets_of(7, heartbeat, component=100), senders=2)
+    found(findings, "mavlink", "wrong", r"system 7 component 1: 127.* and 127.* both send as system 7")
+    assert not any("component 100" in each.subject for each in findings)
     with socket.socket(type=socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", free_port()))
         findings = look(free_endpoint(), mavlink=f"udpin:127.0.0.1:{owner.getsockname()[1]}")

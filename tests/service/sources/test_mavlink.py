@@ -262,16 +262,40 @@ def test_hostile_datagrams_are_counted(listener: Listener, port: int) -> None:
 
 
 def test_messages_of_others_are_ignored(listener: Listener, port: int) -> None:
-    """A late datagram is rejected; a camera's position, and one of system 0, are not the vehicle's."""
-    with Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as nobody:
+    """A late datagram is rejected, as are messages of a system or component 0; a camera's position is ignored."""
+    with (
+        Autopilot(port) as vehicle, Autopilot(port, component=100) as camera, Autopilot(port, system=0) as nobody,
+        Autopilot(port, component=0) as unset,
+    ):  # fmt: skip
         vehicle.send(estimator_status(127), local_position(2000, math.nan, *range(5)), local_position(1500))
         camera.send(local_position(3000))
         nobody.send(local_position(3000))
+        unset.send(local_position(3000))
         vehicle.send(local_position(4000))
         first, second = listener.receive(2)
     assert (first.address.vehicle, first.fields["timestamp"], second.fields["timestamp"]) == ("9", 2_000_000, 4_000_000)
     assert (first.fields["xy_valid"], first.fields["v_xy_valid"], second.fields["xy_valid"]) == (False, True, True)
-    assert [each.reason for each in listener.rejections] == ["out of order: 1500 ms since boot, after 2000 ms"]
+    late, *ignored = listener.rejections
+    assert late.reason == "out of order: 1500 ms since boot, after 2000 ms"
+    link = f"udpin:127.0.0.1:{port}"
+    assert [each.where for each in ignored] == [f"{link} system 0 component 1", f"{link} system 9 component 0"]
+    assert all("id 0 addresses all and is no sender's" in each.reason for each in ignored)
+
+
+def test_two_senders_of_one_system_are_named(listener: Listener, port: int, caplog: pytest.LogCaptureFixture) -> None:
+    """Two senders with one system id are logged once, with both addresses; one that reconnects twice is not."""
+    with Autopilot(port) as one, Autopilot(port) as other, Autopilot(port) as third:
+        for ms, sender in enumerate((one, one, other, other, third, third), start=1000):
+            sender.send(local_position(ms))
+            listener.receive()
+        assert not caplog.records
+        for ms in range(2000, 2020):
+            (other if ms % 2 else third).send(local_position(ms))
+            listener.receive()
+        [record] = caplog.records
+        ports = {each._socket.getsockname()[1] for each in (other, third)}
+        assert {int(each) for each in re.findall(r"127\.0\.0\.1:(\d+) ?", record.getMessage())[1:]} == ports
+        assert "both send as system 9, and their messages are mixed" in record.getMessage()
 
 
 def test_broken_tcp_link_is_an_error() -> None:

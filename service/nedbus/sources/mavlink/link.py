@@ -12,13 +12,13 @@ from typing import Any, Final
 
 from nedbus.errors import ConfigError, SourceError
 
+from .senders import Peer
+
 _MAX_DATAGRAMS: Final = 100  # per read
 _MAX_READ: Final = 65535  # bytes
 _CONNECT_TIMEOUT: Final = 3.0  # s
 _LINK: Final = re.compile(r"(udpin|udpout|tcp):(.+):(\d{1,5})|(serial):(/.+)")
 _FORMS: Final = "udpin:0.0.0.0:14550, udpout:HOST:PORT, tcp:HOST:PORT or serial:/dev/ttyACM0"
-
-Peer = Any  # address of the other side, as its socket has it
 
 
 class _UdpLink:

@@ -12,10 +12,10 @@ from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection
 
 from .fields import is_reboot
-from .link import Peer
 from .log_client import Command, LogStreamClient
 from .log_reassembly import Reassembly
-from .reader import AUTOPILOT, Received
+from .reader import Received
+from .senders import AUTOPILOT, Peer
 
 _KINDS: Final = ("LOGGING_DATA_ACKED", "LOGGING_DATA")
 _COMMANDS: Final = {"start": dialect.MAV_CMD_LOGGING_START, "stop": dialect.MAV_CMD_LOGGING_STOP}

@@ -13,11 +13,9 @@ from pymavlink.dialects.v20 import common as dialect
 
 from nedbus.sources.source import Rejection
 
-from .link import Link, Peer
+from .link import Link
 from .log_reassembly import Piece
-
-AUTOPILOT: Final = 1
-"""Component id of an autopilot; cameras, gimbals and ground stations have others."""
+from .senders import Peer, why_ignored
 
 _MAX_BUFFER: Final = 2**16  # bytes kept by the parser of a stream
 _MAX_WAITING: Final = 16_384  # messages read ahead; more are lost, as the sequence numbers of both protocols show
@@ -79,8 +77,11 @@ class LinkReader:
                     continue
                 # If the dialect does not have the message, only its header can be parsed.
                 sequence, system, component = raw[4:7] if raw[0] == dialect.PROTOCOL_MARKER_V2 else raw[2:5]
-                if system and component == AUTOPILOT:
+                reason = why_ignored(system, component)
+                if not reason:
                     yield Received(message, system, sequence, peer, now)
+                elif not ((system and component) or message.get_type().startswith("UNKNOWN")):  # cameras are expected
+                    yield Rejection(f"{self._name} system {system} component {component}", reason)
             if not self._link.stream and self._parser.buf_len():
                 yield Rejection(self._name, f"{self._parser.buf_len()} bytes of a truncated message")
 

@@ -20,10 +20,11 @@ from nedbus.transport import Session
 from nedbus_msgs import DEFAULT_TOPIC, Address
 
 from .fields import CONVERSIONS
-from .link import Link, Peer, open_link, parse_link
+from .link import Link, open_link, parse_link
 from .log_receiver import LogReceiver
 from .log_stream import LogStream
-from .reader import AUTOPILOT, LinkReader, ReadAhead, Received
+from .reader import LinkReader, ReadAhead, Received
+from .senders import AUTOPILOT, Peer, Senders
 from .vehicle import Vehicle
 
 _log = logging.getLogger(__name__)
@@ -73,6 +74,7 @@ class _LinkSession:
         self._sending = threading.Lock()
         self._vehicles: dict[int, Vehicle] = {}
         self._peers: dict[int, Peer] = {}
+        self._senders = Senders()
         self._logs: dict[int, LogStream] = {}
         self._receiver = LogReceiver(options, name, self._send, system=_SYSTEM, component=_COMPONENT)
         reader = LinkReader(link, name=name)
@@ -120,6 +122,8 @@ class _LinkSession:
         if vehicle is None:
             vehicle = self._vehicles[system] = Vehicle(self._name_of(system), self._options)
         self._peers[system] = received.peer
+        if text := self._senders.add(system, received.peer, now):
+            _log.warning("%s: %s", self._name, text, extra=about("duplicate", source=self._name))
         vehicle.track_sequence(received.sequence, now, counted=received.piece.lost if received.piece else 0)
         log = self._log_of(system)
         if log is not None and message.get_type() == "TIMESYNC" and message.tc1:
