@@ -20,7 +20,7 @@ from nedbus.events import ACCOUNT_PARAMETER, Account, AccountReport, report_of
 from nedbus.log_event import about
 from nedbus.settings import Settings, locate_setting
 from nedbus.sources import LiveSource, Source
-from nedbus.transport import UPLINK_POLL, Session, Uplinks, open_client, open_router, read_router_config
+from nedbus.transport import Session, Uplinks, open_client, open_router, read_router_config
 from nedbus_msgs import status_key
 
 from .plan import Planned, is_finite, plan_sources
@@ -177,7 +177,7 @@ class Daemon:
                 self._workers = apply_plan(self._plan, self._workers, partial(self._make_worker, registry))
             self.ready.set()
             self._permission = watch_permission(session, settings, registry)
-            self._wait(registry, None if is_client else Uplinks(session, settings.connect, tls=settings.tls))
+            self._wait(registry, Uplinks(session, settings.connect, is_client=is_client, tls=settings.tls))
         finally:
             self._stop.set()
             stop_workers(self._workers, _GRACE)
@@ -232,9 +232,8 @@ class Daemon:
                 logged = True
         return None
 
-    def _wait(self, registry: PublisherRegistry, uplinks: Uplinks | None) -> None:
+    def _wait(self, registry: PublisherRegistry, uplinks: Uplinks) -> None:
         """Wait for `stop`, or until all finite sources have ended and their messages are acknowledged."""
-        watches = uplinks is not None and bool(self._settings.connect)
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
@@ -243,11 +242,10 @@ class Daemon:
                     self._stop.wait(2 * HEARTBEAT if any(_is_paced(worker.source) for worker in finite) else 0.0)
                     registry.flush(registry.publishers, stop=self._stop)
                     return
-            self._changed.wait(UPLINK_POLL if watches else _POLL)
+            self._changed.wait(_POLL)
             self._changed.clear()
             self.look()
-            if uplinks is not None:
-                uplinks.check()
+            uplinks.check()
 
 
 def _is_paced(source: Source) -> bool:

@@ -18,7 +18,7 @@ from .rmw_zenoh import (
     subscription_token,
 )
 from .router import RouterConfig, open_router, read_router_config, router_endpoints
-from .router_log import UPLINK_POLL, Uplinks, log_refusals
+from .router_log import Uplinks, log_refusals
 from .router_state import RouterState, ask_routers
 from .session import (
     LEASE,
@@ -45,7 +45,7 @@ from .zenoh_ext import (
 
 __all__ = [
     "BRIDGED_ENCODING", "DEFAULT_ENDPOINT", "LEASE", "LONGEST_TOKEN", "MAX_ANSWERS", "NO_HASH", "PX4_TYPES",
-    "UPLINK_POLL", "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
+    "AliveTokens", "Answers", "Attachment", "Heartbeats", "PublisherToken", "RawSample",
     "RetransmitRequest", "RouterConfig", "RouterState", "Session", "SourceInfo", "Tls", "TopicKey", "Uplinks",
     "Verdict", "alive_keys", "ask", "ask_routers", "check_endpoints", "check_pem", "dial_endpoint", "entity_name",
     "follow_heartbeats", "gid_of_token", "heartbeat_key", "heartbeat_payload", "is_forked", "log_refusals",

@@ -1,4 +1,4 @@
-"""Log events of an embedded router: links to other routers that come up or break, and refused clients.
+"""Log events of a service and its router: links to other routers that come up or break, and refused clients.
 
 Zenoh does not report links, and writes refusals only to its own log, on stdout.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -18,13 +19,11 @@ import zenoh
 
 from nedbus.log_event import about
 
+from .endpoints import split_endpoint
 from .session import Session
 from .tls import Tls
 
 _log = logging.getLogger(__name__)
-
-UPLINK_POLL: Final = 1.0
-"""Seconds between checks of the links."""
 
 _LINK_TIMEOUT: Final = 3.0  # s until a link that does not come up is logged
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
@@ -41,38 +40,53 @@ _REASONS: Final = {  # by substring of Zenoh's text
 
 
 class Uplinks:
-    """Log when the links to other routers come up, fail to come up, or are lost; call `check` every second."""
+    """Log when links to routers come up, do not come up, are lost, and are back; call `check` every second.
+
+    A router keeps a link to each endpoint; a client, whose session is open, one link to any of them.
+    """
 
     def __init__(
         self,
         session: Session,
         endpoints: Sequence[str],
         *,
+        is_client: bool = False,
         tls: Tls | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._session = session
-        self._tls = tls
-        self._now = now
-        self._due = now() + _LINK_TIMEOUT
-        self._is_up: dict[str, bool | None] = dict.fromkeys(endpoints)  # last logged state; None before the first
+        self._session, self._tls, self._now = session, tls, now
+        self._is_client = is_client
+        names = [" or ".join(endpoints)] if is_client else endpoints
+        # The last logged state of each link, None before the first, and since when [s].
+        self._states: dict[str, tuple[bool | None, float]] = dict.fromkeys(names, (is_client or None, now()))
 
     def check(self) -> None:
         """Compare the expected links with the open ones."""
         # The destination of an open link is the dialled endpoint, but its host name may have been resolved.
-        dialled = {_protocol_and_port(link.dst) for link in self._session.info.links()}
-        for endpoint, was_up in self._is_up.items():
-            is_up = _protocol_and_port(endpoint) in dialled
-            if is_up == was_up or (not is_up and was_up is None and self._now() < self._due):
+        dialled = [link.dst for link in self._session.info.links()]
+        for name, (was_up, since) in self._states.items():
+            is_up, lasted = bool(dialled) if self._is_client else self._is_linked(name, dialled), self._now() - since
+            if is_up == was_up or (not is_up and was_up is None and lasted < _LINK_TIMEOUT):
                 continue
-            self._is_up[endpoint] = is_up
+            self._states[name] = is_up, since if was_up is None else self._now()
             if is_up:
-                _log.info("joined %s", endpoint, extra=about("link-back"))
+                text = f"joined {name}" if was_up is None else f"the link to {name} is up, after {lasted:.0f} s"
+                _log.info("%s", text, extra=about("link-back"))
             elif was_up:
-                _log.warning("the link to %s is lost: still trying", endpoint, extra=about("link-broken"))
+                _log.warning("the link to %s is lost: still trying", name, extra=about("link-broken"))
             else:
-                reason = self._explain(endpoint)
-                _log.warning("no link to %s%s: still trying", endpoint, reason, extra=about("link-broken"))
+                _log.warning("no link to %s%s: still trying", name, self._explain(name), extra=about("link-broken"))
+
+    def _is_linked(self, endpoint: str, dialled: Sequence[str]) -> bool:
+        """Return whether one of these is the endpoint; hosts only matter if several endpoints have its port."""
+        protocol, host, port = split_endpoint(endpoint) or (endpoint, "", 0)
+        hosts = {each[1] for each in map(split_endpoint, dialled) if each and each[::2] == (protocol, port)}
+        if not hosts or sum(each[::2] == (protocol, port) for each in map(split_endpoint, self._states) if each) == 1:
+            return bool(hosts) or endpoint in dialled  # a Unix socket has no host
+        try:
+            return not hosts.isdisjoint([host, *(str(each[4][0]) for each in socket.getaddrinfo(host, None))])
+        except OSError:
+            return True  # the name cannot be resolved now, which says nothing about an open link
 
     def _explain(self, endpoint: str) -> str:
         if not endpoint.startswith(("tls/", "quic/")):
@@ -81,11 +95,6 @@ class Uplinks:
             return " (no certificates are given for it: set tls_ca, tls_certificate and tls_key)"
         explanation = self._tls.explain()
         return f" ({explanation})" if explanation else ""
-
-
-def _protocol_and_port(locator: str) -> tuple[str, str]:
-    address = locator.partition("?")[0].partition("#")[0]
-    return address.partition("/")[0], address.rpartition(":")[2]
 
 
 def log_refusals() -> None:

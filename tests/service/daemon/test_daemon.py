@@ -18,7 +18,7 @@ import pytest
 import zenoh
 
 import nedbus
-from nedbus.transport import Session, Uplinks, open_router
+from nedbus.transport import Session, Uplinks, open_client, open_router
 from nedbus_msgs import Provenance, VehicleLocalPosition
 from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.flights.messages import VLP, message
@@ -298,7 +298,10 @@ def test_links_to_other_routers_are_said(caplog: pytest.LogCaptureFixture) -> No
     """A router that joins another says when the link is up, that it does not come up, and that it is lost."""
     far, now = free_endpoint(), 0.0
     caplog.set_level("INFO", "nedbus")
-    said = [f"no link to {far}: still trying", f"joined {far}", f"the link to {far} is lost: still trying"]
+    said = [
+        f"no link to {far}: still trying", f"the link to {far} is up, after 3 s",
+        f"the link to {far} is lost: still trying", f"the link to {far} is up, after 12 s",
+    ]  # fmt: skip
     session = open_router(listen=(free_endpoint(),), connect=(far,))
     uplinks = Uplinks(session, (far,), now=lambda: now)
 
@@ -313,7 +316,53 @@ def test_links_to_other_routers_are_said(caplog: pytest.LogCaptureFixture) -> No
     wait_for(lambda: has_said(2), what="the link")
     other.close()
     wait_for(lambda: has_said(3), what="the loss")
+    now += 12.0
+    other = open_router(listen=(far,))
+    wait_for(lambda: has_said(4), what="the link to come back")
+    other.close()
     session.close()
+
+
+def test_link_of_a_client_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """A client logs once that its link is lost, and that it is up again, with its endpoints and the duration."""
+    here, other, now = free_endpoint(), free_endpoint(), 0.0
+    caplog.set_level("INFO", "nedbus")
+    router = open_router(listen=(here,))
+    with open_client([here, other], timeout=DEADLINE) as session:
+        uplinks = Uplinks(session, (here, other), is_client=True, now=lambda: now)
+
+        def has_logged(*lines: str) -> bool:
+            uplinks.check()
+            return caplog.messages == [f"the link to {here} or {other} is {line}" for line in lines]
+
+        assert has_logged()
+        router.close()
+        wait_for(lambda: has_logged("lost: still trying"), what="the loss")
+        now = 12.0
+        router = open_router(listen=(here,))
+        wait_for(lambda: has_logged("lost: still trying", "up, after 12 s"), what="the link to come back")
+    router.close()
+
+
+def test_dead_router_on_a_shared_port_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    """Of two routers on one port number, the one that does not answer is reported, also by its host name."""
+    port, now = free_endpoint().rpartition(":")[2], 0.0
+    live, dead, named = (f"tcp/{host}:{port}" for host in ("127.0.0.1", "127.0.0.2", "localhost"))
+    router = open_router(listen=(live,))
+    session = open_router(listen=(free_endpoint(),), connect=(live, dead))
+    uplinks = Uplinks(session, (live, dead, named), now=lambda: now)
+
+    def has_joined() -> bool:
+        uplinks.check()
+        return caplog.messages == [f"joined {live}", f"joined {named}"]
+
+    caplog.set_level("INFO", "nedbus")
+    wait_for(has_joined, what="the link")
+    now = 3.0
+    uplinks.check()
+    assert caplog.messages[2:] == [f"no link to {dead}: still trying"]
+    session.close()
+    router.close()
 
 
 def test_taken_port_is_a_clear_error(run_nedbus: Start, endpoint: str) -> None:

@@ -23,7 +23,7 @@ from nedbus.log_event import about
 from nedbus.monitoring import service_pages
 from nedbus.settings import load_settings
 from nedbus.sources import SOURCE_KINDS
-from nedbus.transport import DEFAULT_ENDPOINT, UPLINK_POLL, Uplinks, log_refusals, open_router, router_endpoints
+from nedbus.transport import DEFAULT_ENDPOINT, Uplinks, log_refusals, open_router, router_endpoints
 
 from .bridges import serve_pages
 from .doctor import report_mistakes
@@ -130,7 +130,7 @@ def router(
         joining = f", joining {', '.join(routers)}" if routers else ""
         _log.info("router on %s%s", ", ".join(where), joining, extra=about("router"))
         uplinks = Uplinks(session, routers, tls=tls)
-        while not stop.wait(UPLINK_POLL if routers else None):
+        while not stop.wait(1.0 if routers else None):
             uplinks.check()
         session.close()
 
