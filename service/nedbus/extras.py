@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, Final
@@ -18,8 +17,6 @@ def needs(extra: str, module: str) -> Any:
 
     Raises ConfigError, with the package to install, if a dependency of the module is missing.
     """
-    collects = gc.isenabled()
-    gc.disable()  # as in the command line: imports make no garbage
     try:
         return import_module(module)
     except ModuleNotFoundError as exc:
@@ -27,9 +24,6 @@ def needs(extra: str, module: str) -> Any:
         # Never install by name alone: on PyPI the name belongs to another project.
         hint = f"in a clone of nedbus, pip install '.[{extra}]'" if extra in EXTRAS else f"pip install {extra}"
         raise ConfigError(missing, f"not installed: {hint}") from exc
-    finally:
-        if collects:
-            gc.enable()
 
 
 def lazy_exports(package: str, modules: Mapping[str, tuple[str, str]]) -> Callable[[str], object]:

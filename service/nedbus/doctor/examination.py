@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,6 +12,7 @@ from typing import Final
 
 from nedbus.errors import NedbusError
 from nedbus.extras import needs
+from nedbus.log_event import about
 from nedbus.settings import Settings
 from nedbus.sources import parse_link
 from nedbus.transport import Tls, open_client, probe_writes
@@ -20,6 +22,8 @@ from .finding import Finding, limit_findings, sort_findings
 from .network_checks import NETWORK_CHECKS
 from .observation import Observation
 from .prober import check_endpoint, check_tls_files
+
+_log = logging.getLogger(__name__)
 
 Check = Callable[[], Iterable[Finding]]
 _LISTEN: Final = 3.0  # s
@@ -100,6 +104,10 @@ def _run_together(checks: Mapping[tuple[str, str], Check], seconds: float) -> li
             found[name] = list(check())
         except (NedbusError, OSError) as exc:
             found[name] = [Finding(*name, "wrong", f"check failed: {exc}")]
+        except BaseException as exc:  # noqa: BLE001 - includes Zenoh's panics
+            _log.exception("unexpected error in a check", extra=about("bug"))
+            seen = f"check failed: unexpected {type(exc).__name__}: {exc}"
+            found[name] = [Finding(*name, "unknown", seen, "a bug in nedbus: report it with the traceback above")]
 
     threads = [
         threading.Thread(target=run, args=each, name=f"nedbus-{each[0][0]}", daemon=True) for each in checks.items()

@@ -5,6 +5,7 @@ Zenoh does not report links, and writes refusals only to its own log, on stdout.
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import re
@@ -26,6 +27,7 @@ from .tls import Tls
 _log = logging.getLogger(__name__)
 
 _LINK_TIMEOUT: Final = 3.0  # s until a link that does not come up is logged
+_EXIT_TIMEOUT: Final = 1.0  # s; a child process may keep the pipe open
 _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 _REFUSED: Final = re.compile(r"WARN .*\bzenoh_link_tls::unicast: (.*)\. Hint: ")  # of a listener; all have a hint
 _REASONS: Final = {  # by substring of Zenoh's text
@@ -107,7 +109,15 @@ def log_refusals() -> None:
     os.dup2(write, 1)
     os.close(write)
     zenoh.init_log_from_env_or("zenoh_link_tls=warn")
-    threading.Thread(target=_filter, args=(read, stdout), name="nedbus-refusals", daemon=True).start()
+    reader = threading.Thread(target=_filter, args=(read, stdout), name="nedbus-refusals", daemon=True)
+    reader.start()
+    atexit.register(_end_pipe, stdout, reader)
+
+
+def _end_pipe(stdout: int, reader: threading.Thread) -> None:
+    """Close the pipe at the exit of the process, and wait until its last lines are passed on."""
+    os.dup2(stdout, 1)
+    reader.join(_EXIT_TIMEOUT)
 
 
 def _filter(read: int, stdout: int) -> None:

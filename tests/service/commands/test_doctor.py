@@ -110,6 +110,18 @@ def test_nothing_listens(endpoint: str) -> None:
     found(findings, "endpoint", "ok", "a Zenoh router answers")
 
 
+def test_check_that_raises(endpoint: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """An unexpected error of a check is its finding, with the error; it is not taken for a slow network."""
+
+    def fail(*_: object) -> list[Finding]:
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setattr("nedbus.doctor.examination.check_endpoint", fail)
+    failed = found(look(endpoint), "endpoint", "unknown", "check failed: unexpected ZeroDivisionError: by nothing")
+    assert "a bug in nedbus" in failed.advice
+    assert "Traceback" in caplog.text
+
+
 def test_what_is_no_router(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another server is told from a router and from TLS; one that never answers does not hold up the doctor."""
     for name in ("_OPEN_TIMEOUT", "_HANDSHAKE_TIMEOUT"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import pytest
 
 from nedbus.errors import ConfigError
@@ -17,3 +19,19 @@ def test_missing_package_is_named_with_its_cure(extra: str, command: str) -> Non
     with pytest.raises(ConfigError) as caught:
         needs(extra, "gone")
     assert str(caught.value) == f"gone: not installed: {command}"
+
+
+def test_import_leaves_garbage_collection_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that turns garbage collection off while a module is imported, in another thread, finds it off."""
+    seen = list[bool]()
+
+    def import_slowly(_: str) -> None:
+        seen.append(gc.isenabled())
+        gc.disable()
+
+    monkeypatch.setattr("nedbus.extras.import_module", import_slowly)
+    try:
+        needs("web", "slow")
+        assert (seen, gc.isenabled()) == ([True], False)
+    finally:
+        gc.enable()

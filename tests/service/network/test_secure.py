@@ -312,6 +312,20 @@ def test_refused_clients_are_logged(
     assert "certificate" not in router.out
 
 
+def test_last_lines_of_a_process_that_logs_refusals(start: Start) -> None:
+    """Lines printed just before the end of a process pass through the pipe of Zenoh's log, whole and in order."""
+    code = """
+from nedbus.transport import log_refusals
+log_refusals()
+for number in range(2000):
+    print(number, flush=True)
+print("the end", end="")
+"""
+    process = start("-c", code, measured=False)
+    assert process.wait() == 0
+    assert process.out.split("\n") == [*map(str, range(2000)), "the end"]
+
+
 def test_thinned_stream_flows_as_the_stream_does(
     join: Join, open_as: Open, clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
