@@ -28,8 +28,9 @@ hypothesis.settings.load_profile("nedbus")
 
 
 def pytest_configure() -> None:
-    """Make Ctrl-C work: a shell's background job ignores it, and so would every process that the tests start."""
+    """Make signals work that a background job of a shell, or nohup, ignores: processes of tests would inherit that."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

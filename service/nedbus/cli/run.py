@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from types import FrameType
 from typing import Final
 
@@ -19,10 +20,7 @@ from nedbus.log_event import about
 _log = logging.getLogger("nedbus")
 
 _END_TIMEOUT: Final = 1.6  # s between a signal and a forced exit
-
-
-def _ignore_hangup() -> None:
-    _log.info("SIGHUP ignored: stop this process with SIGTERM or Ctrl-C", extra=about("reload"))
+_HANGUP_PAUSE: Final = 0.2  # s; some shells pass the signal on before their terminal is gone
 
 
 def run_until_stopped(
@@ -30,12 +28,13 @@ def run_until_stopped(
     *,
     on_stop: Callable[[], object] = lambda: None,
     on_tick: Callable[[], object] = lambda: None,
-    on_hangup: Callable[[], object] = _ignore_hangup,
+    on_hangup: Callable[[], object] | None = None,
 ) -> None:
-    """Run `body` in a thread until it returns; Ctrl-C or SIGTERM set its stop event.
+    """Run `body` in a thread until it returns; Ctrl-C, SIGTERM or SIGHUP set its stop event.
 
-    `on_stop` is called from the signal handler, `on_tick` ten times a second and `on_hangup` after SIGHUP from the main
-    thread. The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
+    `on_stop` is called from the signal handler, `on_tick` ten times a second from the main thread, and `on_hangup`
+    after a SIGHUP that does not come from a closed terminal, in place of the end. `nohup` keeps SIGHUP ignored.
+    The main thread does nothing else, and so handles signals at once, even while Zenoh blocks.
 
     Raises typer.Exit with 130 after Ctrl-C, with 1 if the body returned False.
     """
@@ -59,13 +58,21 @@ def run_until_stopped(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, on_signal)
-    signal.signal(signal.SIGHUP, lambda number, _: hangups.append(number))
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda number, _: hangups.append(number))
+    on_terminal = _has_terminal()
     thread = threading.Thread(target=run, name="nedbus-run", daemon=True)
     thread.start()
     while thread.is_alive() and not signals:
         if hangups:
             hangups.clear()
-            on_hangup()
+            thread.join(_HANGUP_PAUSE)
+            if signals:
+                break
+            if on_hangup is not None and _has_terminal() == on_terminal:
+                on_hangup()
+            else:
+                on_signal(signal.SIGHUP, None)
         on_tick()
         thread.join(0.1)
     if signals:
@@ -83,3 +90,11 @@ def run_until_stopped(
         raise typer.Exit(130)
     if not succeeded:
         raise typer.Exit(1)
+
+
+def _has_terminal() -> bool:
+    """Return whether this process has a controlling terminal."""
+    with suppress(OSError):
+        os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
+        return True
+    return False

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -141,7 +140,6 @@ class Terminal:
     def __init__(self, zygote: Zygote, *arguments: str, **environment: str) -> None:
         self._main, terminal = pty.openpty()
         self._output = bytearray()
-        self._stopping = threading.Event()
         environment = {"COLUMNS": "80", "LINES": "24", "TERM": "xterm"} | environment
         self.popen = fork_command(zygote, *arguments, out=terminal, err=terminal, **environment)
         os.close(terminal)
@@ -165,17 +163,10 @@ class Terminal:
         self._reader.join(DEADLINE)
         return exit_code
 
-    def hang_up(self) -> None:
-        """Close the terminal, as `sshd` does when a connection breaks."""
-        self._stopping.set()
-        self._reader.join(DEADLINE)
-        self.popen.send_signal(signal.SIGHUP)
-
     def _read(self) -> None:
         with suppress(OSError):  # the other side is closed
-            while not self._stopping.is_set():
-                if select.select([self._main], [], [], 0.1)[0]:
-                    self._output.extend(os.read(self._main, 4096))
+            while data := os.read(self._main, 4096):
+                self._output.extend(data)
         os.close(self._main)
 
 
@@ -464,31 +455,63 @@ def test_second_signal_ends_at_once(start: Start, number: signal.Signals, exit_c
     assert stuck.wait() == exit_code
 
 
-def test_hangup_ends_no_router(run_nedbus: Start) -> None:
-    """SIGHUP, which a closed terminal sends, ends nothing; what ends a service is logged, with the date."""
+def test_hangup_ends_a_router(run_nedbus: Start) -> None:
+    """SIGHUP ends a command that has nothing to reload; the signal is logged, with the date."""
     where = free_endpoint()
     router = run_nedbus("router", "-l", where)
     wait_for(lambda: f"router on {where}" in router.err, what="the router")
     router.signal(signal.SIGHUP)
-    wait_for(lambda: "SIGHUP ignored" in router.err, what="the hang-up")
-    router.signal(signal.SIGTERM)
     assert router.wait() == 0
     last = router.err.splitlines()[-1]
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    stopping on SIGTERM", last)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d INFO    stopping on SIGHUP", last)
+
+
+ON_TERMINAL = (
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+)
+
+
+@contextmanager
+def owning_terminal(log: Path, *command: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
+    """Run `nedbus` as the first process of a terminal; yield it and the other side of the terminal."""
+    main, terminal = pty.openpty()
+    python = (sys.executable, "-c", ON_TERMINAL, sys.executable, "-m", "nedbus", *command)
+    with log.open("wb") as err, subprocess.Popen(
+        python, stdin=terminal, stdout=terminal, stderr=err, start_new_session=True, env=unmeasured()
+    ) as process:  # fmt: skip
+        os.close(terminal)
+        yield process, main
+        process.kill()
 
 
 @pytest.mark.process
-def test_closed_terminal_ends_no_service(on_terminal: OnTerminal, bus: nedbus.Bus, endpoint: str) -> None:
-    """A service whose terminal is gone publishes on, and ends as any other."""
-    with on_terminal("serve", "-c", endpoint, "-s", "sim:") as terminal:
-        wait_for(bus.latest, what="data")
-        terminal.hang_up()
-        with bus.subscribe(mode="every") as subscription:
-            for _ in range(50):
-                subscription.receive(DEADLINE)
-        assert terminal.popen.poll() is None
-        terminal.popen.send_signal(signal.SIGTERM)
-        assert terminal.wait() == 0
+@pytest.mark.parametrize("command", ["serve -s sim:", "record -o flight.mcap", "web --http 127.0.0.1:PORT"])
+def test_closed_terminal_ends_commands(bus: nedbus.Bus, endpoint: str, tmp_path: Path, command: str) -> None:
+    """A closed terminal ends a service, a recording and a page, as Ctrl-C does; none runs on unseen."""
+    log, arguments = tmp_path / "log", command.replace("PORT", str(free_port())).split()
+    with flying(bus, "9"), owning_terminal(log, *arguments, "-c", endpoint) as (process, main):
+        begun = {
+            "serve": lambda: "1" in bus.vehicles(),
+            "record": lambda: Path("flight.mcap").exists() and Path("flight.mcap").stat().st_size > 1000,
+            "web": lambda: "open http" in log.read_text(),
+        }
+        wait_for(begun[arguments[0]], what="the command")
+        os.close(main)
+        assert process.wait(DEADLINE) == 0
+    assert "stopping on SIGHUP" in log.read_text()
+
+
+@pytest.mark.process
+def test_hangup_on_an_open_terminal_reloads(endpoint: str, tmp_path: Path) -> None:
+    """A SIGHUP from `kill` makes a service reload, on an open terminal too."""
+    log = tmp_path / "log"
+    with owning_terminal(log, "serve", "-s", "sim:", "-c", endpoint) as (process, main):
+        wait_for(lambda: "sim:" in log.read_text(), what="the source")
+        process.send_signal(signal.SIGHUP)
+        wait_for(lambda: "settings reloaded: 0 started, 0 stopped, 1 unchanged" in log.read_text(), what="the reload")
+        process.terminate()
+        assert process.wait(DEADLINE) == 0
+        os.close(main)
 
 
 @pytest.mark.slow

@@ -59,7 +59,7 @@ def serve(
     """Run a service: publish validated messages from sources.
 
     The service runs its own router unless it joins one (--connect). SIGHUP reloads the settings: it starts new sources,
-    stops removed ones, and leaves all others running.
+    stops removed ones, and leaves all others running. Closing the terminal of a service stops it.
     """
     given = {name: value for name, value in locals().items() if name not in {"config", "check"}}
     if check:
