@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from contextlib import suppress
 
 import pytest
 from pydantic import ValidationError
@@ -121,5 +123,41 @@ def test_unknown_value_is_one_as_it_is_sent_too() -> None:
 def test_messages_within_messages_are_bounded() -> None:
     """A text of some lines that stands for a million fields is refused."""
     text = f"uint64 timestamp\nA[999] a{WITHIN}A\nB[999] b{WITHIN}B\nuint8 c\n"
-    with pytest.raises(MsgError, match="more than the 256"):
+    with pytest.raises(MsgError, match="more than 1000 fields"):
         define_msg("Large", text)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "float32 angle 1.5", "float32 angle -.5e3 # the default", "float32[2] angle [1, 2]", "bool angle true",
+        'string FRAME="map"\nfloat32 angle', "string A = 'a # b'\nfloat32 angle", "float32 angle # \f form feed",
+        "float32 angle # \u2028 line separator", "float32 angle # \x85 next line", "float32 angle\r\n",
+    ],
+)  # fmt: skip
+def test_text_of_ros2_is_accepted(line: str) -> None:
+    """Defaults, constants of strings, a byte order mark, and separators of lines in Unicode, which end no line."""
+    fields = read_msg(f"\ufeffuint64 timestamp\n{line}\nuint8 mode\n")
+    assert [field.name for field in fields] == ["timestamp", "angle", "mode"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "".join(f"uint8 f{number}\n" for number in range(19_000)),
+        "uint8 a # @range" + " " * 200_000,
+        "uint8 a # @range " + "9" * 200_000,
+        f"A[999] a{WITHIN}A\nuint8 b #" + "@range " * 30_000,
+        f"A[999] a{WITHIN}A\nB[999] b{WITHIN}B\n" + "".join(f"C[0] c{i}\n" for i in range(9000)) + f"{WITHIN}C\nbool d",
+        "A[999] " + "a" * 200_000 + f"{WITHIN}A\nuint8 b",
+    ],
+    ids=["fields", "spaces", "digits", "comment", "empty arrays", "long name"],
+)
+def test_parsing_takes_linear_time(text: str) -> None:
+    """No text of 200,000 characters takes more than a fraction of a second, whatever it stands for."""
+    begin = time.process_time()
+    with suppress(MsgError):
+        define_msg("Long", f"uint64 timestamp\n{text}")
+    with suppress(MsgError):
+        hash_of_msg("Long", f"uint64 timestamp\n{text}")
+    assert time.process_time() - begin < 10

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import islice
@@ -17,13 +17,21 @@ from nedbus_msgs.undeclared import define
 
 from .types import ARRAY, NESTED, PACKAGE, Described, described, type_hash
 
-_FIELD = re.compile(r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]+)\s*(?:=\s*(?P<value>[^#]*))?(?P<comment>#.*)?")
-_NUMBER: Final = r"[-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|inf)"
-_RANGE = re.compile(rf"@range\s+({_NUMBER})?\s*,\s*({_NUMBER})?")
-_INVALID = re.compile(rf"@invalid\s+({_NUMBER})")
-_MOST: Final = 1000  # fields read from a file; a message has fewer
+_FIELD = re.compile(
+    r"(?P<type>[^\s#=]+)\s+(?P<name>[^\s#=]{1,255})\s*"
+    r"(?:=\s*(?P<value>[^#]*)|(?:[-+.\d\[\"']|true\b|True\b|false\b|False\b)[^#]*)?(?P<comment>#.*)?"
+)
+"""A field, with a default value or not, or a constant."""
+_LINE_END = re.compile(r"\r\n?|\n")  # not U+2028 or a form feed, which a comment may have
+_STRINGS: Final = ("string", "wstring")  # of constants
+# Possessive: a comment may have 200,000 spaces or digits.
+_NUMBER: Final = r"[-+]?(?:\d++\.?\d*+(?:[eE][-+]?\d++)?|inf)"
+_RANGE = re.compile(rf"@range\s++({_NUMBER})?\s*+,\s*+({_NUMBER})?")
+_INVALID = re.compile(rf"@invalid\s++({_NUMBER})")
+_MOST: Final = 1000  # fields of a file, nested ones included; a message has fewer
 _NESTED: Final = 3  # levels of nested messages; PX4 has one
 _LONGEST: Final = 2**18  # characters per file; PX4's longest has 20,000
+_COMMENT: Final = 2000  # characters of a comment that are kept
 
 
 class MsgError(ValueError):
@@ -51,7 +59,10 @@ def read_msg(text: str) -> list[MsgField]:
     Nested messages follow it as in ROS 2 and MCAP, each after a line of = and a line `MSG: package/Name`. Their fields
     are flattened into the message: `current_lat`, `esc_0_esc_rpm`.
     """
-    return list(islice(_flatten(_parts(text), "", "", 0), _MOST))
+    fields = list(islice(_flatten(_parts(text), "", "", 0), _MOST + 1))
+    if len(fields) > _MOST:
+        raise MsgError(1, 1, f"more than {_MOST} fields, including those of nested messages")
+    return fields
 
 
 @lru_cache(256)  # its codecs are kept with it
@@ -72,14 +83,14 @@ def define_msg(name: str, text: str) -> Definition[Message]:
 def hash_of_msg(name: str, text: str) -> str:
     """Return the RIHS01 hash of the px4_msgs type in a .msg file, including nested messages."""
     parts = _parts(text)
-    described = {part: [_describe(line, parts) for line in lines] for part, lines in parts.items()}
-    used = sorted({line.base for lines in parts.values() for line in lines} & parts.keys())
+    described = {part: [_describe(line, parts) for line in lines.values()] for part, lines in parts.items()}
+    used = sorted({line.base for lines in parts.values() for line in lines.values()} & parts.keys())
     return type_hash(*((f"{PACKAGE}/{each or name}", described[each]) for each in ["", *used]))
 
 
 def bases_of_msg(text: str) -> set[str]:
     """Return the names of all field types in a .msg file, both base types and nested messages."""
-    return {line.base for lines in _parts(text).values() for line in lines}
+    return {line.base for lines in _parts(text).values() for line in lines.values()}
 
 
 class _Line(NamedTuple):
@@ -93,34 +104,37 @@ class _Line(NamedTuple):
     comment: str
 
 
-def _parts(text: str) -> dict[str, list[_Line]]:
-    """Return the fields of the message under "", and those of nested messages under their names."""
+_Parts = Mapping[str, Mapping[str, _Line]]
+
+
+def _parts(text: str) -> _Parts:
+    """Return the fields of the message by name under "", and those of nested messages under their names."""
     if len(text) > _LONGEST:
         raise MsgError(1, 1, f"{len(text)} characters, more than the limit of {_LONGEST}")
-    parts: dict[str, list[_Line]] = {"": []}
-    current = parts[""]
-    for number, line in enumerate(text.splitlines(), 1):
+    current: dict[str, _Line] = {}
+    parts = {"": current}
+    for number, line in enumerate(_LINE_END.split(text.removeprefix("\ufeff")), 1):
         start = len(line) - len(line.lstrip())
         if line.startswith("MSG: "):
-            current = parts.setdefault(line.rpartition("/")[2].strip(), [])
+            current = parts.setdefault(line.rpartition("/")[2].strip(), {})
         elif line.strip() and line[start] != "#" and not line.startswith("==="):
             found = _FIELD.fullmatch(line.strip())
             if found is None:
                 raise MsgError(number, start + 1, "expected a field, such as 'float32[4] q', or a constant")
             base, bracket, length = found["type"].rpartition("/")[2].partition("[")
-            column, comment = start + 1 + found.start("name"), (found["comment"] or "").lstrip("# ").strip()
-            if any(each.name == found["name"] for each in current):
-                raise MsgError(number, column, f"a second field {found['name']!r}")
+            name, comment = found["name"], (found["comment"] or "").lstrip("# ")[:_COMMENT].strip()
+            if name in current:
+                raise MsgError(number, start + 1 + found.start("name"), f"a second field {name!r}")
             if found["value"] is None:
-                current.append(_Line(number, start + 1, base, bracket + length, found["name"], comment))
-            elif base not in BASES and base not in ALIASES:
+                current[name] = _Line(number, start + 1, base, bracket + length, name, comment)
+            elif base not in BASES and base not in ALIASES and base not in _STRINGS:
                 raise MsgError(number, start + 1, f"a constant of type {base!r}")
     return parts
 
 
-def _flatten(parts: Mapping[str, Sequence[_Line]], message: str, prefix: str, level: int) -> Iterator[MsgField]:
-    for line in parts[message]:
-        count = re.fullmatch(r"\[(\d{1,3})\]", line.length)
+def _flatten(parts: _Parts, message: str, prefix: str, level: int) -> Iterator[MsgField]:
+    for line in parts[message].values():
+        count = re.fullmatch(r"\[([1-9]\d{0,2})\]", line.length)
         if parts.get(line.base) and level < _NESTED and (count or not line.length):
             for index in range(int(count[1])) if count else [None]:
                 yield from _flatten(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
@@ -95,21 +95,32 @@ class SourceOutput:
 
         Raises AddressInUseError if another source of this service publishes one of them.
         """
-        own = set(self.addresses)
-        for address in run.addresses:
-            if address not in own and self._registry.is_published(address):
+        new = run.addresses.keys() - set(self.addresses)
+        for address in new:
+            if self._registry.is_published(address):
                 raise AddressInUseError(address)
+        alive = self._registry.alive(new)
         for address, definition in run.addresses.items():
-            self.claim(address, definition, lossless=lossless)
+            self.claim(address, definition, lossless=lossless, alive=alive)
 
-    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
-        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one."""
+    def claim(
+        self,
+        address: Address,
+        definition: Definition[Any] | None = None,
+        *,
+        lossless: bool = False,
+        alive: Collection[Address] | None = None,
+    ) -> None:
+        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one.
+
+        `alive`: the addresses that were published before, if the caller has asked.
+        """
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             return
-        if self._registry.is_alive(address):
+        if address in (self._registry.alive([address]) if alive is None else alive):
             text = f"{address} is also published by another process: readers receive both"
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)

@@ -78,7 +78,8 @@ class McapSource:
         try:
             fields = decode_with(definition, recorded.payload, recorded.stream.layout)
         except DecodeError as exc:
-            return SourceMessage(due, address, {}, error=f"message {number} of the recording: {exc}")
+            error = f"message {number} of the recording: {exc}"
+            return SourceMessage(due, address, {}, error=error, definition=definition)
         for name in recorded.stream.missing & definition.all_fields:
             fields.pop(name, None)
         source = _INPUT if recorded.stream.is_input else None

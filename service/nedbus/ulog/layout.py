@@ -17,11 +17,12 @@ BASIC_TYPES: Final[Mapping[str, FieldType]] = {
     },
 }
 """The types that ULog defines, by their names in C."""
-FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w+);", re.ASCII)
+FIELD: Final = re.compile(r"(\w+)(?:\[(\d{1,9})\])? (\w{1,255});", re.ASCII)
 """One field of a format."""
 
 _MAX_FORMATS: Final = 2**20  # characters of all formats; a real log has 50,000
-_MAX_LAYOUTS: Final = 1000  # a real log has 170
+_MAX_LAYOUTS: Final = 500  # a real log has 100, and PX4 300 topics
+_MAX_ALL_FIELDS: Final = 8192  # of all messages, also of those refused: 45 us each; a real log has 1,500
 _MAX_FIELDS: Final = 1000  # of one message, nested ones and padding included; a real one has 100
 _MAX_SIZE: Final = 65_533  # bytes of one message: the size of a record is a uint16, and two bytes are the message id
 _MAX_NESTING: Final = 3  # levels of nested messages; PX4 has one
@@ -74,6 +75,7 @@ class Formats:
         self._texts: dict[str, str] = {}
         self._layouts: dict[str, PayloadLayout] = {}
         self._free = _MAX_FORMATS
+        self._left = _MAX_ALL_FIELDS
 
     def add(self, name: str, text: str) -> None:
         """Store the format of a message; raise ValueError if it contradicts an earlier one, or there are too many."""
@@ -89,7 +91,7 @@ class Formats:
         """Return the layout of a message; raise ValueError if its format is unknown, invalid or too large."""
         if name not in self._layouts:
             if len(self._layouts) == _MAX_LAYOUTS:
-                raise ValueError(f"more than {_MAX_LAYOUTS} messages")
+                raise ValueError(f"the log has more than {_MAX_LAYOUTS} messages")
             self._layouts[name] = self._resolve(name)
         return self._layouts[name]
 
@@ -98,6 +100,9 @@ class Formats:
         offset = size = 0
         for number, (field, base, length) in enumerate(self._expand(name), 1):
             start, offset = offset, offset + base.size * (length or 1)
+            self._left -= 1
+            if self._left < 0:
+                raise ValueError(f"the messages of the log have more than {_MAX_ALL_FIELDS} fields")
             if number > _MAX_FIELDS or offset > _MAX_SIZE:
                 raise ValueError(f"it has more than {_MAX_FIELDS} fields or {_MAX_SIZE} bytes")
             if not field.rpartition(".")[2].startswith("_padding"):

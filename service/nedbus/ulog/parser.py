@@ -29,6 +29,7 @@ _START: Final = 16  # bytes before the first record
 _HEADER: Final = 3  # bytes of a record: size and type
 _DATA_HEADER: Final = 5  # bytes: size, type and message id
 _MAX_PADDING: Final = 8  # bytes that a message may have beyond its size; PX4 aligns to 8
+_MAX_SUBSCRIPTIONS: Final = 1000  # at a time; a real log has 170
 _MAX_SKIPPED: Final = 16  # records of unknown content in a row
 _WINDOW: Final = 2**16  # bytes: after damage of this length, records are found
 _SAMPLE: Final = 2**12  # bytes of a window that are searched in longer damage
@@ -293,6 +294,8 @@ class UlogParser:
                     raise ValueError(f"the message id of {old.name} is also that of {record.name}, which is ignored")
                 return []
             try:
+                if len(self._subscriptions) == _MAX_SUBSCRIPTIONS:
+                    raise ValueError(f"the log has more than {_MAX_SUBSCRIPTIONS} subscriptions")
                 record = record._replace(layout=self._formats.layout(record.name))
             except ValueError as exc:
                 raise ValueError(f"{record.name} cannot be decoded: {exc}") from exc

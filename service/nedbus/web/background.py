@@ -38,7 +38,7 @@ class Background:
             if path.suffix.lower() in _PICTURES:
                 self._read_picture(path)
             else:
-                self.rings = list(_rings(json.loads(path.read_text())))
+                self.rings = list(_rings(json.loads(path.read_bytes())))
         except OSError as exc:
             raise ConfigError("--map", f"{path}: {(exc.strerror or str(exc)).lower()}") from exc
         except (ValueError, TypeError, LookupError, RecursionError) as exc:

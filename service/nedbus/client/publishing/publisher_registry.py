@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import ExitStack
 from typing import Any, Final, cast
 
@@ -104,9 +104,15 @@ class PublisherRegistry:
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
-    def is_alive(self, address: Address) -> bool:
-        """Return True if an address is published, by this or another process."""
-        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_TOKENS_TIMEOUT))
+    def alive(self, addresses: Collection[Address]) -> set[Address]:
+        """Return the addresses that are published, by this or another process; ask the router once for each vehicle."""
+        prefix = self.prefix
+        if len(addresses) == 1:
+            asked = {address.alive_key(prefix=prefix) for address in addresses}
+        else:
+            asked = {Selection(ANY, each.vehicle).alive_key_expr(prefix=prefix) for each in addresses}
+        found = {key for each in asked for key in alive_keys(self._session, each, timeout=_TOKENS_TIMEOUT)}
+        return {address for address in addresses if address.alive_key(prefix=prefix) in found}
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""

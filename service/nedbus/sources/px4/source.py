@@ -76,8 +76,8 @@ def _read_definitions(paths: str) -> Definitions:
             try:
                 text = _with_messages_within(file)
                 definition, type_hash = define_msg(file.stem, text), hash_of_msg(file.stem, text)
-            except (OSError, UnicodeDecodeError) as exc:
-                raise ConfigError(str(file), getattr(exc, "strerror", None) or "not UTF-8 text", key="msg") from None
+            except OSError as exc:
+                raise ConfigError(str(file), exc.strerror or str(exc), key="msg") from None
             except ValueError as exc:  # such as MsgError
                 if file == path:
                     raise ConfigError(str(file), str(exc), key="msg") from None
@@ -92,9 +92,20 @@ def _read_definitions(paths: str) -> Definitions:
 
 def _with_messages_within(file: Path) -> str:
     """Return a .msg file followed by the nested messages that lie beside it, in the format of ROS 2."""
-    text, added = file.read_text(), set[str]()
-    while missing := {base for base in bases_of_msg(text) - added if file.with_name(f"{base}.msg").is_file()}:
+    text = new = _read_text(file)
+    added = set[str]()
+    while missing := {base for base in bases_of_msg(new) - added if file.with_name(f"{base}.msg").is_file()}:
         added |= missing
-        for base in sorted(missing):
-            text += f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{file.with_name(f'{base}.msg').read_text()}"
+        files = {base: _read_text(file.with_name(f"{base}.msg")) for base in sorted(missing)}
+        new = "".join(f"\n{'=' * 80}\nMSG: px4_msgs/{base}\n{each}" for base, each in files.items())
+        text += new
     return text
+
+
+def _read_text(file: Path) -> str:
+    """Return a text in UTF-8, with or without a byte order mark, or in Latin-1."""
+    content = file.read_bytes()
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
