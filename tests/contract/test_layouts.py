@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from pydantic import ValidationError
 
-from nedbus_msgs import DEFAULT, LayoutError, VehicleLocalPosition
+from nedbus_msgs import DEFAULT, LayoutError, VehicleLocalPosition, field_type
 from tests.flights.first_message import CURRENT, FIELD_TYPES, LAYOUTS, downgrade, find_layout, layout_table, upgrade
 
 from .strategies import DATA, bits, messages
@@ -104,3 +104,27 @@ def test_upgrade_keeps_the_rules() -> None:
     """Old layouts are validated like the current one."""
     with pytest.raises(ValidationError, match="xy_valid"):
         upgrade({"timestamp": 1, "xy_valid": True})
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "fitted"),
+    [
+        ("uint8", 255, 255), ("uint8", 256, None), ("uint8", -1, None), ("uint8", 6.0, 6), ("uint8", 6.5, None),
+        ("uint8", math.nan, None), ("uint8", True, 1), ("int64", 2**63, None), ("uint64", -1, None),
+        ("bool", 1, True), ("bool", 2, None), ("float32", 16_777_216, 16_777_216.0), ("float32", 16_777_217, None),
+        ("float32", 0.1, None), ("float32", 1e39, None), ("float32", math.inf, math.inf), ("float64", 2**53 + 1, None),
+        ("uint8[2]", (1, 2.0), (1, 2)), ("uint8[2]", (1, 256), None), ("uint8[3]", (1, 2), (1, 2, 0)),
+        ("uint8[1]", (1, 2), None), ("uint8", (1,), None), ("uint8[1]", 1, None),
+    ],
+)  # fmt: skip
+def test_number_fits_only_if_it_keeps_its_value(kind: str, value: object, fitted: object) -> None:
+    """A number of another type, or an array of fewer of them, is converted exactly, or not at all."""
+    found = field_type(kind).fit(value)
+    assert found == fitted
+    assert type(found) is type(fitted)
+
+
+def test_not_a_number_fits_any_float() -> None:
+    """NaN is kept, and a shorter array is filled up with it."""
+    assert math.isnan(field_type("float32").fit(math.nan))
+    assert repr(field_type("float32[3]").fit((1, math.nan))) == "(1.0, nan, nan)"

@@ -81,3 +81,16 @@ def write_log(
         message = VehicleLocalPosition.model_validate({"timestamp": timestamp, "x": float(number), **fields})
         writer.add(topic, message)
     return writer.write(path)
+
+
+def write_raw_log(
+    path: Path, topics: Mapping[str, tuple[str, str]], messages: Iterable[tuple[str, Sequence[object]]]
+) -> Path:
+    """Write a log of topics with any format: fields as ULog text, and the struct code of a message, by topic."""
+    writer, names = UlogWriter(), list(topics)
+    for number, (topic, (fields, _)) in enumerate(topics.items()):
+        writer.put("F", f"{topic}:{fields}".encode())
+        writer.put("A", struct.pack("<BH", 0, number) + topic.encode())
+    for topic, values in messages:
+        writer.put("D", struct.pack(f"<H{topics[topic][1]}", names.index(topic), *values))
+    return writer.write(path)

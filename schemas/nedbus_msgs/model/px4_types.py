@@ -91,6 +91,24 @@ class FieldType:
         bits = 8 * self.size
         return (0, 2**bits - 1) if self.base.startswith("uint") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
 
+    def fit(self, value: Any) -> Any:
+        """Convert a number of another type, or a tuple of at most this length; return None unless it keeps its value.
+
+        A shorter array is filled up with "not provided".
+        """
+        base = BASES[self.base]
+        if self.length is not None:
+            if not isinstance(value, tuple) or len(value) > self.length:
+                return None
+            fitted = tuple(map(FieldType(self.base).fit, value))
+            return None if None in fitted else fitted + (base.absent,) * (self.length - len(value))
+        try:
+            number = value if self.is_float or self.base == "bool" else int(value)
+            (fitted,) = struct.unpack(f"<{base.code}", struct.pack(f"<{base.code}", number))
+        except (TypeError, ValueError, OverflowError, struct.error):
+            return None
+        return fitted if fitted == value or math.isnan(fitted) else None
+
     @cached_property
     def annotation(self) -> Any:
         """The type annotation of a model's field."""

@@ -252,6 +252,8 @@ def _decode_ulog(topic: UlogTopic) -> _Decoded:
             decoded.valid[wrong.reshape(len(messages), -1).any(axis=1)] = False
     for name in definition.all_fields - plan.provided:
         decoded.absent[name] = True
+    for name in plan.names.keys() & topic.absent.keys():
+        decoded.absent[name] = topic.absent[name]
     return decoded
 
 

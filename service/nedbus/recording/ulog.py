@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from nedbus_msgs import TOPICS, Address, Definition
+from nedbus_msgs import BASES, TOPICS, Address, Definition
 
 from .ulog_reader import UlogReader, UlogStream
 
@@ -21,11 +21,15 @@ UlogColumns = Mapping[str, npt.NDArray[np.generic]]
 
 @dataclass(frozen=True, slots=True)
 class UlogTopic:
-    """One topic of a log; its message definition is known to nedbus, or comes from the log."""
+    """One topic of a log; its message definition is known to nedbus, or comes from the log.
+
+    `absent`: for columns of another type than the message has, a mask of the messages whose value does not fit.
+    """
 
     address: Address
     definition: Definition[Any]
     columns: UlogColumns
+    absent: Mapping[str, npt.NDArray[np.bool_]]
 
 
 @dataclass(slots=True)
@@ -59,6 +63,12 @@ def read_ulog(
     found: dict[Address, UlogTopic] = {}
     for stream, joined in payloads.items():
         table: npt.NDArray[np.void] = np.frombuffer(joined, np.dtype(stream.subscription.layout.dtype))
-        columns = {name: table[name] for name in stream.names}
-        found[stream.address] = UlogTopic(stream.address, stream.definition, columns)
+        columns: dict[str, npt.NDArray[np.generic]] = {name: table[name] for name in stream.names}
+        absent: dict[str, npt.NDArray[np.bool_]] = {}
+        if types := stream.fitting.types:
+            rows = [stream.decode(row.tobytes()) for row in table]
+            for name, kind in types.items():
+                columns[name] = np.array([row.get(name, kind.absent) for row in rows], BASES[kind.base].code)
+                absent[name] = np.array([name not in row for row in rows])
+        found[stream.address] = UlogTopic(stream.address, stream.definition, columns, absent)
     return UlogTopics(found, reader.warnings, reader.damaged, reader.boot_utc)

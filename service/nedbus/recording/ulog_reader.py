@@ -13,6 +13,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus.ulog import (
     Damage,
     Data,
+    Fitting,
     Header,
     Information,
     Parameter,
@@ -30,14 +31,13 @@ from .flight_files import open_flight
 
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged places in the warnings
-_OLDEST: Final = 0x010D  # PX4 1.13, the oldest release with known layouts
 
 
 @dataclass(slots=True, eq=False)
 class UlogStream:
     """The messages of one subscription.
 
-    `names`: its fields, without those that had another type before PX4 1.13.
+    `fitting`: for its fields of another type than the message has.
     `first`: the stream that has its address already, as PX4 can log a topic twice. `checksum`: of the messages so far,
     if the topic has several subscriptions.
     """
@@ -45,14 +45,20 @@ class UlogStream:
     address: Address
     definition: Definition[Any]
     subscription: Subscription
-    names: tuple[str, ...]
+    fitting: Fitting
     first: UlogStream | None
     checksum: int | None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its fields."""
+        return tuple(field.name for field in self.subscription.fields)
 
     def decode(self, payload: bytes) -> dict[str, object]:
         """Return the fields of a message."""
         fields = self.subscription.decode(payload)
-        return fields if len(fields) == len(self.names) else {name: fields[name] for name in self.names}
+        self.fitting.apply(fields)
+        return fields
 
 
 class UlogReader:
@@ -69,7 +75,7 @@ class UlogReader:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
         self._parser = UlogParser(verify=True)
-        self._release = self._places = self.start = self.boot_utc = self.position = 0
+        self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, UlogStream | None] = {}
         self._seconds: list[UlogStream] = []
@@ -82,7 +88,8 @@ class UlogReader:
         """Damage and skipped parts so far."""
         ends = {f"damaged: {self._places - _MAX_NAMED} further places": self._places > _MAX_NAMED}
         ends |= {f"damaged: {self._parser.undecodable} messages without a definition": self._parser.undecodable > 0}
-        return self._warnings + [text for text, holds in ends.items() if holds]
+        reasons = [reason for stream in self.streams.values() for reason in stream.fitting.unfit.values()]
+        return self._warnings + reasons + [text for text, holds in ends.items() if holds]
 
     def messages(self) -> Iterator[tuple[UlogStream, bytes]]:
         """Yield each message as its stream and payload.
@@ -132,8 +139,6 @@ class UlogReader:
         """Take what is not a message."""
         if isinstance(record, Header):
             self.start = record.timestamp
-        elif isinstance(record, Information) and record.key == "ver_sw_release" and isinstance(record.value, int):
-            self._release = record.value >> 16
         elif isinstance(record, Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int):
             self.boot_utc = record.value
         elif isinstance(record, Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
@@ -150,7 +155,7 @@ class UlogReader:
 
     def _open(self, subscription: Subscription) -> UlogStream | None:
         """Return the stream of a subscription with its first message; None if it is not wanted, or cannot be used."""
-        topic, types = subscription.name, {field.name: field.kind for field in subscription.fields}
+        topic, names = subscription.name, {field.name for field in subscription.fields}
         if self._topics is not None and topic not in self._topics:
             return None
         self._vehicle = self._vehicle or self._system_id
@@ -160,21 +165,13 @@ class UlogReader:
             self._warnings.append(f"skipped {topic}: {exc}")
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
             return None
-        known = definition.known_types
-        wrong = {name for name, kind in types.items() if kind not in known.get(name, {kind})}
-        if wrong and 0 < self._release < _OLDEST:
-            older = f"skipped {', '.join(sorted(wrong))}, which had another type before PX4 1.13"
-            self._warnings.append(f"{topic} [{subscription.multi_id}]: {older}")
-            types = {name: kind for name, kind in types.items() if name not in wrong}
-            wrong = set()
-        if wrong | (lacking := definition.always - types.keys()):
-            names = ", ".join(sorted(wrong | lacking))
-            self._warnings.append(f"{topic} [{subscription.multi_id}]: the definition of {names} is damaged")
+        if lacking := ", ".join(sorted(definition.always - names)):
+            self._warnings.append(f"{topic} [{subscription.multi_id}]: the definition of {lacking} is damaged")
             self.damaged = True
-        if wrong or "timestamp" not in types:
+        if "timestamp" not in names:
             return None
-        checksum = 0 if self._subscribed[topic] > 1 else None
-        stream = UlogStream(address, definition, subscription, tuple(types), self.streams.get(address), checksum)
+        fitting, checksum = Fitting(definition, subscription), 0 if self._subscribed[topic] > 1 else None
+        stream = UlogStream(address, definition, subscription, fitting, self.streams.get(address), checksum)
         if stream.first is None:
             self.streams[address] = stream
         else:

@@ -1,6 +1,6 @@
 """ULog, PX4's log format: an incremental parser for files and streams, and the definitions of logged messages."""
 
-from .definitions import address_of, definition_of
+from .definitions import Fitting, address_of, definition_of
 from .layout import PayloadField, PayloadLayout
 from .parser import UlogParser
 from .records import (  # fmt: skip  # fmt: skip
@@ -26,6 +26,7 @@ __all__ = [
     "Damage",
     "Data",
     "Dropout",
+    "Fitting",
     "Format",
     "Header",
     "Information",

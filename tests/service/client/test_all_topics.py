@@ -28,10 +28,6 @@ REJECTED: Final = {  # a bool that PX4 did not set
     ("cuav_1.16_gps_interference", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 194)"): 31,
     ("nxp_v0_ekf_failure", "rtl_status", "has_vtol_approach: Input should be a valid boolean (is 94)"): 39,
 }
-BEFORE_1_13: Final = {  # fields of another type, of cubeorange_1.12_small
-    "battery_status": {"cell_count", "voltage_cell_v"},
-    "vehicle_status": {f"onboard_control_sensors_{what}" for what in ("enabled", "health", "present")},
-}
 STREAMS: Final = {  # addresses, messages
     "gps_loss": (7, 26775),
     "twelve_messages": (27, 46863),
@@ -83,14 +79,14 @@ def raw_streams(flight: Path) -> dict[str, Mapping[str, npt.NDArray[Any]]]:
     return found
 
 
-def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArray, flight: str) -> int:
+def compare(stream: str, raw: Mapping[str, npt.NDArray[Any]], array: MessageArray) -> int:
     """Assert that messages have the values of a log in all fields; return the number of compared values."""
     topic, compared = stream.partition("/")[0], 0
     for column, values in raw.items():
         *outer, last = re.sub(r"\[(\d+)\](?=.*\.)", r"_\1", column).split(".")
         name, _, index = last.partition("[")
         name = "_".join([*outer, name])
-        if last.startswith("_padding") or (flight.startswith("cube") and name in BEFORE_1_13.get(topic, ())):
+        if last.startswith("_padding"):
             continue
         expected, fields = values, [name]
         if topic in BY_TOPIC:
@@ -118,7 +114,7 @@ def test_every_message_of_a_log_is_its_value(flight: Path) -> None:
     for stream, array in arrays.items():
         count = len(raw[stream]["timestamp"])
         assert len(array) == count - left_out.get(stream, 0), stream
-        compared += compare(stream, raw[stream], array, flight.stem) if len(array) == count else 0
+        compared += compare(stream, raw[stream], array) if len(array) == count else 0
     assert compared > 100_000
 
 
@@ -217,7 +213,7 @@ def test_log_is_one_table(flight: Path) -> None:
             rows, has_one = np.arange(len(table)), np.ones(len(table), bool)  # each of its messages is a row
         assert np.array_equal(np.isnan(table[f"{stream}.age"]), ~has_one), stream
         for column, logged in values.items():
-            if f"{stream}.{column}" in columns and column not in BEFORE_1_13.get(stream.partition("/")[0], ()):
+            if f"{stream}.{column}" in columns:
                 ours = table[f"{stream}.{column}"]
                 assert np.array_equal(ours[has_one], logged[rows].astype(ours.dtype)[has_one], equal_nan=True), column
                 compared += 1

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pyulog import ULog
 
+import nedbus
 from nedbus.errors import SourceError
 from nedbus.sources import ReplayRun
 from nedbus_msgs import DEFAULT, VehicleLocalPosition
 from tests.flights.first_message import LAYOUTS, upgrade
 from tests.flights.messages import VLP, message
-from tests.flights.replays import open_replay
-from tests.flights.ulogs import LOGS, UlogWriter, write_log
+from tests.flights.replays import convert_replay, open_replay
+from tests.flights.ulogs import LOGS, UlogWriter, write_log, write_raw_log
+from tests.peers.command_line import run_command
 
 # Counted with pyulog: messages of all local position topics, layout, addresses.
 REAL = {
@@ -225,3 +227,57 @@ def test_damaged_definition_is_noticed(tmp_path: Path) -> None:
         else:
             assert run.damage
             assert all("z" not in each.fields for each in run.messages)
+
+
+OLD_BATTERY = "uint64_t timestamp;int32_t cell_count;double temperature;float[3] voltage_cell_v;uint8_t connected;"
+OLD_STATUS = "uint64_t timestamp;uint32_t system_id;uint32_t component_id;uint8_t nav_state;"
+
+
+def write_old_log(path: Path, counts: Sequence[int], *, temperature: float = 20.5) -> Path:
+    """Write a log as of PX4 1.9, without its release: fields of other types than today's."""
+    topics = {"battery_status": (OLD_BATTERY, "Qid3fB"), "vehicle_status": (OLD_STATUS, "QIIB")}
+    rows = [("battery_status", (10 + n, count, temperature, 4.1, 4.2, 4.0, 1)) for n, count in enumerate(counts)]
+    return write_raw_log(path, topics, [*rows, ("vehicle_status", (100, 1, 1, 2)), ("vehicle_status", (200, 1, 1, 5))])
+
+
+def test_fields_of_another_type_keep_their_values(tmp_path: Path) -> None:
+    """A value is converted where it fits, in a replay, in arrays and in a recording; such a log is not damaged."""
+    path = write_old_log(tmp_path / "a.ulg", [6, 6])
+    run = open_log(path, "?topics=*")
+    first, *_, last = run.messages
+    assert (first.fields["cell_count"], first.fields["temperature"], first.fields["connected"]) == (6, 20.5, True)
+    assert (last.fields["system_id"], last.fields["nav_state"]) == (1, 5)
+    assert (run.warnings, run.damage) == ((), None)
+    convert_replay(f"ulog:{path}?topics=*", tmp_path / "a.mcap")
+    for file in (path, tmp_path / "a.mcap"):
+        streams = nedbus.read(file, ["*"])
+        battery = streams["battery_status/0"]
+        assert battery["cell_count"].tolist() == [6, 6]
+        assert battery["voltage_cell_v"][0, :3].tolist() == pytest.approx([4.1, 4.2, 4.0])
+        assert np.isnan(battery["voltage_cell_v"][0, 3:]).all()
+        assert streams["vehicle_status"]["system_id"].tolist() == [1, 1]
+        assert "cell_count" not in nedbus.missing_of(battery)
+
+
+def test_value_that_does_not_fit_is_named_once(tmp_path: Path) -> None:
+    """Such a field is left out of its message, and the log names it with a value; the rest of the message is read."""
+    path = write_old_log(tmp_path / "a.ulg", [6, -1, 256, 7], temperature=0.1)
+    run = open_log(path, "?topics=*")
+    batteries = [each.fields for each in run.messages if each.address.topic == "battery_status"]
+    assert [fields.get("cell_count") for fields in batteries] == [6, None, None, 7]
+    assert run.damage is None
+    assert sorted(run.warnings) == [
+        "battery_status: left out cell_count where it is not a uint8, such as -1",
+        "battery_status: left out temperature where it is not a float32, such as 0.1",
+    ]
+    table = nedbus.read(path, "battery_status", dataframe="pandas")
+    assert table["cell_count"].isna().tolist() == [False, True, True, False]
+    assert nedbus.read(path, "battery_status")["cell_count"].tolist() == [6, 0, 0, 7]
+
+
+def test_old_log_without_its_release_is_not_damaged(tmp_path: Path) -> None:
+    """A log that is read whole is converted with exit code 0, and its change of mode is an event."""
+    path = write_old_log(tmp_path / "a.ulg", [6])
+    converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
+    assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
+    assert "mode Position to Return" in run_command("events", str(path)).out

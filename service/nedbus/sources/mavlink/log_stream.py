@@ -13,7 +13,7 @@ from nedbus.errors import AddressError, OutputError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import Damage, Data, Subscription, UlogError, UlogParser, address_of, definition_of
+from nedbus.ulog import Damage, Data, Fitting, Subscription, UlogError, UlogParser, address_of, definition_of
 from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
 
 from .log_client import LogStatus, LogStreamClient
@@ -30,7 +30,7 @@ _PIECE: Final = 249  # bytes of a LOGGING_DATA
 _DATA_HEADER: Final = 5  # bytes of a record before its message
 _MAX_OFFSET_AGE: Final = 30.0  # s for which a clock offset is used
 
-_Route = tuple[Subscription, Address, Definition[Any]]
+_Route = tuple[Subscription, Address, Definition[Any], Fitting]
 
 
 class LogStream:
@@ -100,7 +100,12 @@ class LogStream:
                 if route is None or route[0] is not record.subscription:
                     route = yield from self._find_route(record.subscription)
                 if route is not None:
-                    yield self._message(record, route[1], route[2], now)
+                    fields = record.subscription.decode(record.payload)
+                    told = len(route[3].unfit)
+                    route[3].apply(fields)
+                    for name, reason in [*route[3].unfit.items()][told:]:
+                        yield Rejection(f"{self._name} {name}", reason, count=0)
+                    yield self._message(fields, route[1], route[2], now)
             elif isinstance(record, Damage) and record.reason not in self._damages and len(self._damages) < 100:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
@@ -154,14 +159,16 @@ class LogStream:
         route: _Route | None = None
         if self._topics is None or subscription.name in self._topics:
             try:
-                route = subscription, address_of(self._name, subscription), definition_of(subscription)
+                address, definition = address_of(self._name, subscription), definition_of(subscription)
+                route = subscription, address, definition, Fitting(definition, subscription)
             except (AddressError, ValueError) as exc:
                 yield Rejection(f"{self._name} {subscription.name}", str(exc))
         self._routes[subscription.message_id] = route
         return route
 
-    def _message(self, record: Data, address: Address, definition: Definition[Any], now: float) -> SourceMessage:
-        fields = record.subscription.layout.decode(record.payload)
+    def _message(
+        self, fields: dict[str, Any], address: Address, definition: Definition[Any], now: float
+    ) -> SourceMessage:
         timestamp = fields.get("timestamp")
         if self._clock is not None and isinstance(timestamp, int):
             self._delays += now + self._clock[0] - timestamp / 1e6
