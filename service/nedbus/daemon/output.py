@@ -151,6 +151,8 @@ class SourceOutput:
         self.durations.add(time.perf_counter() - start)
         self.published += 1
         stream.health.add(fields, received=self._now_ns(), lost=message.lost)
+        if message.dropout:
+            self._account.add_dropout(message.address.vehicle, message.dropout, clock.steady() - message.dropout)
         self._account.add(message.address, fields, clock.steady(), lost=message.lost)
 
     def publish_replay(self, message: SourceMessage, *, lossless: bool) -> None:

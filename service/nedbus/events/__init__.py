@@ -11,11 +11,11 @@ from .report import ACCOUNT_PARAMETER, FORGOTTEN, AccountReport, VehicleReport, 
 from .rules import FIXES, MODES, RECENT
 from .story import Span, Story, spans_of, state_at, stories_of, story_of
 from .times import Times, since_text, to_age, to_clock
-from .vehicle import Vehicle
+from .vehicle import EKF_SELECTOR, Vehicle
 
 __all__ = [
-    "ACCOUNT_PARAMETER", "ALL", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MODES", "RECENT", "SEVERITIES", "VALID",
-    "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Severity", "Span", "State", "Story",
-    "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json", "merge_vehicles", "report_of",
+    "ACCOUNT_PARAMETER", "ALL", "EKF_SELECTOR", "FIXES", "FORGOTTEN", "KEPT", "KINDS", "MODES", "RECENT", "SEVERITIES",
+    "VALID", "WINDOW", "Account", "AccountReport", "Condition", "Event", "Expectation", "Severity", "Span", "State",
+    "Story", "Times", "Vehicle", "VehicleReport", "by_vehicle", "faults_of", "from_json", "merge_vehicles", "report_of",
     "since_text", "spans_of", "state_at", "stories_of", "story_of", "to_age", "to_clock", "unknown_text",
 ]  # fmt: skip

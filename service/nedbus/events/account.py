@@ -56,6 +56,12 @@ class Account:
             if vehicle := self._vehicle(address.vehicle):
                 vehicle.add(address, message, time, missing=missing, lost=lost)
 
+    def add_dropout(self, vehicle: str, seconds: float, time: float) -> None:
+        """Record that the logger of a vehicle recorded nothing for some seconds from `time` on."""
+        with self._lock:
+            if known := self._vehicle(vehicle):
+                known.add_dropout(seconds, time)
+
     def reject(self, address: Address, reason: str, time: float) -> None:
         """Record a rejected message."""
         with self._lock:

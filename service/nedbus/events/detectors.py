@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from operator import attrgetter, itemgetter
 from typing import Any, Final, Literal, cast
 
@@ -161,15 +162,15 @@ def make_detector(message: str) -> ChangeDetector | None:
     match message:
         case "VehicleStatus":
             return ChangeDetector(["arming_state", "nav_state", *flags], detect_status)
-        case "EstimatorStatusFlags" | "FailsafeFlags":
-            return ChangeDetector(flags, lambda before, after: detect_flags(flag_rules, before, after))
+        case "EstimatorStatusFlags":
+            return ChangeDetector([*flags, *rules.FAKE_AIDING], partial(detect_estimator, flag_rules))
+        case "FailsafeFlags":
+            return ChangeDetector(flags, partial(detect_flags, flag_rules))
         case "SensorGps":
             return GpsDetector()
         case "BatteryStatus":
             return ChangeDetector(["warning", "connected"], detect_battery, context=["remaining"])
-        case "VehicleLandDetected":
-            return ChangeDetector(["landed"], detect_landing)
-    return None
+    return ChangeDetector(["landed"], detect_landing) if message == "VehicleLandDetected" else None
 
 
 def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
@@ -191,6 +192,15 @@ def detect_flags(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fi
                 rule.kind, change, "info" if is_info else rule.severity, text, tuple(flags), on_ground=rule.on_ground,
                 first=rule.first, initial=not is_event,
             )  # fmt: skip
+
+
+def detect_estimator(flag_rules: Sequence[rules.FlagRule], before: Fields, after: Fields) -> Iterator[Finding]:
+    """Yield the findings of an EstimatorStatusFlags: its flags, and a fake position that nothing replaces."""
+    yield from detect_flags(flag_rules, before, after)
+    was, now = ([name for name in rules.AIDING if fields.get(name)] for fields in (before, after))
+    if was and not now and rules.FAKE_AIDING.keys() >= set(was):
+        text = f"no horizontal aiding: {', '.join(map(rules.AIDING.__getitem__, was))} ended, nothing else is fused"
+        yield Finding("not_aided", "once", "watch", text, on_ground="info")
 
 
 def detect_status(before: Fields, after: Fields) -> Iterator[Finding]:

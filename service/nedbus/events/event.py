@@ -114,7 +114,7 @@ _PRIORITY: Final = (
     "gone", "silent", "failsafe", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "battery", "dead_reckoning",
 )  # fmt: skip
 _SENSING: Final = (
-    "gps_fix_lost", "gps_fix", "few_satellites", "jamming", "spoofing", "not_fused", "innovation_rejected",
+    "gps_fix_lost", "gps_fix", "few_satellites", "jamming", "spoofing", "not_fused", "not_aided", "innovation_rejected",
     "estimator_fault",
 )  # fmt: skip
 _CORRECTIONS: Final = ("reset", "jump", "origin_set", "origin_moved")
@@ -134,6 +134,7 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "few_satellites": ("jamming", "spoofing"),
     "jamming": (),
     "spoofing": (),
+    "not_aided": (),
     "not_fused": ("gps_fix_lost", "few_satellites", "jamming", "spoofing", "innovation_rejected", "estimator_fault"),
     "innovation_rejected": ("gps_fix_lost", "gps_fix", "jamming", "spoofing", "estimator_fault"),
     "estimator_fault": (),
@@ -153,6 +154,7 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "rejected": (),
     "link_down": (),
     "overload": (),
+    "dropout": (),
 }  # fmt: skip
 """All kinds of events, each with the kinds that may explain it."""
 

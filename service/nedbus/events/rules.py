@@ -43,6 +43,9 @@ _AIDING: Final = {
     "cs_gnss_pos": "GNSS position", "cs_gnss_vel": "GNSS velocity", "cs_ev_pos": "vision position",
     "cs_ev_vel": "vision velocity", "cs_opt_flow": "optical flow", "cs_aux_gpos": "auxiliary position",
 }  # fmt: skip
+FAKE_AIDING: Final = {"cs_fake_pos": "fake position", "cs_valid_fake_pos": "valid fake position"}
+"""What the EKF fuses in place of a measured position, for as long as it trusts that."""
+AIDING: Final[Mapping[str, str]] = {**_AIDING, **FAKE_AIDING}
 _HEIGHTS: Final = {
     "cs_gps_hgt": "GNSS height", "cs_gnss_yaw": "GNSS yaw", "cs_ev_yaw": "vision yaw", "cs_ev_hgt": "vision height",
     "cs_baro_hgt": "baro height", "cs_rng_hgt": "range height",

@@ -16,6 +16,12 @@ from .position import PositionDetector
 from .rules import FLAPPING_CHANGES, KEPT_ON_REBOOT, MAX_BURST, MAX_SILENCE, PAUSE, RECENT, RULES, flags_of
 from .times import to_age
 
+EKF_SELECTOR: Final = "estimator_selector_status"
+"""The topic that names the EKF in use."""
+
+_EKF: Final = "estimator_status_flags"
+_EKF_KINDS: Final = frozenset(rule.kind for rule in RULES["EstimatorStatusFlags"])
+_MAX_EKFS: Final = 9  # instances; 255 stands for none
 _REBOOT: Final = 1_000_000  # us that PX4's time jumps back at a reboot; a smaller step is reordering
 _MAX_RECENT: Final = 100
 _MAX_STREAMS: Final = 1000  # per vehicle, which bounds the memory that a peer can use
@@ -60,6 +66,8 @@ class Vehicle:
         self._changes: dict[tuple[str, tuple[str, ...]], deque[Event]] = {}  # recent changes of each condition
         self._suppressed: Counter[tuple[str, tuple[str, ...]]] = Counter()  # changes of flapping conditions
         self._lost, self._rejected = _Burst(), _Burst()
+        self._dropouts = _Burst()  # in ms
+        self._primary = 0  # instance of the EKF in use
 
     def add(self, address: Address, message: object, time: float, *, missing: frozenset[str], lost: int) -> None:
         """Add a message; `lost` is the number of messages lost before it."""
@@ -71,6 +79,8 @@ class Vehicle:
             if len(self._detectors) >= _MAX_STREAMS:
                 return
             detector = self._detectors[address] = self._open(address)
+        if address.topic == EKF_SELECTOR:
+            self._select_ekf(message)
         if detector is None:
             return
         before, earlier = detector.stamp, detector.earlier
@@ -91,6 +101,12 @@ class Vehicle:
                 self.armed = each.kind == "armed"
             self.emit(each, address.topic, time)
 
+    def add_dropout(self, seconds: float, time: float) -> None:
+        """Record that the logger recorded nothing from `time` on; the vehicle is not silent meanwhile."""
+        self._dropouts.add(time, round(1e3 * seconds), "")
+        if self.main is not None:
+            self._main_time = max(self._main_time, time + seconds)
+
     def reject(self, topic: str, reason: str, time: float) -> None:
         """Record a rejected message."""
         if not self._rejected.count:
@@ -100,12 +116,17 @@ class Vehicle:
 
     def settle(self, time: float) -> None:
         """Report bursts of losses and rejections, and flapping, that have ended."""
-        lost, rejected = self._lost, self._rejected
+        lost, rejected, dropouts = self._lost, self._rejected, self._dropouts
         if lost.is_over(time) or (lost.count and time - lost.begin > MAX_BURST):
             names = tuple(sorted(lost.topics))
             text = f"{lost.count} message{'s' * (lost.count > 1)} lost ({', '.join(names)})"
             self.emit(Finding("lost", "once", "watch", text, names, {"messages": lost.count}), "", lost.begin)
             self._lost = _Burst()
+        if dropouts.is_over(time):
+            duration = dropouts.count / 1e3
+            text = f"the logger recorded nothing for {to_age(duration)}"
+            self.emit(Finding("dropout", "once", "info", text, numbers={"duration": duration}), "", dropouts.begin)
+            self._dropouts = _Burst()
         if rejected.is_over(time):
             text = f"rejections stopped ({rejected.count} message{'s' * (rejected.count > 1)})"
             self.emit(Finding("rejected", "end", "info", text, numbers={"messages": rejected.count}), "", rejected.end)
@@ -183,7 +204,8 @@ class Vehicle:
     def _open(self, address: Address) -> ChangeDetector | None:
         """Return a detector for a new stream, None if it has no events or a better stream is in use."""
         self.topics.add(address.topic)
-        if address.instance and address.topic not in _POSITIONS:  # only the first sensor, battery and EKF are used
+        used = self._primary if address.topic == _EKF else 0  # only the first sensor and battery, and the EKF in use
+        if (address.instance or 0) != used and address.topic not in _POSITIONS:
             return None
         group = next((each for each in _KINDS_BY_GROUP if address.topic in each), ())
         if group:
@@ -197,6 +219,16 @@ class Vehicle:
             self.main = address
             return PositionDetector()
         return make_detector(BY_TOPIC[address.topic].name) if address.topic in BY_TOPIC else None
+
+    def _select_ekf(self, message: object) -> None:
+        """Use the flags of the EKF that an estimator_selector_status names."""
+        name = "primary_instance"
+        primary = message.get(name) if isinstance(message, dict) else getattr(message, name, None)
+        if type(primary) is int and primary in range(_MAX_EKFS) and primary != self._primary:
+            old, new = (Address(self.name, _EKF, each) for each in (self._primary, primary))
+            self._primary = primary
+            self._supersede(old, new, _EKF_KINDS)
+            self._detectors.pop(new, None)
 
     def _supersede(self, old: Address, new: Address, kinds: frozenset[str]) -> None:
         """Stop using a stream, and end its conditions, when a better one arrives."""

@@ -13,6 +13,7 @@ from nedbus.errors import AddressError, SourceError
 from nedbus.ulog import (
     Damage,
     Data,
+    Dropout,
     Fitting,
     Header,
     Information,
@@ -66,7 +67,8 @@ class UlogReader:
 
     The options are those of `read_ulog`. `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if
     the log has none so far. `position`: bytes read so far.
-    `streams`: those with a message so far. `damaged`: True if damage may have cost messages so far.
+    `dropout`: seconds that the logger lost, until the caller resets it. `streams`: those with a message so far.
+    `damaged`: True if damage may have cost messages so far.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class UlogReader:
         self._seconds: list[UlogStream] = []
         self._subscribed: Counter[str] = Counter()  # subscriptions of each topic
         self.streams: dict[Address, UlogStream] = {}
+        self.dropout = 0.0
         self.damaged = False
 
     @property
@@ -141,6 +144,8 @@ class UlogReader:
             self.start = record.timestamp
         elif isinstance(record, Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int):
             self.boot_utc = record.value
+        elif isinstance(record, Dropout):
+            self.dropout += record.duration / 1e3
         elif isinstance(record, Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
             self._system_id = str(record.value)
         elif isinstance(record, Subscription):

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, cast
 
 from nedbus import recording
 from nedbus.errors import InvalidMessageError
-from nedbus.events import Account, Times
-from nedbus_msgs import BY_TOPIC, Address, codec_of, upgrade_fields
+from nedbus.events import EKF_SELECTOR, Account, Times
+from nedbus_msgs import BY_TOPIC, TOPICS, Address, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
-from .source import ReplaySource, SourceMessage
+from .options import RecordedOptions
+from .source import ReplayRun, ReplaySource, SourceMessage
 
 KEPT_OF_FILE: Final = 100_000
 """Events kept per file; the oldest are discarded."""
@@ -32,16 +33,34 @@ class FileAccount:
     warnings: tuple[str, ...]
 
 
+class _EventOptions(RecordedOptions):
+    """Options of a replay for its events: all known topics, and the one that names the EKF in use."""
+
+    @property
+    def chosen_topics(self) -> Collection[str]:
+        """The topics to deliver."""
+        return {*TOPICS, EKF_SELECTOR}
+
+
+def open_file(path: Path, *, vehicle: str | None = None) -> ReplayRun:
+    """Open a .ulg or .mcap file for its events, as `read_account` does."""
+    spec = replace(parse_source(source_text_of_file(path)), options=_EventOptions(vehicle=vehicle))
+    return cast("ReplaySource", spec.open_source(vehicle="1")).open()
+
+
 def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
     """Return the events of a .ulg or .mcap file; `vehicle` renames the vehicle of a file that has only one.
 
     Raises ConfigError or SourceError if the file cannot be read.
     """
-    spec = parse_source(source_text_of_file(path, vehicle=vehicle))
-    run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
+    run = open_file(path, vehicle=vehicle)
     account, due = Account(KEPT_OF_FILE), 0.0
     for message, _, _ in follow(run.messages, account):
         due = message.due
+    for index, event in enumerate(account.events):  # before the first message that gave the time since boot
+        known = account.vehicles.get(event.vehicle)
+        if event.boot is None and known is not None and known.boot is not None:
+            account.events[index] = replace(event, boot=known.boot + event.time - known.time)
     return FileAccount(account, times_of(path, run.addresses), due, run.warnings)
 
 
@@ -58,6 +77,8 @@ def follow(
     """Add the messages of a replay to an account; yield each with its rejection reason or its payload."""
     checked = due = 0.0
     for message in messages:
+        if message.dropout:
+            account.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL

@@ -22,6 +22,7 @@ class SourceMessage:
     `error`: the reason if it cannot be decoded; `fields` is empty then.
     `definition`: its message definition; None for the default of its topic.
     `source`: what readers see in `sample.source`, if it differs from the kind of the source.
+    `dropout`: seconds for which the vehicle's logger recorded nothing, just before this one.
     """
 
     due: float
@@ -32,6 +33,7 @@ class SourceMessage:
     error: str | None = None
     definition: Definition[Any] | None = None
     source: str | None = None
+    dropout: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

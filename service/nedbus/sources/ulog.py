@@ -52,7 +52,8 @@ class UlogSource:
         clock = _Clock()
         for due, stream, fields in clock.pace(reader):
             run.addresses[stream.address], run.position = stream.definition, reader.position
-            yield SourceMessage(due, stream.address, fields, definition=stream.definition)
+            dropout, reader.dropout = reader.dropout, 0.0
+            yield SourceMessage(due, stream.address, fields, definition=stream.definition, dropout=dropout)
         warnings = _warnings_of(reader)
         for address, count in clock.unordered.items():
             warnings.append(f"{address}: {count} timestamps out of order; the log's own order is kept")

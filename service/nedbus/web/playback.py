@@ -17,15 +17,7 @@ from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import Account, Times
 from nedbus.log_event import about
-from nedbus.sources import (
-    KEPT_OF_FILE,
-    ReplaySource,
-    SourceMessage,
-    follow,
-    parse_source,
-    source_text_of_file,
-    times_of,
-)
+from nedbus.sources import KEPT_OF_FILE, SourceMessage, follow, open_file, times_of
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
@@ -52,7 +44,6 @@ class Recording:
     """
 
     def __init__(self, path: Path) -> None:
-        spec = parse_source(source_text_of_file(path))
         self.name = path.name
         self.whole = Fleet(long=_WHOLE)
         self.chronicle = Chronicle(Account(KEPT_OF_FILE), times=Times())
@@ -61,7 +52,7 @@ class Recording:
         self.is_read = False
         self._path = path
         self._indices: dict[Address, list[int]] = {}  # indices in `entries`, by stream
-        self._run = cast("ReplaySource", spec.open_source(vehicle="1")).open()
+        self._run = open_file(path)
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property

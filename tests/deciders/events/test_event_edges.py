@@ -182,3 +182,54 @@ def test_noisy_vehicle_leaves_room_for_others_in_an_answer() -> None:
     assert [event.kind for event in answered if event.vehicle == "quiet"] == ["xy_invalid", "xy_invalid"]
     assert 100 < len(answered) <= 300
     assert [event.time for event in answered] == sorted(event.time for event in answered)
+
+
+def test_dropout_of_the_logger_is_no_silence(sent: Sent) -> None:
+    """Nothing was recorded for 5 s: an event of the logger with its duration, and no silent vehicle."""
+    sent(0.0)
+    sent.account.add_dropout("1", 5.0, 0.02)
+    for time in (1.0, 4.0, 5.0, 7.9):
+        sent.account.update(time)
+    assert sent.told == [("dropout", "once")]
+    [event] = sent.account.events
+    assert (event.severity, event.time, event.numbers["duration"]) == ("info", 0.02, 5.0)
+    assert event.text == "the logger recorded nothing for 5.0 s"
+    sent.account.update(8.5)  # 3 s after its end
+    assert sent.told[1:] == [("silent", "begin")]
+
+
+def test_only_the_ekf_in_use_has_events(sent: Sent) -> None:
+    """The selector names the EKF in use: faults of others are no events, and those of the former one end."""
+    for primary, faulty in ((1, 0), (0, 0), (1, 1)):
+        for time in (0.0, 1.0):
+            sent(time, "estimator_selector_status", primary_instance=primary)
+            for instance in (0, 1):
+                flags = {"cs_gnss_pos": time == 0.0 or instance != faulty}
+                sent(time, "estimator_status_flags", instance, **flags)
+        assert len(sent.told) == (0 if primary != faulty else 1), primary
+        sent = Sent()
+    sent(0.0, "estimator_status_flags", 0, cs_gnss_pos=True, cs_mag_fault=False)
+    sent(1.0, "estimator_status_flags", 0, cs_gnss_pos=False, cs_mag_fault=True)
+    assert sent.state(1.0) == "watch"
+    for odd in (255, -1, 1.0, None, "x"):
+        sent(1.5, "estimator_selector_status", primary_instance=odd)
+    assert sent.state(1.5) == "watch"
+    sent(2.0, "estimator_selector_status", primary_instance=1)
+    assert sent.state(2.0) == "info"
+    sent(3.0, "estimator_status_flags", 1, cs_gnss_pos=True, cs_mag_fault=False)
+    sent(4.0, "estimator_status_flags", 0, cs_gnss_pos=True, cs_mag_fault=True)
+    assert sent.state(4.0) == "info"
+
+
+@pytest.mark.parametrize("gnss", [False, True])
+def test_fake_position_that_ends_is_evidence(sent: Sent, gnss: bool) -> None:
+    """A fake position that nothing replaces precedes an invalid position; one that GNSS replaces is no event."""
+    sent(0.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=True, cs_gnss_pos=False)
+    sent(0.0)
+    sent(1.0, "estimator_status_flags", 0, cs_fake_pos=True, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
+    sent(2.0, "estimator_status_flags", 0, cs_fake_pos=False, cs_valid_fake_pos=False, cs_gnss_pos=gnss)
+    sent(2.2, xy_valid=False)
+    [invalid] = [each for each in sent.account.events if each.kind == "xy_invalid"]
+    assert [each.text for each in invalid.evidence] == [
+        "no horizontal aiding: fake position ended, nothing else is fused"
+    ][: not gnss]

@@ -16,7 +16,7 @@ from nedbus.errors import SourceError
 from nedbus.sources import ReplayRun
 from nedbus_msgs import DEFAULT, VehicleLocalPosition
 from tests.flights.first_message import LAYOUTS, upgrade
-from tests.flights.messages import VLP, message
+from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import convert_replay, open_replay
 from tests.flights.ulogs import LOGS, UlogWriter, write_log, write_raw_log
 from tests.peers.command_line import run_command
@@ -281,3 +281,26 @@ def test_old_log_without_its_release_is_not_damaged(tmp_path: Path) -> None:
     converted = run_command("convert", str(path), str(tmp_path / "a.mcap"))
     assert (converted.exit_code, converted.err.count("damaged")) == (0, 0)
     assert "mode Position to Return" in run_command("events", str(path)).out
+
+
+def test_dropout_in_a_log_is_an_event_of_the_logger(tmp_path: Path) -> None:
+    """A dropout of 5 s is told with its duration; a gap without a record of it is silence of the vehicle."""
+    for is_recorded in (True, False):
+        writer = UlogWriter()
+        writer.define([VLP])
+        for time in [*range(10_000_000, 16_000_000, 100_000), *range(21_000_000, 25_000_000, 100_000)]:
+            if is_recorded and time == 21_000_000:
+                writer.put("O", struct.pack("<H", 5000))
+            writer.add(VLP, message(time, **VALID))
+        lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out
+        assert ("the logger recorded nothing for 5.0 s" in lines, "silent" in lines) == (is_recorded, not is_recorded)
+
+
+def test_event_before_the_first_timestamp_has_a_time_since_boot(tmp_path: Path) -> None:
+    """Rejections begin and end on one clock, also if the first messages have no timestamp."""
+    writer = UlogWriter()
+    writer.define([VLP])
+    for time in (0, 0, *range(100_000_000, 108_000_000, 100_000)):
+        writer.add(VLP, message(time, **VALID), **({} if time else {"z_valid": 2}))
+    lines = run_command("events", str(writer.write(tmp_path / "a.ulg"))).out.splitlines()
+    assert [line.split()[0] for line in lines] == ["100.000", "100.000"]

@@ -13,7 +13,7 @@ from nedbus.errors import AddressError, OutputError
 from nedbus.log_event import about
 from nedbus.sources.options import MavlinkOptions
 from nedbus.sources.source import Rejection, SourceMessage
-from nedbus.ulog import Damage, Data, Fitting, Subscription, UlogError, UlogParser, address_of, definition_of
+from nedbus.ulog import Damage, Data, Dropout, Fitting, Subscription, UlogError, UlogParser, address_of, definition_of
 from nedbus_msgs import DEFAULT_TOPIC, Address, Definition
 
 from .log_client import LogStatus, LogStreamClient
@@ -62,6 +62,7 @@ class LogStream:
         self._parser = UlogParser(verify=False)
         self._routes: dict[int, _Route | None] = {}
         self._damages: set[str] = set()
+        self._dropout = 0.0  # s that the vehicle's logger lost before the next message
 
     @property
     def is_streaming(self) -> bool:
@@ -106,6 +107,8 @@ class LogStream:
                     for name, reason in [*route[3].unfit.items()][told:]:
                         yield Rejection(f"{self._name} {name}", reason, count=0)
                     yield self._message(fields, route[1], route[2], now)
+            elif isinstance(record, Dropout):
+                self._dropout += record.duration / 1e3
             elif isinstance(record, Damage) and record.reason not in self._damages and len(self._damages) < 100:
                 self._damages.add(record.reason)
                 yield Rejection(f"{self._name} ULog stream", record.reason)
@@ -174,8 +177,8 @@ class LogStream:
             self._delays += now + self._clock[0] - timestamp / 1e6
             self._delayed += 1
         self._carried.add(address)
-        lost, self._owed = self._owed, 0
-        return SourceMessage(0.0, address, fields, lost, definition=definition, source=SOURCE)
+        lost, self._owed, dropout, self._dropout = self._owed, 0, self._dropout, 0.0
+        return SourceMessage(0.0, address, fields, lost, definition=definition, source=SOURCE, dropout=dropout)
 
     def _count_gap(self, lost: int, now: float) -> None:
         """Count a gap; bounds are those of records of all kinds, by their least and greatest size."""
