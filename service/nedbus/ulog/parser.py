@@ -239,7 +239,7 @@ class UlogParser:
         known = self._known.get(buffer[at : at + _DATA_HEADER])
         kind, content = buffer[at + 2 : at + _HEADER], at + _HEADER
         stop = content + int.from_bytes(buffer[at : at + 2], "little")
-        if kind and not kind.isalpha():
+        if kind and not b"!" <= kind <= b"~":  # a type is a printable character, one of a later version, too
             return _Seen(_Judgement.NONE, stop)
         if stop > len(buffer) or not kind:
             return _Seen(_Judgement.PARTIAL, stop)

@@ -20,7 +20,7 @@ _NAME = re.compile(r"[A-Za-z][\w/-]{0,254}", re.ASCII)
 _KEY = re.compile(rb"(\w+)(\[\d{1,5}\])? (\S[^\0]*)")
 
 Value = int | float | bool | str | bytes
-"""Value of an information or a parameter; an array of numbers is bytes."""
+"""Value of an information or a parameter; an array of numbers, or a value of an unknown type, is bytes."""
 
 
 class UlogError(ValueError):
@@ -176,8 +176,8 @@ def _key_and_value(content: bytes) -> tuple[str, Value]:
     found, value = _KEY.fullmatch(content[1 : 1 + content[0]]), content[1 + content[0] :]
     if not found:
         raise ValueError
-    kind, key = BASIC_TYPES[found[1].decode()], found[3].decode()
-    if found[2]:  # PX4 does not always log the length that it declares
+    kind, key = BASIC_TYPES.get(found[1].decode()), found[3].decode()
+    if found[2] or kind is None:  # PX4 does not always log the length that it declares
         return key, value.decode(errors="replace") if found[1] == b"char" else value
     return key, struct.unpack_from("<" + BASES[kind.base].code, value)[0]
 

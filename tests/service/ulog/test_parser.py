@@ -138,13 +138,21 @@ def test_nested_bomb_is_refused_at_once() -> None:
     assert len([each for each in records if isinstance(each, Damage)]) == 2
 
 
-def test_unknown_record_types_are_skipped() -> None:
-    """Records that a later version of the format adds are no damage."""
+@pytest.mark.parametrize(
+    ("kind", "content"),
+    [
+        ("Z", b"from the future"), ("z", b""), ("7", b"from the future"), ("_", b"private"),
+        ("S", bytes.fromhex("2f731320250cbb12") + b"more"), ("O", struct.pack("<H", 10) + b"more"),
+        ("I", b"\x0dfloat16_t abcxx"), ("M", b"\0\x0down_struct abc123"), ("P", b"\x0bint32_t abc1234more"),
+    ],
+)  # fmt: skip
+def test_extensions_are_skipped(kind: str, content: bytes) -> None:
+    """Types of records and of values that a later version adds, and fields after the known ones, are no damage."""
     writer = UlogWriter()
     writer.define([VLP])
     for number in range(5):
         writer.add(VLP, VehicleLocalPosition(timestamp=number, x=1.0))
-        writer.put("Z", b"from the future")
+        writer.put(kind, content)
     records = parse(bytes(writer.data))
     assert len(data_of(records)) == 5
     assert not any(isinstance(each, Damage) for each in records)
