@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
 _MAX_ROWS: Final = 10_000_000  # rows of a table resampled at a rate; a damaged timestamp must not exhaust memory
+_STALE: Final = 1_000_000  # us; a message that is older than the start of recording by more was sent before it
 _STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
 _PARALLEL: Final = 1 - 1e-9  # cosine above which two quaternions count as equal
 
@@ -83,8 +84,9 @@ def align(
     topics = [topics] if isinstance(topics, str) else topics
     names = [*reference, *(topics or ())]
     streams: Streams
+    start = 0
     if not isinstance(flight, Mapping):
-        streams = read_streams(flight, names if topics else None, vehicle=vehicle)
+        streams, start = read_streams(flight, names if topics else None, vehicle=vehicle)
     elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
         raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}")
     else:
@@ -94,7 +96,7 @@ def align(
         raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
-    times = stamps[on] if isinstance(on, str) else _times(on, stamps.values())
+    times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
     columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
         offset = utc_of(flight, vehicle=vehicle)
@@ -195,17 +197,25 @@ def _stamps(stream: str, messages: MessageArray) -> _Ints:
     return stamps
 
 
-def _times(on: float | Sequence[int] | _Ints, stamps: Iterable[_Ints]) -> _Ints:
-    """Return the given times, or times at the given rate from the first to the last message [us]."""
+def _times(on: float | Sequence[int] | _Ints, stamps: Mapping[str, _Ints], start: int) -> _Ints:
+    """Return the given times, or times at the given rate from the first to the last message [us].
+
+    PX4 logs the last message of a topic that is seldom sent with its old time: rows begin at `start` then.
+    """
     given = np.asarray(on)
     if given.dtype.kind not in "iuf" or given.ndim > 1 or not np.all((given > 0) if given.ndim == 0 else (given >= 0)):
         raise ConfigError("on", f"{on!r:.60} is neither a stream, nor a rate above 0 [Hz], nor times [us]")
     if given.ndim:
         return given.astype(np.int64)
-    every = np.concatenate([*stamps, np.empty(0, np.int64)])
-    every, rate = every[every > 0], float(given)  # a timestamp of 0 is unset
-    count = np.ptp(every) / 1e6 * rate + 1 if len(every) else 0
+    set_ones = {name: times[times > 0] for name, times in stamps.items() if times.any()}  # a timestamp of 0 is unset
+    firsts, lasts = ({name: int(end(each)) for name, each in set_ones.items()} for end in (np.min, np.max))
+    rate, first, last = float(given), min(firsts.values(), default=2**62), max(lasts.values(), default=0)
+    first = start if first + _STALE < start <= last else first
+    count = max(0.0, (last - first) / 1e6 * rate + 1)
     if count > _MAX_ROWS:
-        raise ConfigError("on", f"{rate:g} Hz gives {count:.0f} rows, above {_MAX_ROWS}: use a lower rate, or times")
-    first: int = every.min(initial=2**62)
+        ends = (
+            f"{min(firsts, key=firsts.__getitem__)} begins at {first / 1e6:.0f} s, {max(lasts, key=lasts.__getitem__)}"
+        )
+        advice = "choose topics on one clock, a lower rate, or times"
+        raise ConfigError("on", f"{rate:g} Hz has too many rows: {ends} ends at {last / 1e6:.0f} s: {advice}")
     return first + np.round(np.arange(int(count)) * (1e6 / rate)).astype(np.int64)

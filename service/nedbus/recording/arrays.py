@@ -100,15 +100,15 @@ def read(
     Raises SourceError if the file cannot be read, AddressError if no stream or several streams match topic, vehicle
     and instance, ConfigError if the package that reads the file is not installed.
     """
-    streams = read_streams(path, topic, vehicle=vehicle, instance=instance)
+    streams, _ = read_streams(path, topic, vehicle=vehicle, instance=instance)
     tables = {name: to_dataframe(messages, absent, dataframe) for name, (messages, absent) in streams.items()}
     return next(iter(tables.values())) if isinstance(topic, str) else tables
 
 
 def read_streams(
     path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
-) -> Streams:
-    """Return the messages of one stream, or of several streams of one vehicle.
+) -> tuple[Streams, int]:
+    """Return the messages of one stream, or of several streams of one vehicle, and when recording began.
 
     `topics`: None selects all streams, for a log all of known topics.
     """
@@ -126,7 +126,7 @@ def read_streams(
         streams = {address.stream: found for address, found in flight.read(chosen).items()}
         for warning in flight.warnings:
             _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
-    return streams
+    return streams, flight.start
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
@@ -148,6 +148,7 @@ class Flight:
     """A .ulg log or an .mcap recording open for reading: its addresses, and the messages of each.
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
+    `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
 
     Raises SourceError if the file cannot be read.
     """
@@ -156,7 +157,8 @@ class Flight:
         self.definitions: dict[Address, Definition[Any]]
         self._file: RecordingReader | UlogTopics
         self._invalid: list[str] = []
-        if SUFFIXES.get(path.suffix) == "mcap":
+        self.start = 0
+        if SUFFIXES.get(path.suffix.lower()) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
             if not self.definitions:
@@ -164,6 +166,7 @@ class Flight:
                 raise SourceError(str(path), "this recording has no messages of PX4 topics")
         else:
             log = read_ulog(path, topics=topics)
+            self.start = log.start
             self._file, self.definitions = log, {each: topic.definition for each, topic in log.topics.items()}
         self.addresses = sorted(self.definitions)
 
@@ -195,13 +198,18 @@ class Flight:
             topics = self._file.topics
             return {address: self._valid(address, _decode_ulog(topics[address])) for address in addresses}
         parts = {address: [_decode_cdr(self.definitions[address], [])] for address in addresses}
-        recorded = self._file.messages(parts.keys())
+        recorded, logged, ages = self._file.messages(parts.keys()), list[int](), list[npt.NDArray[np.float64]]()
         while chunk := list(islice(recorded, _CHUNK)):
             by_address: dict[Address, list[RecordedMessage]] = {}
             for each in chunk:
                 by_address.setdefault(each.stream.address, []).append(each)
             for address, own in by_address.items():
                 parts[address].append(_decode_cdr(self.definitions[address], own))
+                times = [each.logged // 1000 for each in own]
+                logged.append(min(times))
+                ages.append(times - parts[address][-1].messages["timestamp"].astype(float))
+        if ages:
+            self.start = max(0, min(logged) - round(np.median(np.concatenate(ages))))
         return {
             address: self._valid(address, _Decoded(*map(np.concatenate, zip(*own, strict=True))))
             for address, own in parts.items()

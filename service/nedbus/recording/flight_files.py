@@ -17,7 +17,7 @@ _MAX_NAMED: Final = 10  # addresses listed in an error
 
 def format_of(path: str | PurePath) -> str:
     """Return the format of a flight file, "ulog" or "mcap"; raise ConfigError for another suffix."""
-    found = SUFFIXES.get(PurePath(path).suffix)
+    found = SUFFIXES.get(PurePath(path).suffix.lower())
     if found is None:
         raise ConfigError(str(path), f"not a flight file: its name must end with {' or '.join(SUFFIXES)}")
     return found
@@ -25,7 +25,7 @@ def format_of(path: str | PurePath) -> str:
 
 def check_recording(path: Path) -> None:
     """Raise ConfigError unless the name of a recording ends with .mcap."""
-    if SUFFIXES.get(path.suffix) != "mcap":
+    if SUFFIXES.get(path.suffix.lower()) != "mcap":
         raise ConfigError(str(path), "not a recording: its name must end with .mcap")
 
 

@@ -91,7 +91,7 @@ def draw(
 
     Raises ConfigError for another suffix, OutputError if the file cannot be written; no partial file is left.
     """
-    if Path(path).suffix not in _SUFFIXES:
+    if Path(path).suffix.lower() not in _SUFFIXES:
         raise ConfigError(str(path), f"not a picture format: the name must end with {' or '.join(_SUFFIXES)}")
     try:
         with whole_file(Path(path), replace=True) as part, warnings.catch_warnings(action="ignore"):

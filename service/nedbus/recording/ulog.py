@@ -37,13 +37,14 @@ class UlogTopics:
     """Topics of a log.
 
     `warnings`: damage and skipped parts; `damaged`: True if damage may have cost messages.
-    `boot_utc`: Unix time of the boot [us], 0 if the log has none.
+    `start`: time at which logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if the log has none.
     Logs have no checksums: damage to the values of a message goes undetected.
     """
 
     topics: dict[Address, UlogTopic]
     warnings: list[str]
     damaged: bool
+    start: int
     boot_utc: int
 
 
@@ -71,4 +72,4 @@ def read_ulog(
                 columns[name] = np.array([row.get(name, kind.absent) for row in rows], BASES[kind.base].code)
                 absent[name] = np.array([name not in row for row in rows])
         found[stream.address] = UlogTopic(stream.address, stream.definition, columns, absent)
-    return UlogTopics(found, reader.warnings, reader.damaged, reader.boot_utc)
+    return UlogTopics(found, reader.warnings, reader.damaged, reader.start, reader.boot_utc)

@@ -84,7 +84,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
         path = rest if rest and "/" not in kind_name else text
-        kind_of_file = SUFFIXES.get(PurePath(path.partition("?")[0]).suffix)
+        kind_of_file = SUFFIXES.get(PurePath(path.partition("?")[0]).suffix.lower())
         hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
         raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")

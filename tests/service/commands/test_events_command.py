@@ -18,6 +18,7 @@ import pytest
 import nedbus
 from nedbus import Address
 from nedbus.events import KINDS
+from nedbus.sources import source_text_of_file
 from nedbus.transport import Session
 from tests.flights.messages import VALID, VLP, message
 from tests.flights.ulogs import LOGS, UlogWriter
@@ -383,3 +384,17 @@ def test_every_kind_is_on_the_page() -> None:
     rows = re.findall(r"^\| (`.*?) \| .*(?:bad|watch|info)", PAGE.read_text(), re.MULTILINE)
     kinds = [kind for row in rows for kind in re.findall(r"`(\w+)`", row)]
     assert sorted(kinds) == sorted(KINDS)
+
+
+def test_suffix_in_capitals_is_read_by_every_command(log: Path, tmp_path: Path) -> None:
+    """A card formatted as FAT has FLIGHT.ULG, and a converted file may be FLIGHT.MCAP."""
+    flight, converted = tmp_path / "FLIGHT.ULG", tmp_path / "FLIGHT.MCAP"
+    flight.write_bytes(log.read_bytes())
+    for arguments in (["convert", flight, converted], ["plot", flight, "-o", tmp_path / "A.PNG"], ["plot", converted]):
+        shown = run_command(*map(str, arguments))
+        assert shown.exit_code == 0, shown.err
+    for path in (flight, converted):
+        assert run_command("events", str(path)).out == run_command("events", str(log)).out
+        assert run_command("why", str(path)).exit_code == 0
+        assert nedbus.addresses_of(path) == nedbus.addresses_of(log)
+        assert str(path) in str(source_text_of_file(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from itertools import repeat
@@ -16,7 +17,9 @@ from nedbus.errors import AddressError, ConfigError
 from nedbus.recording import RecordingWriter
 from nedbus_msgs import MESSAGES, Address, Definition, Message, Provenance, definition_of
 from nedbus_msgs.arrays import MessageArray, arrays_of
-from tests.flights.messages import VLP
+from tests.flights.messages import VLP, message
+from tests.flights.replays import convert_replay
+from tests.flights.ulogs import UlogWriter
 
 BOOT = 1_700_000_000_000_000  # us, of a vehicle in 2023
 
@@ -134,6 +137,38 @@ def test_rate_covers_the_flight() -> None:
     for rate in (20, 0, -1, math.nan, math.inf, "*", None, [-1], [[1]], ["a"], np.int64(0)):
         with pytest.raises((ConfigError, AddressError), match=r"^on[: ]"):
             nedbus.align({VLP: POSITIONS, "home_position": late}, on=rate)  # type: ignore[arg-type] # these are the mistakes
+
+
+@pytest.mark.parametrize("form", ["ULG", "MCAP"])
+def test_rows_begin_with_the_recording(tmp_path: Path, form: str) -> None:
+    """PX4 logs the last message of a topic with its old time: no rows are empty until something was recorded."""
+    log = tmp_path / "a.ULG"
+    times = range(300_000_000, 310_000_000, 20_000)
+    writer = UlogWriter()
+    writer.define([VLP])
+    struct.pack_into("<Q", writer.data, 8, times.start)  # the start of logging
+    writer.put("F", b"home_position:uint64_t timestamp;float x;")
+    writer.put("A", struct.pack("<BH", 0, 99) + b"home_position")
+    writer.put("D", struct.pack("<HQf", 99, 250_000_000, 7.0))
+    for time in times:
+        writer.add(VLP, message(time))
+    writer.write(log)
+    path = log if form == "ULG" else tmp_path / "a.MCAP"
+    if form == "MCAP":
+        convert_replay(f"ulog:{log}", path)
+    table = nedbus.align(path, on=50)
+    assert table["timestamp"].tolist() == list(times)
+    assert table["home_position.age"][[0, -1]].tolist() == pytest.approx([50.0, 59.98])
+    assert set(table["home_position.x"]) == {7.0}
+
+
+def test_streams_on_two_clocks_are_an_error() -> None:
+    """The error names the streams at both ends, and what to do."""
+    unix = array_of(VLP, {"timestamp": BOOT}, {"timestamp": BOOT + 1_000_000})
+    with pytest.raises(
+        ConfigError, match=f"home_position begins at 1 s, {VLP} ends at 1700000001 s: choose topics on one"
+    ):
+        nedbus.align({VLP: unix, "home_position": HOME}, on=50)
 
 
 def test_odd_streams_are_aligned(tmp_path: Path) -> None:

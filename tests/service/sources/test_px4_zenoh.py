@@ -322,6 +322,14 @@ def test_definition_that_is_none_is_refused(tmp_path: Path, text: str, where: st
         parse_source(f"px4-zenoh:?msg={tmp_path}/empty").open_source(vehicle="1")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+def test_definition_in_any_encoding_is_read(tmp_path: Path, encoding: str) -> None:
+    """A byte order mark, and a degree sign of an old editor, also in the file of a nested message."""
+    (tmp_path / "Esc.msg").write_text("float32 rpm # 10 °\n", encoding=encoding)
+    (tmp_path / "EscStatus.msg").write_text("uint64 timestamp # °\nEsc[2] esc\n", encoding=encoding)
+    parse_source(f"px4-zenoh:?msg={tmp_path}/EscStatus.msg").open_source(vehicle="1")
+
+
 def test_hostile_input_is_counted(listener: Listener, raw: Session) -> None:
     """Wrong hashes, lengths, attachments and random payloads: counted, and each key named, which the log does once."""
     good = Px4(raw)

@@ -48,7 +48,7 @@ def drawn(background: Background) -> Any:
 def test_every_kind_of_geojson_is_drawn(tmp_path: Path, shape: object, lengths: list[int]) -> None:
     """Each geometry of GeoJSON becomes lines and points in metres from the common origin."""
     file = tmp_path / "field.geojson"
-    file.write_text(json.dumps(shape))
+    file.write_text(json.dumps(shape), encoding="utf-8-sig")  # with the byte order mark of editors on Windows
     lines = drawn(Background(file)).data_source.data
     assert [len(each) for each in lines["east"]] == lengths
     assert (lines["east"][0][0], lines["north"][0][0]) == pytest.approx((0.0, 0.0), abs=1e-6)
