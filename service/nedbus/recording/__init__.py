@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .mcap_writer import RecordingWriter
     from .plot import MAX_STREAMS, draw
     from .recorder import Recorder
-    from .ulog import UlogColumns, UlogTopic, UlogTopics, read_ulog
+    from .ulog import UlogTopic, UlogTopics, read_ulog
     from .ulog_reader import UlogReader, UlogStream
     from .utc import UtcOffset, utc_of
 else:
@@ -26,7 +26,7 @@ else:
         ("", "alignment"): "align",
         ("", "arrays"): "Flight addresses_of missing_of read",
         ("", "flight_files"): "SUFFIXES check_recording format_of matching",
-        ("", "ulog"): "UlogColumns UlogTopic UlogTopics read_ulog",
+        ("", "ulog"): "UlogTopic UlogTopics read_ulog",
         ("", "ulog_reader"): "UlogReader UlogStream",
         ("", "utc"): "UtcOffset utc_of",
         ("mcap", "mcap_reader"): "RecordedMessage RecordedStream RecordingReader",
@@ -38,7 +38,7 @@ else:
 
 __all__ = [
     "MAX_STREAMS", "SUFFIXES", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader",
-    "RecordingWriter", "UlogColumns", "UlogReader", "UlogStream", "UlogTopic", "UlogTopics", "UtcOffset",
+    "RecordingWriter", "UlogReader", "UlogStream", "UlogTopic", "UlogTopics", "UtcOffset",
     "addresses_of", "align", "check_recording", "draw", "format_of", "matching", "missing_of", "read", "read_ulog",
     "utc_of",
 ]  # fmt: skip

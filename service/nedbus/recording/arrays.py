@@ -31,7 +31,8 @@ from nedbus_msgs import (
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
 from .flight_files import SUFFIXES, matching, require_one_vehicle, single_match
-from .ulog import UlogTopic, UlogTopics, read_ulog
+from .ulog import UlogTopic, read_ulog
+from .ulog_reader import UlogReader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -149,15 +150,17 @@ class Flight:
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
     `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
+    `boot_utc`: Unix time of the boot according to the log's information [us], 0 if unknown.
 
     Raises SourceError if the file cannot be read.
     """
 
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
         self.definitions: dict[Address, Definition[Any]]
-        self._file: RecordingReader | UlogTopics
+        self._file: RecordingReader | UlogReader
+        self._topics: dict[Address, UlogTopic] = {}
         self._invalid: list[str] = []
-        self.start = 0
+        self.start = self.boot_utc = 0
         if SUFFIXES.get(path.suffix.lower()) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
@@ -166,21 +169,17 @@ class Flight:
                 raise SourceError(str(path), "this recording has no messages of PX4 topics")
         else:
             log = read_ulog(path, topics=topics)
-            self.start = log.start
-            self._file, self.definitions = log, {each: topic.definition for each, topic in log.topics.items()}
+            self._file, self._topics = log.reader, log.topics
+            self.start, self.boot_utc = log.reader.start, log.reader.boot_utc
+            self.definitions = {each: topic.definition for each, topic in log.topics.items()}
         self.addresses = sorted(self.definitions)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if not isinstance(self._file, UlogTopics):
+        if not isinstance(self._file, UlogReader):
             self._file.close()
-
-    @property
-    def boot_utc(self) -> int:
-        """Unix time of the boot according to the log's information [us]; 0 if unknown."""
-        return self._file.boot_utc if isinstance(self._file, UlogTopics) else 0
 
     @property
     def warnings(self) -> list[str]:
@@ -194,9 +193,8 @@ class Flight:
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
-        if isinstance(self._file, UlogTopics):
-            topics = self._file.topics
-            return {address: self._valid(address, _decode_ulog(topics[address])) for address in addresses}
+        if isinstance(self._file, UlogReader):
+            return {address: self._valid(address, _decode_ulog(self._topics[address])) for address in addresses}
         parts = {address: [_decode_cdr(self.definitions[address], [])] for address in addresses}
         recorded, logged, ages = self._file.messages(parts.keys()), list[int](), list[npt.NDArray[np.float64]]()
         while chunk := list(islice(recorded, _CHUNK)):

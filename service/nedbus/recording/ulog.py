@@ -15,49 +15,37 @@ from nedbus_msgs import BASES, TOPICS, Address, Definition
 
 from .ulog_reader import UlogReader, UlogStream
 
-UlogColumns = Mapping[str, npt.NDArray[np.generic]]
-"""The values of all messages of one topic, by PX4's field name; array fields have one row per message."""
-
 
 @dataclass(frozen=True, slots=True)
 class UlogTopic:
     """One topic of a log; its message definition is known to nedbus, or comes from the log.
 
+    `columns`: its values by PX4's field name, with one row per message for an array.
     `absent`: for columns of another type than the message has, a mask of the messages whose value does not fit.
     """
 
-    address: Address
     definition: Definition[Any]
-    columns: UlogColumns
+    columns: Mapping[str, npt.NDArray[np.generic]]
     absent: Mapping[str, npt.NDArray[np.bool_]]
 
 
 @dataclass(slots=True)
 class UlogTopics:
-    """Topics of a log.
+    """Topics of a log, and the reader with what else it has found.
 
-    `warnings`: damage and skipped parts; `damaged`: True if damage may have cost messages.
-    `start`: time at which logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if the log has none.
     Logs have no checksums: damage to the values of a message goes undetected.
     """
 
     topics: dict[Address, UlogTopic]
-    warnings: list[str]
-    damaged: bool
-    start: int
-    boot_utc: int
+    reader: UlogReader
 
 
-def read_ulog(
-    path: Path, *, topics: Collection[str] | None = TOPICS, vehicle: str | None = None, default_vehicle: str = "1"
-) -> UlogTopics:
+def read_ulog(path: Path, *, topics: Collection[str] | None = TOPICS) -> UlogTopics:
     """Read topics of a log, all for None; messages unknown to nedbus are defined by the log's formats.
-
-    `vehicle`: by default the log's MAV_SYS_ID; `default_vehicle` is used if the log has none.
 
     Raises SourceError if the file is not a ULog file, or has none of the topics.
     """
-    reader = UlogReader(path, topics=topics, vehicle=vehicle, default_vehicle=default_vehicle)
+    reader = UlogReader(path, topics=topics, vehicle=None, default_vehicle="1")
     payloads: defaultdict[UlogStream, bytearray] = defaultdict(bytearray)
     for stream, payload in reader.messages():
         payloads[stream] += payload
@@ -71,5 +59,5 @@ def read_ulog(
             for name, kind in types.items():
                 columns[name] = np.array([row.get(name, kind.absent) for row in rows], BASES[kind.base].code)
                 absent[name] = np.array([name not in row for row in rows])
-        found[stream.address] = UlogTopic(stream.address, stream.definition, columns, absent)
-    return UlogTopics(found, reader.warnings, reader.damaged, reader.start, reader.boot_utc)
+        found[stream.address] = UlogTopic(stream.definition, columns, absent)
+    return UlogTopics(found, reader)

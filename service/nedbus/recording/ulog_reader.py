@@ -9,23 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 from zlib import crc32
 
+from nedbus import ulog
 from nedbus.errors import AddressError, SourceError
-from nedbus.ulog import (
-    Damage,
-    Data,
-    Dropout,
-    Fitting,
-    Header,
-    Information,
-    Parameter,
-    Record,
-    Subscription,
-    UlogError,
-    UlogParser,
-    Unsubscription,
-    address_of,
-    definition_of,
-)
 from nedbus_msgs import TOPICS, Address, Definition
 
 from .flight_files import open_flight
@@ -45,8 +30,8 @@ class UlogStream:
 
     address: Address
     definition: Definition[Any]
-    subscription: Subscription
-    fitting: Fitting
+    subscription: ulog.Subscription
+    fitting: ulog.Fitting
     first: UlogStream | None
     checksum: int | None
 
@@ -65,7 +50,8 @@ class UlogStream:
 class UlogReader:
     """Read the messages of a log in the log's order; the memory does not grow with the log.
 
-    The options are those of `read_ulog`. `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if
+    `topics`: those to read, None for all. `vehicle`: by default the log's MAV_SYS_ID, else `default_vehicle`.
+    `start`: when logging began [us]. `boot_utc`: Unix time of the boot [us], 0 if
     the log has none so far. `position`: bytes read so far.
     `dropout`: seconds that the logger lost, until the caller resets it. `streams`: those with a message so far.
     `damaged`: True if damage may have cost messages so far.
@@ -76,7 +62,7 @@ class UlogReader:
     ) -> None:
         self._path, self._topics = path, topics
         self._vehicle, self._system_id = vehicle, default_vehicle
-        self._parser = UlogParser(verify=True)
+        self._parser = ulog.UlogParser(verify=True)
         self._places = self.start = self.boot_utc = self.position = 0
         self._warnings: list[str] = []
         self._by_id: dict[int, UlogStream | None] = {}
@@ -99,10 +85,10 @@ class UlogReader:
 
         Raises SourceError if the file is not a ULog file, or has none of the topics.
         """
-        streams = self._by_id
+        streams, data = self._by_id, ulog.Data
         for records in self._records():
             for record in records:
-                if not isinstance(record, Data):
+                if not isinstance(record, data):
                     self._note(record)
                     continue
                 subscription, payload = record
@@ -125,7 +111,7 @@ class UlogReader:
             wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
             raise SourceError(str(self._path), "; ".join([f"this log has no message of {wanted}", *self.warnings[:3]]))
 
-    def _records(self) -> Iterator[list[Record]]:
+    def _records(self) -> Iterator[list[ulog.Record]]:
         try:
             with open_flight(self._path) as file:
                 while chunk := file.read(_CHUNK):
@@ -133,39 +119,41 @@ class UlogReader:
                     yield self._parser.feed(chunk)
             yield self._parser.close()
             self.damaged |= self._parser.undecodable > 0
-        except UlogError as exc:
+        except ulog.UlogError as exc:
             raise SourceError(str(self._path), f"not a readable ULog file: {exc}") from exc
         except OSError as exc:
             raise SourceError(str(self._path), (exc.strerror or str(exc)).lower()) from exc
 
-    def _note(self, record: Record) -> None:
+    def _note(self, record: ulog.Record) -> None:
         """Take what is not a message."""
-        if isinstance(record, Header):
+        if isinstance(record, ulog.Header):
             self.start = record.timestamp
-        elif isinstance(record, Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int):
+        elif (
+            isinstance(record, ulog.Information) and record.key == "boot_time_utc_us" and isinstance(record.value, int)
+        ):
             self.boot_utc = record.value
-        elif isinstance(record, Dropout):
+        elif isinstance(record, ulog.Dropout):
             self.dropout += record.duration / 1e3
-        elif isinstance(record, Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
+        elif isinstance(record, ulog.Parameter) and record.key == "MAV_SYS_ID" and record.value in range(1, 256):
             self._system_id = str(record.value)
-        elif isinstance(record, Subscription):
+        elif isinstance(record, ulog.Subscription):
             self._subscribed[record.name] += 1
-        elif isinstance(record, Unsubscription):
+        elif isinstance(record, ulog.Unsubscription):
             self._by_id.pop(record.message_id, None)
-        elif isinstance(record, Damage):
+        elif isinstance(record, ulog.Damage):
             self._places += not record.is_end
             self.damaged |= not record.is_end
             if self._places <= _MAX_NAMED:
                 self._warnings.append(f"{'truncated' if record.is_end else 'damaged'}: {record.reason}")
 
-    def _open(self, subscription: Subscription) -> UlogStream | None:
+    def _open(self, subscription: ulog.Subscription) -> UlogStream | None:
         """Return the stream of a subscription with its first message; None if it is not wanted, or cannot be used."""
         topic, names = subscription.name, {field.name for field in subscription.fields}
         if self._topics is not None and topic not in self._topics:
             return None
         self._vehicle = self._vehicle or self._system_id
         try:
-            definition, address = definition_of(subscription), address_of(self._vehicle, subscription)
+            definition, address = ulog.definition_of(subscription), ulog.address_of(self._vehicle, subscription)
         except ValueError as exc:
             self._warnings.append(f"skipped {topic}: {exc}")
             self.damaged |= topic in TOPICS or isinstance(exc, AddressError)
@@ -175,7 +163,7 @@ class UlogReader:
             self.damaged = True
         if "timestamp" not in names:
             return None
-        fitting, checksum = Fitting(definition, subscription), 0 if self._subscribed[topic] > 1 else None
+        fitting, checksum = ulog.Fitting(definition, subscription), 0 if self._subscribed[topic] > 1 else None
         stream = UlogStream(address, definition, subscription, fitting, self.streams.get(address), checksum)
         if stream.first is None:
             self.streams[address] = stream

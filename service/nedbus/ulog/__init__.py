@@ -3,7 +3,7 @@
 from .definitions import Fitting, address_of, definition_of
 from .layout import PayloadField, PayloadLayout
 from .parser import UlogParser
-from .records import (  # fmt: skip  # fmt: skip
+from .records import (
     Damage,
     Data,
     Dropout,
@@ -23,26 +23,7 @@ from .records import (  # fmt: skip  # fmt: skip
 )
 
 __all__ = [
-    "Damage",
-    "Data",
-    "Dropout",
-    "Fitting",
-    "Format",
-    "Header",
-    "Information",
-    "LoggedText",
-    "MultiInformation",
-    "Parameter",
-    "ParameterDefault",
-    "PayloadField",
-    "PayloadLayout",
-    "Record",
-    "Subscription",
-    "Sync",
-    "UlogError",
-    "UlogParser",
-    "Unsubscription",
-    "Value",
-    "address_of",
-    "definition_of",
+    "Damage", "Data", "Dropout", "Fitting", "Format", "Header", "Information", "LoggedText", "MultiInformation",
+    "Parameter", "ParameterDefault", "PayloadField", "PayloadLayout", "Record", "Subscription", "Sync", "UlogError",
+    "UlogParser", "Unsubscription", "Value", "address_of", "definition_of",
 ]  # fmt: skip
