@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from mcap.records import Channel, McapRecord, Message, Schema, Statistics
 
@@ -24,6 +24,8 @@ from nedbus_msgs import (
 )
 
 from .mcap_chunks import READ_ERRORS, ChunkFile, records_of
+
+_MAX_DEFINITIONS: Final = 16_000  # fields, or the time of as many: 32 for a message, 1 for 256 characters
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +67,7 @@ class RecordingReader:
         self.warnings = self._file.warnings
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
+        self._left = _MAX_DEFINITIONS
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
         for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
@@ -161,7 +164,11 @@ class RecordingReader:
     def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
         """Return the definition and layout of a schema; raise ValueError if no layout matches."""
         if schema.id not in self._layouts:
+            if self._left < 0:
+                raise ValueError("the definitions of this file are more than those of 250 topics of PX4")
+            self._left -= len(schema.data) // 256
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
+            self._left -= 32 + len(read_msg(text))
             definition = known or define_msg(schema.name.rpartition("/")[2], text)
             layout = known.find_layout(field.name for field in read_msg(text)) if known else definition.current
             if layout is None:

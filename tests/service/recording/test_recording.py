@@ -464,3 +464,21 @@ def test_pipe_is_refused_in_a_sentence(tmp_path: Path, suffix: str) -> None:
     folder.mkdir()
     with pytest.raises(SourceError, match="not a regular file"):
         nedbus.read(folder)
+
+
+def test_private_records_are_skipped(tmp_path: Path) -> None:
+    """Records that MCAP leaves to applications, and those of a later version, are no damage where they may be."""
+    path, extended = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    convert_replay(f"ulog:{write_log(tmp_path / 'a.ulg', range(0, 10_000_000, 1000))}", path)
+    content, at, parts = path.read_bytes(), 8, list[bytes]()
+    while content[at] != 15:  # the end of the data section
+        end = at + 9 + int.from_bytes(content[at + 1 : at + 9], "little")
+        parts.append(content[at:end])
+        if content[end] not in (7, 8):  # behind a chunk and its index
+            parts.append(b"\x90\x05" + bytes(7) + b"hello\x30\x03" + bytes(7) + b"new")
+        at = end
+    extended.write_bytes(content[:8] + b"".join(parts) + content[at:])
+    with RecordingReader(extended, vehicle="1") as reader:
+        reader.check()
+        assert (reader.damaged, sum(reader.counts.values())) == (False, 10_000)
+        assert not [warning for warning in reader.warnings if "skipped" in warning]

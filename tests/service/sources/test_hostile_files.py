@@ -114,6 +114,8 @@ SCHEMAS: Final[dict[str, Callable[[], Iterable[str]]]] = {
     ],
     "recursive": lambda: [STAMP + f"A[999] a{PART}A\nB[999] b{PART}B\nA[999] a\n"],
     "name": lambda: [STAMP + "A[999] " + "a" * 200_000 + f"{PART}A\nuint8 b\n"],
+    "messages": lambda: [f"{STAMP}uint8 f{number}" for number in range(5000)],
+    "large messages": lambda: [STAMP + "".join(f"uint8 f{i}_{n}\n" for i in range(250)) for n in range(400)],
     "annotation": lambda: [STAMP + "uint8 a # @range" + " " * 100_000, STAMP + "uint8 a # @range " + "9" * 100_000],
 }  # fmt: skip
 
