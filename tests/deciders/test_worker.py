@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, cast
@@ -79,8 +79,7 @@ class FakeRegistry:
     def is_published(self, address: Address) -> bool:
         return address in self.open
 
-    def alive(self, addresses: Collection[Address]) -> set[Address]:
-        return {address for address in addresses if address in self.open}
+    is_alive = is_published
 
     def is_read(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at

@@ -159,7 +159,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.alive([address])  # a round trip: the router has processed all earlier declarations
+        self._publishers.is_alive(address)  # a round trip: the router has processed all earlier declarations
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

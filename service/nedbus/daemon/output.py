@@ -21,6 +21,7 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 _log = logging.getLogger(__name__)
 
 _STALE: Final = 3.0  # s without a message after which a live address is no longer published
+_MANY: Final = 10  # addresses from which the router is asked for all of them at once
 _MAX_ADDRESSES: Final = 1000  # of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one for each `where`
 _MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may have sent
@@ -99,7 +100,7 @@ class SourceOutput:
         for address in new:
             if self._registry.is_published(address):
                 raise AddressInUseError(address)
-        alive = self._registry.alive(new)
+        alive = self._registry.alive_among(new) if len(new) > _MANY else None
         for address, definition in run.addresses.items():
             self.claim(address, definition, lossless=lossless, alive=alive)
 
@@ -120,7 +121,7 @@ class SourceOutput:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             return
-        if address in (self._registry.alive([address]) if alive is None else alive):
+        if self._registry.is_alive(address) if alive is None else address in alive:
             text = f"{address} is also published by another process: readers receive both"
             _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)

@@ -104,15 +104,15 @@ class PublisherRegistry:
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
-    def alive(self, addresses: Collection[Address]) -> set[Address]:
-        """Return the addresses that are published, by this or another process; ask the router once for each vehicle."""
-        prefix = self.prefix
-        if len(addresses) == 1:
-            asked = {address.alive_key(prefix=prefix) for address in addresses}
-        else:
-            asked = {Selection(ANY, each.vehicle).alive_key_expr(prefix=prefix) for each in addresses}
+    def is_alive(self, address: Address) -> bool:
+        """Return True if an address is published, by this or another process."""
+        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_TOKENS_TIMEOUT))
+
+    def alive_among(self, addresses: Collection[Address]) -> set[Address]:
+        """Return those that are published, as `is_alive` does, with one question to the router for each vehicle."""
+        asked = {Selection(ANY, each.vehicle).alive_key_expr(prefix=self.prefix) for each in addresses}
         found = {key for each in asked for key in alive_keys(self._session, each, timeout=_TOKENS_TIMEOUT)}
-        return {address for address in addresses if address.alive_key(prefix=prefix) in found}
+        return {address for address in addresses if address.alive_key(prefix=self.prefix) in found}
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""
