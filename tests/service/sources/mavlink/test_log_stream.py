@@ -11,6 +11,7 @@ from contextlib import closing, suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final, cast
 
 import pytest
@@ -20,8 +21,12 @@ from pyulog import ULog
 from nedbus.client import LogStreamStatus
 from nedbus.sources import LiveSource, Rejection, SourceMessage, parse_source
 from nedbus.sources.mavlink import log_receiver, reader
-from nedbus.sources.mavlink.log_client import LogStreamClient, LogStreamTimes
+from nedbus.sources.mavlink.log_client import LogStatus, LogStreamClient, LogStreamTimes
+from nedbus.sources.mavlink.log_reassembly import Piece
+from nedbus.sources.mavlink.log_stream import LogStream
+from nedbus.sources.options import MavlinkOptions
 from nedbus.ulog import Data, UlogParser
+from tests.flights.ulogs import write_raw_log
 from tests.peers.ports import free_port
 from tests.peers.px4_log_stream import SHORT, START, STREAMS, Px4LogStream, read_recording
 from tests.waits import DEADLINE
@@ -262,3 +267,20 @@ def test_hostile_vehicle_harms_no_other() -> None:
     assert any("loop cannot be decoded" in reason for _, reason in reasons), reasons
     assert any("two fields are called timestamp" in reason for _, reason in reasons), reasons
     assert len(reasons) < 110
+
+
+def test_stream_of_an_old_release_is_converted(tmp_path: Path) -> None:
+    """Fields of another type are read as those of a log are, and the message after a dropout has its duration."""
+    fields = "uint64_t timestamp;int32_t cell_count;"
+    rows = [("battery_status", (number, count)) for number, count in enumerate((6, 300, -1, 7))]
+    path = write_raw_log(tmp_path / "a.ulg", {"battery_status": (fields, "Qi")}, rows)
+    data = path.read_bytes() + struct.pack("<HBH", 2, ord("O"), 1500) + struct.pack("<HBHQi", 14, ord("D"), 0, 9, 8)
+    client = cast("LogStreamClient", SimpleNamespace(status=LogStatus("streaming")))
+    stream = LogStream("1", MavlinkOptions(log=frozenset({"1"})), client)
+    found = list(stream.add(Piece("delivered", data, begins=True), 0.0))
+    messages = [each for each in found if isinstance(each, SourceMessage)]
+    assert [each.fields.get("cell_count") for each in messages] == [6, None, None, 7, 8]
+    assert [each.dropout for each in messages] == [0.0, 0.0, 0.0, 0.0, 1.5]
+    [rejection] = [each for each in found if isinstance(each, Rejection)]
+    assert rejection.reason == "battery_status: left out cell_count where it is not a uint8, such as 300"
+    assert rejection.count == 0
