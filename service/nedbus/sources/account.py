@@ -44,7 +44,8 @@ class _EventOptions(RecordedOptions):
 
 def open_file(path: Path, *, vehicle: str | None = None) -> ReplayRun:
     """Open a .ulg or .mcap file for its events, as `read_account` does."""
-    spec = replace(parse_source(source_text_of_file(path)), options=_EventOptions(vehicle=vehicle))
+    spec = parse_source(source_text_of_file(path, vehicle=vehicle))
+    spec = replace(spec, options=_EventOptions(vehicle=vehicle))
     return cast("ReplaySource", spec.open_source(vehicle="1")).open()
 
 
