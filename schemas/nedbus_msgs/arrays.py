@@ -164,8 +164,9 @@ class Arrays(Generic[M]):
         return payloads
 
     def decode_cdr(self, payloads: Sequence[bytes], layout: Layout) -> tuple[MessageArray, npt.NDArray[np.bool_]]:
-        """Return the messages of CDR payloads, and a mask of the valid ones; all fields of the layout are the model's.
+        """Return the messages of CDR payloads, and a mask of the valid ones.
 
+        Fields of the layout that the model lacks are left out, all others have the types of the model.
         A payload that is False in the mask may still be valid: `decode_with` and the model decide.
         """
         zeros = cdr_layout(layout).zeros
@@ -176,7 +177,7 @@ class Arrays(Generic[M]):
         whole = layout is self.definition.current
         array = packed.astype(self.dtype) if whole else self.absent(len(payloads))
         for name, kind in layout.types.items():
-            if not whole:
+            if not whole and name in self.definition.types:
                 array[name] = packed[name]
             if kind.base == "bool":
                 offset = cdr_layout(layout).offsets[name]

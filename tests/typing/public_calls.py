@@ -97,6 +97,8 @@ def read() -> None:
     assert_type(nedbus.read("flight.ulg", vehicle=7), nedbus.MessageArray)
     assert_type(nedbus.read("flight.ulg", dataframe="pandas"), pd.DataFrame)
     assert_type(nedbus.read("flight.ulg", ["home_position"]), dict[str, nedbus.MessageArray])
+    assert_type(nedbus.read(["a.ulg", "b.ulg"], ["home_position"]), dict[str, nedbus.MessageArray])
+    assert_type(nedbus.align(["a.ulg", "b.ulg"], on=10.0), nedbus.MessageArray)
     assert_type(nedbus.read("flight.ulg", ["*"], dataframe="pandas"), dict[str, pd.DataFrame])
     assert_type(nedbus.align("flight.ulg", on=50.0, method="linear"), nedbus.MessageArray)
     assert_type(nedbus.align({}, on=[1, 2], utc=True, dataframe="pandas"), pd.DataFrame)

@@ -40,8 +40,9 @@ TopicArgument = Annotated[
         metavar="TOPIC", help="TOPIC, or VEHICLE/TOPIC/INSTANCE as printed by nedbus list", show_default=False
     ),
 ]
-FileArgument = Annotated[
-    Path | None, typer.Argument(metavar="[FILE]", help="A .ulg log or .mcap recording, instead of live vehicles")
+FilesArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(metavar="[FILE]...", help="Logs or recordings (.ulg, .mcap, .tlog), instead of live vehicles"),
 ]
 TopicOption = Annotated[str, typer.Option("--topic", "-t", help='Topic, "*" for all')]
 DefaultTopicOption = Annotated[str | None, typer.Option("--topic", "-t", help=_TOPIC)]

@@ -11,11 +11,12 @@ from nedbus.extras import lazy_exports
 
 if TYPE_CHECKING:
     from .alignment import align
-    from .arrays import Flight, addresses_of, missing_of, read
-    from .flight_files import SUFFIXES, check_recording, format_of, matching
+    from .arrays import Flight, addresses_of, missing_of
+    from .flight_files import check_recording, distinct_names, find_format, format_of, matching, open_flight
     from .mcap_reader import RecordedMessage, RecordedStream, RecordingReader
     from .mcap_writer import RecordingWriter
     from .plot import MAX_STREAMS, draw
+    from .reading import read
     from .recorder import Recorder
     from .ulog import UlogTopic, UlogTopics, read_ulog
     from .ulog_reader import UlogReader, UlogStream
@@ -24,8 +25,9 @@ else:
     # No submodule may share the name of an export: importing it would replace the export.
     _NAMES = {
         ("", "alignment"): "align",
-        ("", "arrays"): "Flight addresses_of missing_of read",
-        ("", "flight_files"): "SUFFIXES check_recording format_of matching",
+        ("", "arrays"): "Flight addresses_of missing_of",
+        ("", "reading"): "read",
+        ("", "flight_files"): "check_recording distinct_names find_format format_of matching open_flight",
         ("", "ulog"): "UlogTopic UlogTopics read_ulog",
         ("", "ulog_reader"): "UlogReader UlogStream",
         ("", "utc"): "UtcOffset utc_of",
@@ -37,8 +39,8 @@ else:
     __getattr__ = lazy_exports(__name__, {name: place for place, names in _NAMES.items() for name in names.split()})
 
 __all__ = [
-    "MAX_STREAMS", "SUFFIXES", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader",
-    "RecordingWriter", "UlogReader", "UlogStream", "UlogTopic", "UlogTopics", "UtcOffset",
-    "addresses_of", "align", "check_recording", "draw", "format_of", "matching", "missing_of", "read", "read_ulog",
+    "MAX_STREAMS", "Flight", "RecordedMessage", "RecordedStream", "Recorder", "RecordingReader", "RecordingWriter",
+    "UlogReader", "UlogStream", "UlogTopic", "UlogTopics", "UtcOffset", "addresses_of", "align", "check_recording",
+    "distinct_names", "draw", "find_format", "format_of", "matching", "missing_of", "open_flight", "read", "read_ulog",
     "utc_of",
 ]  # fmt: skip

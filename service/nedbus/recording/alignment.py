@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
 
 import numpy as np
@@ -13,7 +12,8 @@ from nedbus.errors import AddressError, ConfigError
 from nedbus_msgs import ANY, BY_TOPIC, DEFAULT_TOPIC, UnitQuaternion, is_unix_time
 from nedbus_msgs.arrays import MessageArray
 
-from .arrays import Library, Pandas, Polars, Streams, missing_of, read_streams, to_dataframe
+from .arrays import Library, Pandas, Polars, Streams, missing_of, to_dataframe
+from .reading import FlightPath, read_streams
 from .utc import utc_of
 
 if TYPE_CHECKING:
@@ -32,6 +32,9 @@ _Floats = npt.NDArray[np.float64]
 _Ints = npt.NDArray[np.int64]
 
 
+_Flights = FlightPath | Sequence[FlightPath] | Mapping[str, MessageArray]
+
+
 class _AlignOptions(TypedDict, total=False):
     topics: Sequence[str] | None
     on: str | float | Sequence[int] | npt.NDArray[np.int64]
@@ -41,19 +44,13 @@ class _AlignOptions(TypedDict, total=False):
 
 
 @overload
-def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: None = None, **options: Unpack[_AlignOptions]
-) -> MessageArray: ...
+def align(flight: _Flights, *, dataframe: None = None, **options: Unpack[_AlignOptions]) -> MessageArray: ...
 @overload
-def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Pandas, **options: Unpack[_AlignOptions]
-) -> pd.DataFrame: ...
+def align(flight: _Flights, *, dataframe: Pandas, **options: Unpack[_AlignOptions]) -> pd.DataFrame: ...
 @overload
+def align(flight: _Flights, *, dataframe: Polars, **options: Unpack[_AlignOptions]) -> pl.DataFrame: ...
 def align(
-    flight: str | Path | Mapping[str, MessageArray], *, dataframe: Polars, **options: Unpack[_AlignOptions]
-) -> pl.DataFrame: ...
-def align(
-    flight: str | Path | Mapping[str, MessageArray],
+    flight: _Flights,
     *,
     topics: Sequence[str] | None = None,
     on: str | float | Sequence[int] | npt.NDArray[np.int64] = DEFAULT_TOPIC,
@@ -62,7 +59,7 @@ def align(
     utc: bool = False,
     dataframe: Library = None,
 ) -> Any:
-    """Return several streams of a .ulg log, an .mcap recording, or arrays from `read` as one table, aligned in time.
+    """Return several streams of one or several files, or arrays from `read`, as one table, aligned in time.
 
     `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
     `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
@@ -74,6 +71,8 @@ def align(
     "nearest" uses the message nearest in time; its age can be negative. "linear" interpolates floats between the
     messages before and after, unit quaternions by slerp and angles the shorter way around. Other types, floats across
     a change of a reset counter, and rows after the last message keep the last value.
+    Several files are aligned in UTC: `timestamp` is Unix time, a stream is `<vehicle>/<stream>`, as in `read`, and the
+    rows are by default the positions of the first vehicle.
     `utc`: add a column `utc` with the UTC from `utc_of`, NaT if it has none.
 
     Raises ConfigError if a stream spans several boots of a vehicle, which share no time base, and the errors of `read`.
@@ -92,14 +91,16 @@ def align(
     else:
         everything = not topics or ANY in topics
         streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
-    if isinstance(on, str) and on not in streams:
-        raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
+    if isinstance(on, str):
+        on = _find_stream(on, streams)
+        reference = [on]
     streams = {name: streams[name] for name in [*reference, *streams]}
     stamps = {name: _stamps(name, messages) for name, (messages, _) in streams.items()}
     times = stamps[on] if isinstance(on, str) else _times(on, stamps, start)
     columns: dict[str, npt.NDArray[Any]] = {"timestamp": times.astype(np.uint64)}
     if utc:
-        offset = utc_of(flight, vehicle=vehicle)
+        several = {name: messages for name, (messages, _) in streams.items()}
+        offset = utc_of(flight if isinstance(flight, FlightPath | Mapping) else several, vehicle=vehicle)
         columns["utc"] = np.full(len(times), np.datetime64("NaT", "us"))
         if offset:
             unix = offset.unix_us(times)
@@ -125,6 +126,14 @@ def align(
     return to_dataframe(table, {name: mask for name, mask in absent.items() if mask.any()}, dataframe)
 
 
+def _find_stream(on: str, streams: Streams) -> str:
+    """Return the stream of this name, of the first vehicle that has it; raise AddressError if there is none."""
+    for name in streams:
+        if f"/{name}".endswith(f"/{on}"):
+            return name
+    raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
+
+
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:
     return [(name, messages.dtype[name]) for name in messages.dtype.names or ()]
 
@@ -147,7 +156,7 @@ def _look_up(stamps: _Ints, times: _Ints, method: str) -> tuple[_Ints, _Ints, _F
 
 def _interpolate(stream: str, values: MessageArray, following: MessageArray, weight: _Floats) -> None:
     """Interpolate the floats of `values` towards `following`, in place."""
-    definition = BY_TOPIC.get(stream.partition("/")[0])
+    definition = next((BY_TOPIC[part] for part in stream.split("/") if part in BY_TOPIC), None)
     rules = definition.rules if definition else ()
     quaternions = {name for rule in rules if isinstance(rule, UnitQuaternion) for name in rule.fields}
     for name, _ in _fields(values):

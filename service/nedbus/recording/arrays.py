@@ -1,46 +1,28 @@
-"""Loading of topics of a log or recording as NumPy arrays or data frames, with PX4's own types."""
+"""Messages of a log or recording as NumPy arrays or data frames, with PX4's own types."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from nedbus.errors import ConfigError, DecodeError, SourceError
+from nedbus.errors import ConfigError, DecodeError
 from nedbus.extras import needs
-from nedbus.log_event import about
-from nedbus_msgs import (
-    ANY,
-    DEFAULT_TOPIC,
-    TOPICS,
-    Address,
-    Definition,
-    Message,
-    Selection,
-    decode_with,
-    upgrade_with,
-    vehicle_name,
-)
+from nedbus_msgs import TOPICS, Address, Definition, Message, decode_with, upgrade_with
 from nedbus_msgs.arrays import MessageArray, arrays_of
 
-from .flight_files import SUFFIXES, matching, require_one_vehicle, single_match
+from .flight_files import find_format
 from .ulog import UlogTopic, read_ulog
 from .ulog_reader import UlogReader
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import polars as pl
-
-    from .mcap_reader import RecordedMessage, RecordedStream, RecordingReader
-
-_log = logging.getLogger(__name__)
+    from .mcap_reader import RecordedMessage, RecordedStream
 
 _CHUNK: Final = 65536  # messages of a recording decoded at a time
 
@@ -53,81 +35,6 @@ Streams = dict[str, tuple[MessageArray, Absent]]
 Pandas = Literal["pandas"]
 Polars = Literal["polars"]
 Library = Literal["pandas", "polars"] | None
-
-
-class _StreamFilter(TypedDict, total=False):
-    vehicle: str | int
-    instance: int | None
-
-
-@overload
-def read(
-    path: str | Path, topic: str = ..., *, dataframe: None = None, **stream: Unpack[_StreamFilter]
-) -> MessageArray: ...
-@overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Pandas, **stream: Unpack[_StreamFilter]) -> pd.DataFrame: ...
-@overload
-def read(path: str | Path, topic: str = ..., *, dataframe: Polars, **stream: Unpack[_StreamFilter]) -> pl.DataFrame: ...
-@overload
-def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: None = None, **stream: Unpack[_StreamFilter]
-) -> dict[str, MessageArray]: ...
-@overload
-def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Pandas, **stream: Unpack[_StreamFilter]
-) -> dict[str, pd.DataFrame]: ...
-@overload
-def read(
-    path: str | Path, topic: list[str] | tuple[str, ...], *, dataframe: Polars, **stream: Unpack[_StreamFilter]
-) -> dict[str, pl.DataFrame]: ...
-def read(
-    path: str | Path,
-    topic: str | list[str] | tuple[str, ...] = DEFAULT_TOPIC,
-    *,
-    vehicle: str | int = ANY,
-    instance: int | None = None,
-    dataframe: Library = None,
-) -> Any:
-    """Return one topic of a .ulg log or an .mcap recording as a structured array with one element per message.
-
-    The columns are the fields of the message with PX4's types (`nedbus.dtype_of(topic)`).
-    Fields that a layout or source lacks are NaN, false or 0; `nedbus.missing_of` names them.
-    Invalid messages and damaged parts of the file are skipped and logged.
-    `dataframe`: return a pandas or polars data frame, with array fields as columns `delta_xy[0]`, `delta_xy[1]` and
-    nulls for missing fields; a pandas data frame names these in `attrs["missing"]`.
-    A list of topics, or of streams such as "sensor_gps/1", returns a dict by stream, for one vehicle. "*" selects all
-    streams of the file, including messages that are defined only by the file.
-
-    Raises SourceError if the file cannot be read, AddressError if no stream or several streams match topic, vehicle
-    and instance, ConfigError if the package that reads the file is not installed.
-    """
-    streams, _ = read_streams(path, topic, vehicle=vehicle, instance=instance)
-    tables = {name: to_dataframe(messages, absent, dataframe) for name, (messages, absent) in streams.items()}
-    return next(iter(tables.values())) if isinstance(topic, str) else tables
-
-
-def read_streams(
-    path: str | Path, topics: str | Sequence[str] | None, *, vehicle: str | int, instance: int | None = None
-) -> tuple[Streams, int]:
-    """Return the messages of one stream, or of several streams of one vehicle, and when recording began.
-
-    `topics`: None selects all streams, for a log all of known topics.
-    """
-    path, vehicle = Path(path).expanduser(), vehicle_name(vehicle)
-    names = [ANY] if topics is None else [topics] if isinstance(topics, str) else topics
-    wanted = {name.partition("/")[0] for name in names}
-    with Flight(path, topics=None if ANY in wanted and topics is not None else wanted | TOPICS.keys()) as flight:
-        chosen: dict[Address, None] = {}
-        for name in names:
-            topic, _, number = name.rpartition("/")
-            parts = (topic, vehicle, int(number)) if number.isdecimal() else (name, vehicle, instance)
-            select = single_match if isinstance(topics, str) else matching
-            chosen |= dict.fromkeys(select(path, flight.addresses, Selection(*parts)))
-        require_one_vehicle(path, chosen, vehicle)
-        streams = {address.stream: found for address, found in flight.read(chosen).items()}
-        for warning in flight.warnings:
-            _log.warning("%s: %s", path, warning, extra=about("damaged", source=str(path), reason=warning))
-    return streams, flight.start
 
 
 def missing_of(messages: MessageArray) -> frozenset[str]:
@@ -146,7 +53,7 @@ def addresses_of(path: str | Path) -> list[Address]:
 
 
 class Flight:
-    """A .ulg log or an .mcap recording open for reading: its addresses, and the messages of each.
+    """A .ulg log, an .mcap recording or a .tlog open for reading: its addresses, and the messages of each.
 
     `topics`: the topics to read from a log, None for all; `definitions`: the message definition of each address.
     `start`: when recording began, on the clock of the messages' timestamps [us]; of a recording, once it is read.
@@ -157,16 +64,18 @@ class Flight:
 
     def __init__(self, path: Path, *, topics: Collection[str] | None = TOPICS) -> None:
         self.definitions: dict[Address, Definition[Any]]
-        self._file: RecordingReader | UlogReader
+        self._file: Any
         self._topics: dict[Address, UlogTopic] = {}
         self._invalid: list[str] = []
+        self._decode: Callable[[Definition[Any], Sequence[Any]], _Decoded] = _decode_cdr
         self.start = self.boot_utc = 0
-        if SUFFIXES.get(path.suffix.lower()) == "mcap":
+        if (form := find_format(path)) == "mcap":
             reader = needs("mcap", f"{__package__}.mcap_reader").RecordingReader(path, vehicle="1")
             self._file, self.definitions = reader, {stream.address: stream.definition for stream in reader.counts}
-            if not self.definitions:
-                reader.close()
-                raise SourceError(str(path), "this recording has no messages of PX4 topics")
+        elif form == "tlog":  # converted by the source, which is above this package
+            reader = needs("mavlink", "nedbus.sources.mavlink.tlog").TlogReader(path)
+            self._file, self._decode, self.definitions = reader, _decode_fields, reader.find_definitions()
+            self.boot_utc = reader.boot_utc
         else:
             log = read_ulog(path, topics=topics)
             self._file, self._topics = log.reader, log.topics
@@ -189,20 +98,22 @@ class Flight:
     @property
     def damaged(self) -> bool:
         """True if damage has cost messages so far."""
-        return self._file.damaged
+        return bool(self._file.damaged)
 
     def read(self, addresses: Collection[Address]) -> dict[Address, tuple[MessageArray, Absent]]:
         """Return for each address its messages, and for each missing field a mask of the messages that lack it."""
         if isinstance(self._file, UlogReader):
             return {address: self._valid(address, _decode_ulog(self._topics[address])) for address in addresses}
-        parts = {address: [_decode_cdr(self.definitions[address], [])] for address in addresses}
+        parts = {address: [self._decode(self.definitions[address], [])] for address in addresses}
         recorded, logged, ages = self._file.messages(parts.keys()), list[int](), list[npt.NDArray[np.float64]]()
         while chunk := list(islice(recorded, _CHUNK)):
-            by_address: dict[Address, list[RecordedMessage]] = {}
+            by_address: dict[Address, list[Any]] = {}
             for each in chunk:
-                by_address.setdefault(each.stream.address, []).append(each)
+                by_address.setdefault(each.address, []).append(each)
             for address, own in by_address.items():
-                parts[address].append(_decode_cdr(self.definitions[address], own))
+                parts[address].append(self._decode(self.definitions[address], own))
+                if self._decode is _decode_fields:
+                    continue
                 times = [each.logged // 1000 for each in own]
                 logged.append(min(times))
                 ages.append(times - parts[address][-1].messages["timestamp"].astype(float))
@@ -271,7 +182,8 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
     for index, recorded in enumerate(chunk):
         by_stream.setdefault(recorded.stream, []).append(index)
     for stream, rows in by_stream.items():
-        if stream.layout.types.items() <= definition.types.items():
+        known = {name: kind for name, kind in stream.layout.types.items() if name in definition.known_types}
+        if known.items() <= definition.types.items():
             payloads = [chunk[index].payload for index in rows]
             decoded.messages[rows], decoded.valid[rows] = arrays.decode_cdr(payloads, stream.layout)
         for name in definition.all_fields - (definition.plan(stream.layout.fields).provided - stream.missing):
@@ -284,6 +196,18 @@ def _decode_cdr(definition: Definition[Any], chunk: Sequence[RecordedMessage]) -
     if alone:
         decoded.messages[list(alone)] = arrays.of(list(alone.values()))
         decoded.valid[list(alone)] = True
+    return decoded
+
+
+def _decode_fields(definition: Definition[Any], chunk: Sequence[Any]) -> _Decoded:
+    """Decode messages that have their fields by name."""
+    decoded = _Decoded.empty(definition, len(chunk))
+    for index, each in enumerate(chunk):
+        with suppress(ValidationError):
+            message = upgrade_with(definition, each.fields)
+            decoded.messages[index], decoded.valid[index] = arrays_of(definition).of([message])[0], True
+            for name in definition.all_fields - message.model_fields_set:
+                decoded.absent[name][index] = True
     return decoded
 
 

@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import BinaryIO, Final
 
 from nedbus.errors import AddressError, ConfigError, SourceError
 from nedbus_msgs import Address, Selection
 
-SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap"}
+SUFFIXES: Final[Mapping[str, str]] = {".ulg": "ulog", ".mcap": "mcap", ".tlog": "tlog"}
 """The source type that replays a file, by suffix."""
 
 _MAX_NAMED: Final = 10  # addresses listed in an error
+_UNREADABLE: Final = {
+    b"ULogKey": "an encrypted log: decrypt it with PX4's Tools/decrypt_ulog.py and the private key first",
+    b"PK\x03\x04": "a zip archive: unpack it first",
+    b"\x1f\x8b": "compressed by gzip: unpack it first",
+    b"version https://git-lfs": "a pointer of Git LFS in place of the file: fetch the file with 'git lfs pull'",
+    b"SQLite format 3": "a bag in SQLite: convert it to MCAP with 'ros2 bag convert', storage_id: mcap",
+    b"": "an empty file: copy it again, or look for another log of this flight",
+}  # by first bytes
+
+
+def find_format(path: str | PurePath) -> str | None:
+    """Return the format of a flight file, "ulog", "mcap" or "tlog", by its suffix; a folder is a bag of MCAP files."""
+    suffix = PurePath(str(path).lower().removesuffix(".zstd")).suffix
+    return SUFFIXES.get(suffix) or ("mcap" if Path(path).expanduser().is_dir() else None)
 
 
 def format_of(path: str | PurePath) -> str:
-    """Return the format of a flight file, "ulog" or "mcap"; raise ConfigError for another suffix."""
-    found = SUFFIXES.get(PurePath(path).suffix.lower())
+    """Return the format of a flight file; raise ConfigError for another suffix."""
+    found = find_format(path)
     if found is None:
-        raise ConfigError(str(path), f"not a flight file: its name must end with {' or '.join(SUFFIXES)}")
+        reason = _why_unreadable(Path(path).expanduser())
+        raise ConfigError(str(path), reason or f"not a flight file: its name must end with {' or '.join(SUFFIXES)}")
     return found
 
 
@@ -34,9 +51,55 @@ def open_flight(path: Path) -> BinaryIO:
     try:
         if path.exists() and not path.is_file():
             raise SourceError(str(path), "not a regular file: save the data to a file first")
+        if reason := _why_unreadable(path):
+            raise SourceError(str(path), reason)
         return path.open("rb")
     except OSError as exc:
         raise SourceError(str(path), (exc.strerror or str(exc)).lower()) from exc
+
+
+def recording_files(path: Path) -> tuple[list[Path], list[str]]:
+    """Return the MCAP files of a recording, which may be a folder of ROS 2, in order, and the names of missing ones.
+
+    Raises SourceError for a folder without MCAP files.
+    """
+    if not path.is_dir():
+        return [path], []
+    found = [each for each in path.iterdir() if each.is_file() and find_format(each) == "mcap"]
+    if not found:
+        reason = next(filter(None, map(_why_unreadable, sorted(path.glob("*.db3")))), "")
+        raise SourceError(str(path), reason or "no .mcap file is in this folder")
+    found.sort(key=lambda each: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", each.name)])
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text(errors="replace") if metadata.exists() else ""
+    listed = re.findall(r"^\s*- (?:\S*/)?([^\s/]+\.mcap)\b", text, re.MULTILINE)
+    return found, sorted({*listed} - {each.name.removesuffix(".zstd") for each in found})
+
+
+def _why_unreadable(path: Path) -> str:
+    """Return what a file is in place of a flight, and what to do; "" if it may be one, or cannot be opened."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        head = file.read(32)
+    return next(
+        (text for first, text in _UNREADABLE.items() if head.startswith(first) and bool(head) == bool(first)), ""
+    )
+
+
+def distinct_names(flights: Sequence[tuple[Path, Collection[str]]]) -> list[dict[str, str]]:
+    """Return for each file the names of its vehicles; a vehicle that is in several files is named after its file."""
+    counts = Counter(vehicle for _, vehicles in flights for vehicle in vehicles)
+    taken, found = set(counts), []
+    for path, vehicles in flights:
+        base = re.sub(r"[^A-Za-z0-9_-]", "_", path.name.partition(".")[0])[:60] or "flight"
+        names = {}
+        for vehicle in sorted(vehicles):
+            free = (each for each in (base, *(f"{base}_{number}" for number in range(2, 999))) if each not in taken)
+            names[vehicle] = vehicle if counts[vehicle] == 1 else next(free)
+            taken.add(names[vehicle])
+        found.append(names)
+    return found
 
 
 def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> list[Address]:

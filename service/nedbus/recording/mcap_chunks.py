@@ -9,11 +9,13 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Collection, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from tempfile import TemporaryFile
+from typing import Any, BinaryIO, Final
 from zlib import crc32
 
 from lz4.frame import LZ4FrameDecompressor
@@ -30,6 +32,9 @@ from .flight_files import open_flight
 
 READ_ERRORS: Final = (McapError, ValueError, struct.error, ZstdError, MemoryError, OverflowError, RuntimeError)
 """Errors that the mcap package and the decompressors raise for a damaged file."""
+
+ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+"""The first bytes of zstd frames."""
 
 _RECORD_HEAD: Final = struct.Struct("<BQ")  # opcode, length
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")  # times, size and CRC of the records, length of the compression's name
@@ -64,11 +69,13 @@ class ChunkFile:
         self.warnings: list[str] = []
         self.damaged = False
         self._file = open_flight(path)
+        if self._read(0, len(ZSTD_MAGIC)) == ZSTD_MAGIC:
+            self._file = self._decompress(self._file)
         self.close = self._file.close
         self._size = os.fstat(self._file.fileno()).st_size
         if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             self.close()
-            raise SourceError(str(path), "not a readable MCAP file")
+            raise SourceError(str(path), "; ".join(["not a readable MCAP file", *self.warnings]))
         self._chunks: list[ChunkIndex] = []
         self.summary: list[McapRecord] = []
         try:
@@ -93,6 +100,22 @@ class ChunkFile:
         self.damaged |= lost
         if len(self.warnings) <= _MAX_WARNINGS and warning not in self.warnings:
             self.warnings.append(warning if len(self.warnings) < _MAX_WARNINGS else "further damage is not listed")
+
+    def _decompress(self, packed: BinaryIO) -> BinaryIO:
+        """Return a temporary file with the contents of a compressed one, up to where that is damaged."""
+        packed.seek(0)
+        with packed, ExitStack() as on_error:
+            unpacked = on_error.enter_context(TemporaryFile())
+            limit = max(_MAX_SMALL_CHUNK, _MAX_RATIO * os.fstat(packed.fileno()).st_size)
+            try:
+                for part in ZstdDecompressor().read_to_iter(packed):
+                    unpacked.write(part)
+                    if unpacked.tell() > limit:
+                        raise ZstdError(f"more than {limit} bytes")
+            except ZstdError as exc:
+                self.warn(f"the compressed file is damaged: {exc}", lost=True)
+            on_error.pop_all()
+        return unpacked
 
     def _read(self, start: int, size: int) -> bytes:
         self._file.seek(start)
@@ -135,11 +158,18 @@ class ChunkFile:
             opcode, length = _RECORD_HEAD.unpack_from(begin) if len(begin) >= _RECORD_HEAD.size else (0, 0)
             end = offset + _RECORD_HEAD.size + length
             own_length = _own_length(opcode, begin[_RECORD_HEAD.size :])
-            if opcode == 0 or end > self._size or own_length not in (None, length):
+            if opcode == 0 or end > self._size or not _is_length(length, own_length):
                 self.warn(f"truncated or damaged: skipped from byte {offset} of {self._size} to the end", lost=True)
                 return
             if opcode in _LENGTHS:
                 return
+            # The index after a chunk has no checksum: one flipped bit makes its opcode that of a message.
+            if (
+                after_chunk
+                and opcode == Opcode.MESSAGE
+                and _own_length(Opcode.MESSAGE_INDEX, begin[_RECORD_HEAD.size :]) == length
+            ):
+                opcode = Opcode.MESSAGE_INDEX
             if opcode == Opcode.MESSAGE_INDEX and not after_chunk:
                 self.warn(f"damaged: skipped the chunk before byte {offset}", lost=True)
             after_chunk = opcode == Opcode.CHUNK or (after_chunk and opcode == Opcode.MESSAGE_INDEX)
@@ -156,6 +186,11 @@ def _own_length(opcode: int, body: bytes) -> int | None:
         before = _CHUNK_HEAD.size + int.from_bytes(body[_CHUNK_HEAD.size - 4 : _CHUNK_HEAD.size], "little")
         return before + 8 + int.from_bytes(body[before : before + 8], "little")
     return _LENGTHS.get(opcode)
+
+
+def _is_length(length: int, own_length: int | None) -> bool:
+    """Return whether a record has its own length, or a few bytes more, in which no other record fits."""
+    return own_length is None or 0 <= length - own_length < _RECORD_HEAD.size
 
 
 def records_of(part: bytes) -> Iterator[McapRecord]:
@@ -181,7 +216,8 @@ def _unpack_chunk(record: bytes) -> bytes:
     """Decompress the records of a chunk; raise one of READ_ERRORS if it is damaged or too large."""
     body = ReadDataStream(BytesIO(record[_RECORD_HEAD.size :]))
     chunk = Chunk.read(body)
-    if _RECORD_HEAD.unpack_from(record) != (Opcode.CHUNK, body.count):  # all zeros would parse as an empty chunk
+    opcode, length = _RECORD_HEAD.unpack_from(record)
+    if opcode != Opcode.CHUNK or not _is_length(length, body.count):  # all zeros would parse as an empty chunk
         raise ValueError(len(record))
     size, packed = chunk.uncompressed_size, chunk.data
     if size > max(_MAX_SMALL_CHUNK, min(_MAX_CHUNK, _MAX_RATIO * len(packed))):

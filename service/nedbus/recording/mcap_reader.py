@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
 from mcap.records import Channel, McapRecord, Message, Schema, Statistics
+from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 from nedbus.errors import AddressError, SourceError
 from nedbus_msgs import (
     BY_TOPIC,
     Address,
     Definition,
+    FieldType,
     Layout,
     define_msg,
     is_vehicle_input,
@@ -23,7 +26,10 @@ from nedbus_msgs import (
     split_ros2_topic,
 )
 
-from .mcap_chunks import READ_ERRORS, ChunkFile, records_of
+from .flight_files import recording_files
+from .mcap_chunks import READ_ERRORS, ZSTD_MAGIC, ChunkFile, records_of
+
+_MAX_PAYLOAD: Final = 2**16  # bytes of a message that the recorder compressed
 
 _MAX_DEFINITIONS: Final = 16_000  # fields, or the time of as many: 32 for a message, 1 for 256 characters
 
@@ -49,29 +55,89 @@ class RecordedMessage(NamedTuple):
     payload: bytes
     logged: int
 
+    @property
+    def address(self) -> Address:
+        """The address of its stream."""
+        return self.stream.address
+
 
 class RecordingReader:
-    """An MCAP file open for reading, one chunk at a time; a context manager.
+    """An MCAP file, or a folder with the files of one bag, open for reading, one chunk at a time; a context manager.
 
     `vehicle`: the vehicle of channels that name none; `counts`: the number of messages per stream.
     `warnings`: the damage found, complete after `messages` or `check` has finished.
 
-    Raises SourceError if the file is not MCAP, cannot be opened, or has no readable message because of damage.
+    Raises SourceError if a file is not MCAP, cannot be opened, or if there is no message of a PX4 topic, with reasons.
     """
 
     def __init__(self, path: str | Path, *, vehicle: str) -> None:
-        self.path = Path(path).expanduser()
+        paths, lacking = recording_files(Path(path).expanduser())
+        self._lacking = [f"{name} of this bag is not there" for name in lacking]
+        self._files: list[_RecordedFile] = []
+        try:
+            self._files += (_RecordedFile(each, vehicle) for each in paths)
+            if not self.counts:
+                reasons = [*self.warnings[:3]] or ["nothing in it is of px4_msgs"]
+                problem = "no message can be read" if self.damaged else "this recording has no messages of PX4 topics"
+                raise SourceError(str(path), f"{problem}: {'; '.join(reasons)}")
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def counts(self) -> dict[RecordedStream, int]:
+        """The number of messages per stream."""
+        return {stream: count for file in self._files for stream, count in file.counts.items()}
+
+    @property
+    def warnings(self) -> list[str]:
+        """Damage and what was left out so far."""
+        where = {file: f"{file.name}: " if len(self._files) > 1 else "" for file in self._files}
+        return [*self._lacking, *(f"{where[file]}{text}" for file in self._files for text in file.chunks.warnings)]
+
+    @property
+    def damaged(self) -> bool:
+        """True if damage cost messages."""
+        return bool(self._lacking) or any(file.chunks.damaged for file in self._files)
+
+    def check(self) -> None:
+        """Read everything to complete `warnings` and `damaged`, and to correct `counts` for damage."""
+        for file in self._files:
+            file.check()
+
+    def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
+        """Yield the messages in file order; `only`: those of these addresses."""
+        for file in self._files:
+            yield from file.messages(only)
+
+    def close(self) -> None:
+        """Close the files."""
+        for file in self._files:
+            file.chunks.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class _RecordedFile:
+    """One MCAP file open for reading, with the schemas and channels known so far."""
+
+    def __init__(self, path: Path, vehicle: str) -> None:
+        self.name = path.name
         self._vehicle = vehicle
-        self._file = ChunkFile(self.path)
-        self.close = self._file.close
-        self.warnings = self._file.warnings
+        self.chunks = ChunkFile(path)
         self._schemas: dict[int, Schema] = {}
         self._layouts: dict[int, tuple[Definition[Any], Layout]] = {}  # by schema
         self._left = _MAX_DEFINITIONS
         self._streams: dict[int, RecordedStream | None] = {}  # by channel
         totals: dict[int, int] = {}
-        for record in sorted(self._file.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
-            self._learn(record)
+        for record in sorted(self.chunks.summary, key=lambda record: isinstance(record, Channel)):  # schemas first
+            # A summary may repeat channels without their schemas, which are then in the chunks.
+            if not isinstance(record, Channel) or record.schema_id in {0, *self._schemas}:
+                self._learn(record)
             if isinstance(record, Statistics):
                 totals = record.channel_message_counts
         self._all_known = bool(totals) and totals.keys() <= self._streams.keys()
@@ -80,35 +146,22 @@ class RecordingReader:
         else:
             self.counts = self._count()
 
-    @property
-    def damaged(self) -> bool:
-        """True if damage cost messages."""
-        return self._file.damaged
-
     def check(self) -> None:
-        """Read the whole file to complete `warnings` and `damaged`, and to correct `counts` for damage."""
-        for _ in self._file.parts(self._channels()):
+        for _ in self.chunks.parts(self._channels()):
             pass
-        if self.damaged:
+        if self.chunks.damaged:
             self.counts = self._count()
 
     def messages(self, only: Collection[Address] | None = None) -> Iterator[RecordedMessage]:
-        """Yield the messages in file order; `only`: those of these addresses."""
-        for part in self._file.parts(self._channels(only)):
+        for part in self.chunks.parts(self._channels(only)):
             try:
                 for record in records_of(part):
                     if not isinstance(record, Message):
                         self._learn(record)
                     elif (stream := self._stream(record)) and (only is None or stream.address in only):
-                        yield RecordedMessage(stream, record.data, record.log_time)
+                        yield RecordedMessage(stream, _unpack(record.data), record.log_time)
             except READ_ERRORS:
-                self._file.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+                self.chunks.warn("damaged: a chunk has an invalid record; skipped the rest of that chunk", lost=True)
 
     def _channels(self, only: Collection[Address] | None = None) -> list[int] | None:
         """Return the readable channels, of these addresses or all; None while not all channels are known."""
@@ -118,12 +171,7 @@ class RecordingReader:
         return [number for number, stream in streams if stream and (only is None or stream.address in only)]
 
     def _count(self) -> dict[RecordedStream, int]:
-        """Count the readable messages; raise SourceError if damage leaves none."""
-        counts = Counter(recorded.stream for recorded in self.messages())
-        if not counts and self.damaged:
-            self.close()
-            raise SourceError(str(self.path), f"no message can be read: {'; '.join(self.warnings[:3])}")
-        return counts
+        return dict(Counter(recorded.stream for recorded in self.messages()))
 
     def _learn(self, record: McapRecord) -> None:
         """Register a schema or channel; the first with its id wins."""
@@ -135,7 +183,7 @@ class RecordingReader:
     def _stream(self, message: Message) -> RecordedStream | None:
         if message.channel_id not in self._streams:
             self._streams[message.channel_id] = None
-            self._file.warn(
+            self.chunks.warn(
                 f"skipped the messages of channel {message.channel_id}: its channel record is lost", lost=True
             )
         return self._streams[message.channel_id]
@@ -143,26 +191,27 @@ class RecordingReader:
     def _describe(self, schema: Schema | None, channel: Channel) -> RecordedStream | None:
         if schema is None or not schema.name.startswith(("px4_msgs/", "px4_msgs_old/")):
             return None
-        if channel.message_encoding != "cdr" or schema.encoding != "ros2msg":
-            self._file.warn(
-                f"skipped {channel.topic}: its encoding is {channel.message_encoding} with {schema.encoding}, not cdr"
-                " with ros2msg"
-            )
-            return None
         try:
-            definition, layout = self._layout(schema)
+            if schema.encoding and (channel.message_encoding, schema.encoding) != ("cdr", "ros2msg"):
+                forms = f"{channel.message_encoding} with {schema.encoding}"
+                raise ValueError(
+                    f"its encoding is {forms}, not cdr with ros2msg: record it where px4_msgs is installed"
+                )
+            if not schema.data:
+                raise ValueError(f"the file has no definition of {schema.name}: record it where px4_msgs is installed")
+            definition, layout = self._layout(schema, channel.topic)
             address = self._address(channel)
             expected = BY_TOPIC.get(address.topic, definition)
             if expected is not definition:
                 raise ValueError(f"its messages are {definition.name}, but {address.topic} has {expected.name}")
         except (AddressError, ValueError) as exc:
-            self._file.warn(f"skipped {channel.topic}: {exc}")
+            self.chunks.warn(f"skipped {channel.topic}: {exc}")
             return None
         missing = frozenset(channel.metadata.get("missing", "").split())
         return RecordedStream(address, definition, layout, missing, is_vehicle_input(channel.topic))
 
-    def _layout(self, schema: Schema) -> tuple[Definition[Any], Layout]:
-        """Return the definition and layout of a schema; raise ValueError if no layout matches."""
+    def _layout(self, schema: Schema, topic: str) -> tuple[Definition[Any], Layout]:
+        """Return the definition and layout of a schema; raise ValueError if it is not that of this message."""
         if schema.id not in self._layouts:
             if self._left < 0:
                 raise ValueError("the definitions of this file are more than those of 250 topics of PX4")
@@ -170,11 +219,19 @@ class RecordingReader:
             known, text = ros2_types().get(schema.name), schema.data.decode(errors="replace")
             self._left -= 32 + len(read_msg(text))
             definition = known or define_msg(schema.name.rpartition("/")[2], text)
-            layout = known.find_layout(field.name for field in read_msg(text)) if known else definition.current
-            if layout is None:
-                raise ValueError("no known layout has these fields")
-            self._layouts[schema.id] = definition, layout
+            types = {field.name: field.type for field in read_msg(text)} if known else definition.types
+            same = (each for each in definition.layouts.values() if [*each.types.items()] == [*types.items()])
+            self._layouts[schema.id] = definition, next(same, None) or self._own_layout(definition, types, topic)
         return self._layouts[schema.id]
+
+    def _own_layout(self, known: Definition[Any], types: Mapping[str, FieldType], topic: str) -> Layout:
+        """Return a layout that only this file has; further fields are left out, and named."""
+        wrong = [name for name, kind in types.items() if kind not in known.known_types.get(name, {kind})]
+        if lacking := sorted({*wrong, *(known.always - types.keys())}):
+            raise ValueError(f"its definition of {', '.join(lacking)} is not that of any PX4 release")
+        if unknown := sorted(types.keys() - known.known_types.keys()):
+            self.chunks.warn(f"{topic}: {', '.join(unknown)} left out: not in any {known.name} that nedbus knows")
+        return Layout("of the file", "", types=types)
 
     def _address(self, channel: Channel) -> Address:
         metadata = channel.metadata
@@ -183,3 +240,11 @@ class RecordingReader:
             return Address(metadata["vehicle"], metadata["topic"], None if instance is None else int(instance))
         namespace, topic, instance_number = split_ros2_topic(channel.topic)
         return Address(namespace.replace("/", "-") or self._vehicle, topic, instance_number)
+
+
+def _unpack(payload: bytes) -> bytes:
+    """Decompress a message that rosbag2 compressed by itself; if that fails, leave it for its decoder to reject."""
+    with suppress(ZstdError):
+        if payload.startswith(ZSTD_MAGIC) and frame_content_size(payload) <= _MAX_PAYLOAD:
+            return ZstdDecompressor().decompress(payload, max_output_size=_MAX_PAYLOAD)
+    return payload

@@ -1,6 +1,6 @@
 """Sources of messages: `parse_source` reads a text such as `ulog:flight.ulg?speed=2&vehicle=7`."""
 
-from .account import KEPT_OF_FILE, FileAccount, follow, open_file, read_account, times_of
+from .account import KEPT_OF_FILE, FileAccount, Flights, follow, read_account
 from .conversion import convert
 from .kinds import SOURCE_KINDS, SourceKind, SourceSpec, parse_source, source_text_of_file
 from .mavlink.link import Link, open_link, parse_link
@@ -8,8 +8,7 @@ from .mavlink.senders import Senders, why_ignored
 from .source import Absence, LiveSource, Rejection, ReplayRun, ReplaySource, Source, SourceContext, SourceMessage
 
 __all__ = [
-    "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Link", "LiveSource", "Rejection", "ReplayRun",
+    "KEPT_OF_FILE", "SOURCE_KINDS", "Absence", "FileAccount", "Flights", "Link", "LiveSource", "Rejection", "ReplayRun",
     "ReplaySource", "Senders", "Source", "SourceContext", "SourceKind", "SourceMessage", "SourceSpec", "convert",
-    "follow", "open_file", "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "times_of",
-    "why_ignored",
+    "follow", "open_link", "parse_link", "parse_source", "read_account", "source_text_of_file", "why_ignored",
 ]  # fmt: skip

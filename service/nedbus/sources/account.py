@@ -1,16 +1,21 @@
-"""Detect the events of all vehicles in a log or a recording, by replaying it."""
+"""Detect the events of all vehicles in logs and recordings, by replaying them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from heapq import merge
+from itertools import chain, islice
+from operator import attrgetter
 from pathlib import Path
+from statistics import median
 from typing import Final, cast
 
 from nedbus import recording
-from nedbus.errors import InvalidMessageError
+from nedbus.errors import InvalidMessageError, SourceError
 from nedbus.events import EKF_SELECTOR, Account, Times
-from nedbus_msgs import BY_TOPIC, TOPICS, Address, codec_of, upgrade_fields
+from nedbus_msgs import BY_TOPIC, TOPICS, codec_of, upgrade_fields
 
 from .kinds import parse_source, source_text_of_file
 from .options import RecordedOptions
@@ -19,13 +24,14 @@ from .source import ReplayRun, ReplaySource, SourceMessage
 KEPT_OF_FILE: Final = 100_000
 """Events kept per file; the oldest are discarded."""
 
+_AHEAD: Final = 1000  # messages read for the start of a file
 _CHECK_INTERVAL: Final = 0.5  # s of flight time between checks for silent streams and settled events
 _SETTLE_TIME: Final = 10.0  # s after the last message; events that have not settled by then are reported as they are
 
 
 @dataclass(frozen=True, slots=True)
 class FileAccount:
-    """The events of a whole file. Times are seconds since its first message; `end` is the time of the last one."""
+    """The events of whole files. Times are seconds since their first message; `end` is the time of the last one."""
 
     account: Account
     times: Times
@@ -42,48 +48,104 @@ class _EventOptions(RecordedOptions):
         return {*TOPICS, EKF_SELECTOR}
 
 
-def open_file(path: Path, *, vehicle: str | None = None) -> ReplayRun:
-    """Open a .ulg or .mcap file for its events, as `read_account` does."""
-    spec = parse_source(source_text_of_file(path, vehicle=vehicle))
-    spec = replace(spec, options=_EventOptions(vehicle=vehicle))
-    return cast("ReplaySource", spec.open_source(vehicle="1")).open()
+class Flights:
+    """The messages of one file, or those of several files on one axis of UTC.
 
+    A vehicle that is in several files is named after its file in each. `ended`: the vehicles whose file has ended.
 
-def read_account(path: Path, *, vehicle: str | None = None) -> FileAccount:
-    """Return the events of a .ulg or .mcap file; `vehicle` renames the vehicle of a file that has only one.
-
-    Raises ConfigError or SourceError if the file cannot be read.
+    Raises ConfigError or SourceError if a file cannot be read.
     """
-    run = open_file(path, vehicle=vehicle)
-    account, due = Account(KEPT_OF_FILE), 0.0
-    for message, _, _ in follow(run.messages, account):
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        specs = [replace(parse_source(source_text_of_file(path)), options=_EventOptions()) for path in paths]
+        runs = [cast("ReplaySource", spec.open_source(vehicle="1")).open() for spec in specs]
+        vehicles = [{address.vehicle for address in run.addresses} for run in runs]
+        names = recording.distinct_names(list(zip(paths, vehicles, strict=True)))
+        self._files = list(zip(paths, runs, names, strict=True))
+        self.ended: set[str] = set()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Damage, what was left out, and names given to vehicles so far."""
+        found = []
+        for path, run, names in self._files:
+            reason = "here, as several files have a vehicle"
+            renamed = [f"vehicle {own} is {name} {reason} {own}" for own, name in names.items() if own != name]
+            found += [f"{path}: {text}" for text in (*renamed, *run.warnings)]
+        return tuple(found)
+
+    @cached_property
+    def times(self) -> Times:
+        """The offsets of each vehicle's time to UTC, if its messages contain UTC."""
+        return Times(offsets={name: utc.offset_us / 1e6 for name, utc in self._utc.items()})
+
+    @cached_property
+    def _utc(self) -> dict[str, recording.UtcOffset]:
+        names = ((path, own, name) for path, _, names in self._files for own, name in names.items())
+        found = ((name, recording.utc_of(path, vehicle=own)) for path, own, name in names)
+        return {name: utc for name, utc in found if utc is not None}
+
+    def messages(self) -> Iterator[SourceMessage]:
+        """Yield the messages in order of time; raise SourceError if there are several files and one has no UTC."""
+        if len(self._files) == 1:
+            return self._files[0][1].messages
+        starts = [self._start(*file) for file in self._files]
+        files = zip(self._files, starts, strict=True)
+        shifted = (self._shift(run, names, start - min(starts)) for (_, run, names), start in files)
+        return merge(*shifted, key=attrgetter("due"))
+
+    def _start(self, path: Path, run: ReplayRun, names: Mapping[str, str]) -> float:
+        """Return the Unix time of the start of a file [s]."""
+        ahead = list(islice(run.messages, _AHEAD))
+        run.messages = chain(ahead, run.messages)
+        known = ((self._utc.get(names[each.address.vehicle]), each) for each in ahead if not each.error)
+        times = ((utc.unix_us(cast("int", each.fields["timestamp"])), each.due) for utc, each in known if utc)
+        found = [float(unix) / 1e6 - due for unix, due in times]
+        if not found:
+            raise SourceError(str(path), "no message gives UTC, the axis of several files: read it alone")
+        return median(found)
+
+    def _shift(self, run: ReplayRun, names: Mapping[str, str], offset: float) -> Iterator[SourceMessage]:
+        for each in run.messages:
+            address = replace(each.address, vehicle=names.get(each.address.vehicle, each.address.vehicle))
+            yield replace(each, due=each.due + offset, address=address)
+        self.ended.update(names.values())
+
+
+def read_account(*paths: Path) -> FileAccount:
+    """Return the events of files, as `Flights` reads them; raise its errors."""
+    flights, account, due = Flights(paths), Account(KEPT_OF_FILE), 0.0
+    for message, _, _ in follow(flights.messages(), account, ended=flights.ended):
         due = message.due
     for index, event in enumerate(account.events):  # before the first message that gave the time since boot
         known = account.vehicles.get(event.vehicle)
         if event.boot is None and known is not None and known.boot is not None:
             account.events[index] = replace(event, boot=known.boot + event.time - known.time)
-    return FileAccount(account, times_of(path, run.addresses), due, run.warnings)
-
-
-def times_of(path: Path, addresses: Iterable[Address]) -> Times:
-    """Return the offsets of a file's times to UTC, for each vehicle whose messages contain UTC."""
-    vehicles = {address.vehicle for address in addresses}
-    found = {name: recording.utc_of(path, vehicle=name) for name in vehicles}
-    return Times(offsets={name: utc.offset_us / 1e6 for name, utc in found.items() if utc is not None})
+    return FileAccount(account, flights.times, due, flights.warnings)
 
 
 def follow(
-    messages: Iterable[SourceMessage], account: Account
+    messages: Iterable[SourceMessage], account: Account, *, ended: Collection[str] = ()
 ) -> Iterator[tuple[SourceMessage, str | None, bytes | None]]:
-    """Add the messages of a replay to an account; yield each with its rejection reason or its payload."""
+    """Add the messages of a replay to an account; yield each with its rejection reason or its payload.
+
+    `ended`: the vehicles that have no more messages, which are not silent.
+    """
     checked = due = 0.0
+
+    def update(time: float) -> None:
+        mains = (account.vehicles[name].main for name in ended if name in account.vehicles)
+        account.update(time, {main: "ended" for main in mains if main})
+
     for message in messages:
         if message.dropout:
             account.add_dropout(message.address.vehicle, message.dropout, due)
         due, reason, payload = message.due, message.error, None
+        if due - checked >= _CHECK_INTERVAL and account.vehicles.keys() <= set(ended):
+            checked = due  # between two files
         while due - checked >= _CHECK_INTERVAL:
             checked += _CHECK_INTERVAL
-            account.update(checked)
+            update(checked)
         if reason is None:
             definition = message.definition or BY_TOPIC[message.address.topic]
             try:
@@ -95,5 +157,5 @@ def follow(
         if reason is not None:
             account.reject(message.address, reason, due)
         yield message, reason, payload
-    account.update(due)
+    update(due)
     account.settle(due + _SETTLE_TIME)

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from nedbus.errors import AddressError, ConfigError
 from nedbus.extras import needs
-from nedbus.recording import SUFFIXES, format_of
+from nedbus.recording import find_format, format_of
 from nedbus.transport import Tls
 
 from .options import MavlinkOptions, Options, Px4ZenohOptions, RecordedOptions, SimulatorOptions
@@ -43,6 +43,7 @@ SOURCE_KINDS: Final[Mapping[str, SourceKind]] = {
     "sim": SourceKind(SimulatorOptions, None, "nedbus.sources.simulator.source", "SimulatorSource"),
     "ulog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.ulog", "UlogSource"),
     "mcap": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mcap", "McapSource", "mcap"),
+    "tlog": SourceKind(RecordedOptions, "FILE", "nedbus.sources.mavlink.tlog", "TlogSource", "mavlink"),
     "px4-zenoh": SourceKind(Px4ZenohOptions, "[ENDPOINT]", "nedbus.sources.px4.source", "Px4ZenohSource"),
     "mavlink": SourceKind(MavlinkOptions, "LINK", "nedbus.sources.mavlink.source", "MavlinkSource", "mavlink"),
 }
@@ -84,7 +85,7 @@ def parse_source(source: str | Mapping[str, object]) -> SourceSpec:
     kind = SOURCE_KINDS.get(kind_name)
     if kind is None:
         path = rest if rest and "/" not in kind_name else text
-        kind_of_file = SUFFIXES.get(PurePath(path.partition("?")[0]).suffix.lower())
+        kind_of_file = find_format(path.partition("?")[0])
         hint = f"write {kind_of_file}:{path}" if kind_of_file else f"choose from {', '.join(SOURCE_KINDS)}"
         raise ConfigError(f"source {text!r}", f"there is no kind {kind_name!r}: {hint}")
     target, _, query = rest.rpartition("?") if "?" in rest else (rest, "", "")

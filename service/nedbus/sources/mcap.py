@@ -36,7 +36,7 @@ class McapSource:
         addresses = sorted(definitions)
         vehicles = sorted({address.vehicle for address in addresses})
         if not addresses:
-            found = ", ".join(sorted({stream.address.topic for stream in reader.counts})) or "no topics of PX4"
+            found = ", ".join(sorted({stream.address.topic for stream in reader.counts}))
             raise SourceError(self._path, f"this recording has none of the requested topics; it has {found}")
         if self._vehicle is not None and len(vehicles) > 1:
             raise ConfigError("vehicle", f"{self._path} has several vehicles ({', '.join(vehicles)}): remove it")

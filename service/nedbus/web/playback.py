@@ -17,7 +17,7 @@ from nedbus.client import Monitor, RejectionReport, Sample
 from nedbus.errors import NedbusError
 from nedbus.events import Account, Times
 from nedbus.log_event import about
-from nedbus.sources import KEPT_OF_FILE, SourceMessage, follow, open_file, times_of
+from nedbus.sources import KEPT_OF_FILE, Flights, SourceMessage, follow
 from nedbus_msgs import BY_TOPIC, DEFAULT, Address, codec_of
 
 from .chronicle import Chronicle
@@ -33,7 +33,7 @@ _SPEEDS: Final[list[str | tuple[Any, str]]] = ["0.5", "1", "2", "5", "10", "50"]
 
 
 class Recording:
-    """The messages of a .ulg or .mcap file in time order, loaded in a background thread.
+    """The messages of files in time order, loaded in a background thread.
 
     Positions and the topics whose values are shown are kept as payloads; of all others, only PX4's timestamp.
     `whole`: the flight at two points per second; `chronicle`: the events, in seconds since the first message.
@@ -43,16 +43,15 @@ class Recording:
     Raises ConfigError and SourceError if the file cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.name = path.name
+    def __init__(self, *paths: Path) -> None:
+        self.name = ", ".join(path.name for path in paths)
         self.whole = Fleet(long=_WHOLE)
         self.chronicle = Chronicle(Account(KEPT_OF_FILE), times=Times())
         self.dues: list[float] = []
         self.entries: list[tuple[Address, bytes | str | int]] = []
         self.is_read = False
-        self._path = path
+        self._flights = Flights(paths)
         self._indices: dict[Address, list[int]] = {}  # indices in `entries`, by stream
-        self._run = open_file(path)
         threading.Thread(target=self._read, name="nedbus-recording", daemon=True).start()
 
     @property
@@ -70,16 +69,15 @@ class Recording:
         return sorted(found)
 
     def _read(self) -> None:
+        flights, account = self._flights, self.chronicle.account
         try:
-            self.chronicle.times = times_of(self._path, self._run.addresses)
-            for message, reason, payload in follow(self._run.messages, self.chronicle.account):
+            self.chronicle.times = flights.times
+            for message, reason, payload in follow(flights.messages(), account, ended=flights.ended):
                 self._add(message, reason, payload)
-            for warning in self._run.warnings:
-                _log.warning(
-                    "%s: %s", self._path, warning, extra=about("damaged", source=str(self._path), reason=warning)
-                )
+            for warning in flights.warnings:
+                _log.warning("%s", warning, extra=about("damaged", source=self.name, reason=warning))
         except NedbusError as exc:
-            _log.error("%s", exc, extra=about("damaged", source=str(self._path), reason=str(exc)))
+            _log.error("%s", exc, extra=about("damaged", source=self.name, reason=str(exc)))
         finally:
             self.is_read = True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,12 +74,14 @@ def serve_live(
         reading.result()
 
 
-def serve_recording(path: Path, where: Where, *, stop: threading.Event, tell: Callable[[str], object]) -> None:
-    """Serve the page of a .ulg or .mcap file until `stop` is set; each viewer has its own playback position.
+def serve_recording(
+    paths: Sequence[Path], where: Where, *, stop: threading.Event, tell: Callable[[str], object]
+) -> None:
+    """Serve the page of files until `stop` is set; each viewer has its own playback position.
 
     Raises ConfigError and SourceError if the file cannot be read, and the errors of `serve_live`.
     """
-    recording, background = Recording(path), where.open_background()
+    recording, background = Recording(*paths), where.open_background()
 
     def open_page(document: Document) -> None:
         player = Player(recording)

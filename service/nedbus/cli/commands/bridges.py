@@ -14,7 +14,7 @@ import typer
 from nedbus import __version__, bridges
 from nedbus import web as page
 from nedbus.bridges import FOXGLOVE_PORT
-from nedbus.cli.options import ALL, FileArgument, InstanceOption, TopicOption, VehicleOption, command
+from nedbus.cli.options import ALL, FilesArgument, InstanceOption, TopicOption, VehicleOption, command
 from nedbus.cli.output.streams import write_stderr
 from nedbus.cli.run import run_until_stopped
 from nedbus.client import Bus
@@ -43,7 +43,7 @@ HttpOption = Annotated[str, typer.Option("--http", metavar="HOST:PORT", help="Ad
 @command
 def web(
     open_bus: Callable[[], Bus],
-    file: FileArgument = None,
+    files: FilesArgument = None,
     *,
     topic_option: TopicOption = ANY,
     vehicle: VehicleOption = ANY,
@@ -67,8 +67,8 @@ def web(
         if not is_loopback(host):
             write_stderr(f"no password protects {http}: every client that reaches it can view, but not change anything")
 
-    if file is not None:
-        run_until_stopped(lambda stop: page.serve_recording(file, where, stop=stop, tell=tell))
+    if files:
+        run_until_stopped(lambda stop: page.serve_recording(files, where, stop=stop, tell=tell))
         return
     serve_live = partial(page.serve_live, version=__version__, tell=tell)
     with open_bus() as bus:

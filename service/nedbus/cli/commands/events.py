@@ -13,7 +13,7 @@ import typer
 
 from nedbus import clock
 from nedbus.cli.follow import follow
-from nedbus.cli.options import CsvOption, DurationOption, FileArgument, JsonOption, VehicleOption, command, require_one
+from nedbus.cli.options import CsvOption, DurationOption, FilesArgument, JsonOption, VehicleOption, command, require_one
 from nedbus.cli.output.streams import csv_line, to_text, write, write_stderr
 from nedbus.cli.output.table import fold
 from nedbus.client import Bus, Sample, to_age
@@ -33,7 +33,7 @@ _DAY: Final = 86_400.0
 @command
 def events(
     open_bus: Callable[[], Bus],
-    file: FileArgument = None,
+    files: FilesArgument = None,
     *,
     vehicle: VehicleOption = ANY,
     within: Annotated[
@@ -61,7 +61,7 @@ def events(
             if event.severity in severities and (ANY in (vehicle, event.vehicle) or event.vehicle == vehicle):
                 write(form(event, times))
 
-    if file is None:
+    if not files:
         if csv_output:
             write(csv_line(_HEAD))
         with open_bus() as bus:
@@ -72,9 +72,9 @@ def events(
         return
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
-    read, found = _read(file)
+    read, found = _read(files)
     if vehicle != ANY:
-        _choose_vehicle(file, read.account.vehicles, vehicle)
+        _choose_vehicle(_name(files), read.account.vehicles, vehicle)
     found = [event for event in found if event.severity in severities and vehicle in (ANY, event.vehicle)]
     if csv_output:
         write(csv_line(_HEAD))
@@ -87,13 +87,13 @@ def events(
         write_stderr(f"throughout the file: {'; '.join(texts)}")
     elif not found:
         least = "" if severity == SEVERITIES[-1] else f" of severity {severity}"
-        write_stderr(f"{file}: no events{least} in {read.end:.0f} s")
+        write_stderr(f"{_name(files)}: no events{least} in {read.end:.0f} s")
 
 
 @command
 def why(
     open_bus: Callable[[], Bus],
-    file: FileArgument = None,
+    files: FilesArgument = None,
     *,
     vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed if there are several")] = None,
     at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC) or seconds since boot")] = None,
@@ -107,14 +107,14 @@ def why(
     """
     if vehicle is not None:
         check_vehicle(vehicle)
-    if file is not None:
-        read, found = _read(file)
-        name = _choose_vehicle(file, read.account.vehicles, vehicle)
+    if files:
+        read, found = _read(files)
+        name = _choose_vehicle(_name(files), read.account.vehicles, vehicle)
         followed = read.account.vehicles[name]
         found = [event for event in found if event.vehicle == name]
         conditions = [each for each in followed.conditions.values() if each.severity != "info"]
         topics, times = list(followed.topics), read.times
-        until, advice = "until the end", _ADVICE.get(file.suffix.lower(), _LIVE_ADVICE)
+        until, advice = "until the end", _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
         nothing = f"no faults in {read.end:.0f} s"
     else:
         with open_bus() as bus:
@@ -217,13 +217,18 @@ def _follow(bus: Bus, selection: Selection, show: Callable[[Iterable[Event]], ob
         follow(bus, subscription, handle, count=None, duration=duration, each_second=show_new)
 
 
-def _read(file: Path) -> tuple[FileAccount, list[Event]]:
-    """Read the account of a file and its events in order of time; write warnings to stderr."""
-    read = read_account(file)
+def _name(files: Sequence[Path]) -> str:
+    return ", ".join(map(str, files))
+
+
+def _read(files: Sequence[Path]) -> tuple[FileAccount, list[Event]]:
+    """Read the account of files and its events in order of time; write warnings to stderr."""
+    read = read_account(*files)
     found, told = read.account.events_since(0)
-    warnings = [*read.warnings, *([f"showing the last {len(found)} of {told} events"] if told > len(found) else [])]
-    for warning in warnings:
-        write_stderr(f"{file}: {warning}")
+    for warning in read.warnings:
+        write_stderr(warning)
+    if told > len(found):
+        write_stderr(f"{_name(files)}: showing the last {len(found)} of {told} events")
     return read, sorted(found, key=lambda event: event.time)
 
 

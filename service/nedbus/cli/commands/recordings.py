@@ -23,7 +23,9 @@ from nedbus.sources import LiveSource, parse_source, read_account, source_text_o
 from nedbus.sources import convert as convert_messages
 from nedbus_msgs import ANY, DEFAULT, DEFAULT_TOPIC, Selection
 
-FlightArgument = Annotated[Path, typer.Argument(metavar="FLIGHT", help="A .ulg or .mcap file", show_default=False)]
+FlightArgument = Annotated[
+    Path, typer.Argument(metavar="FLIGHT", help="A .ulg, .mcap or .tlog file", show_default=False)
+]
 
 
 @command

@@ -1,0 +1,153 @@
+"""Replay a .tlog, MAVLink as QGroundControl or MAVProxy received it: each frame behind the host's time in 8 bytes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, cast
+
+from pymavlink.dialects.v20 import common as dialect
+
+from nedbus.errors import SourceError
+from nedbus.recording import open_flight
+from nedbus.sources.options import MavlinkOptions, RecordedOptions
+from nedbus.sources.source import Rejection, ReplayRun, SourceContext, SourceMessage
+from nedbus_msgs import BY_TOPIC, Address, Definition
+
+from .reader import new_parser, parse
+from .vehicle import Vehicle
+
+_AHEAD: Final = 1000  # messages read when a file is opened: their addresses are known from the start
+_MAX_GAP: Final = 60_000_000  # us; a longer step is a pause or a damaged time, and is skipped
+_HEAD: Final = struct.Struct(">Q2s")  # time [us], begin of a frame: marker and length
+_LONGEST: Final = _HEAD.size + 290  # bytes of a record
+_OVERHEAD: Final = {dialect.PROTOCOL_MARKER_V1: 8, dialect.PROTOCOL_MARKER_V2: 12}  # bytes of a frame without payload
+_SIGNATURE: Final = 13  # bytes
+
+
+class TlogReader:
+    """Reads the messages of all autopilots in a .tlog; `due` is the host's time since its first frame [s].
+
+    `definitions`: those of each address so far.
+    """
+
+    def __init__(self, path: Path, topics: Collection[str] | None = None, *, vehicle: str | None = None) -> None:
+        self._path, self._options, self._vehicle = path, MavlinkOptions(topics=tuple(topics or ())), vehicle
+        self.definitions: dict[Address, Definition[Any] | None] = {}
+        self._boots: set[int] = set()  # Unix times [us]
+        self._damaged_bytes = self.position = 0
+
+    @property
+    def boot_utc(self) -> int:
+        """Unix time of the boot by the host's clock [us]; 0 for several vehicles or boots."""
+        return next(iter(self._boots)) if len(self._boots) == 1 else 0
+
+    @property
+    def damaged(self) -> bool:
+        """True if damage may have cost messages so far."""
+        return self._damaged_bytes > 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """Damage so far."""
+        return [f"damaged: {self._damaged_bytes} bytes that are not MAVLink"] if self.damaged else []
+
+    def find_definitions(self) -> dict[Address, Definition[Any]]:
+        """Read the file, and return its addresses and their definitions; raise SourceError if there are none."""
+        for _ in self.messages():
+            pass
+        if not self.definitions:
+            raise SourceError(
+                str(self._path), "; ".join(["no message of an autopilot for these topics", *self.warnings])
+            )
+        return {address: definition for address, definition in self.definitions.items() if definition}
+
+    def close(self) -> None:
+        """Do nothing: the file is open only while it is read."""
+
+    def messages(self, only: Collection[Address] | None = None) -> Iterator[SourceMessage]:
+        """Yield the messages of these addresses, or of all."""
+        self._damaged_bytes = self.position = 0
+        self._boots.clear()
+        self.definitions.clear()
+        vehicles: dict[int, Vehicle] = {}
+        parser, due, last = new_parser(), 0, 0
+        for stamp, frame in self._frames():
+            due, last = due + (stamp - last if last and 0 < stamp - last <= _MAX_GAP else 0), stamp
+            for item in parse(parser, frame, str(self._path), None, due / 1e6):
+                if isinstance(item, Rejection):
+                    self._damaged_bytes += len(frame) if item.where == str(self._path) else 0
+                    continue
+                if item.system not in vehicles:
+                    vehicles[item.system] = Vehicle(self._vehicle or str(item.system), self._options)
+                vehicle = vehicles[item.system]
+                vehicle.track_sequence(item.sequence, item.time)
+                found = vehicle.handle(item.message, item.time)
+                if found is None or found.address is None:
+                    continue
+                if isinstance(found, Rejection):
+                    found = SourceMessage(item.time, found.address, {}, error=found.reason)
+                elif found.rebooted or found.address.vehicle not in {each.vehicle for each in self.definitions}:
+                    self._boots.add(stamp - cast("int", found.fields["timestamp"]))
+                self.definitions.setdefault(found.address, BY_TOPIC[found.address.topic])
+                if only is None or found.address in only:
+                    yield replace(found, due=item.time)
+
+    def _frames(self) -> Iterator[tuple[int, bytes]]:
+        """Yield each frame with its time [us]; behind damage, search for one that another one follows."""
+        with open_flight(self._path) as file:
+            data, is_found = b"", True
+            while data := data + file.read(2 * _LONGEST - len(data)):
+                length = _length(data)
+                is_found = bool(length) and (is_found or len(data) == length or _length(data[length:]) > 0)
+                if not is_found or length > len(data):
+                    self._damaged_bytes += 1
+                    self.position, data = self.position + 1, data[1:]
+                    continue
+                yield _HEAD.unpack_from(data)[0], data[8:length]
+                self.position, data = self.position + length, data[length:]
+
+
+class TlogSource:
+    """A .tlog file, read frame by frame."""
+
+    def __init__(self, path: str, options: RecordedOptions, _: SourceContext) -> None:
+        self._path, self._options = Path(path).expanduser(), options
+        self.finite, self.loop = not options.loop, options.loop
+        self.speed, self.wait = options.speed, options.wait
+
+    def open(self) -> ReplayRun:
+        """Read the beginning; raise SourceError if it has none of the requested topics."""
+        reader = TlogReader(self._path, self._options.topics, vehicle=self._options.vehicle)
+        run = ReplayRun(iter(()), reader.definitions, None, "", position=0)
+        messages = self._read(reader, run)
+        ahead = list(islice(messages, _AHEAD))
+        if not ahead:
+            problem = "; ".join(["no message of an autopilot for these topics", *reader.warnings])
+            raise SourceError(str(self._path), problem)
+        vehicles = sorted({address.vehicle for address in reader.definitions})
+        run.messages = (message for part in (ahead, messages) for message in part)
+        run.total = self._path.stat().st_size
+        run.summary = f"vehicle {', '.join(vehicles)}, {run.total / 1e6:.1f} MB"
+        return run
+
+    def _read(self, reader: TlogReader, run: ReplayRun) -> Iterator[SourceMessage]:
+        for message in reader.messages():
+            run.position = reader.position
+            yield message
+        absent = self._options.absent_from({address.topic for address in reader.definitions}, "this file")
+        run.warnings = (*reader.warnings, *absent)
+        if reader.damaged:
+            run.damage = f"{self._path}: messages lost to damage: {'; '.join(reader.warnings)}"
+
+
+def _length(data: bytes) -> int:
+    """Return the length of the record at the begin of these bytes, 0 if there is none."""
+    if len(data) < _HEAD.size + 1:
+        return 0
+    marker, payload, flags = data[8:11]
+    signature = _SIGNATURE if marker == dialect.PROTOCOL_MARKER_V2 and flags & dialect.MAVLINK_IFLAG_SIGNED else 0
+    return 8 + _OVERHEAD[marker] + payload + signature if marker in _OVERHEAD else 0

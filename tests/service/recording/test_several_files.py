@@ -1,0 +1,134 @@
+"""Several files at once: logs of a swarm on one axis of UTC, each vehicle with a name of its own."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nedbus
+from nedbus.errors import SourceError
+from nedbus.sources import read_account
+from nedbus.web.playback import Recording
+from tests.flights.messages import VALID, VLP, message
+from tests.flights.ulogs import UlogWriter
+from tests.peers.command_line import run_command
+from tests.waits import wait_for
+
+EPOCH = 1_760_000_000_000_000  # us; 2025-10-09 08:53:20 UTC
+OTHER = "estimator_local_position"
+CASES = Path(__file__).parents[4] / "shared/cases"
+
+
+def write_flight(
+    path: Path, *, boot: float, start: float, seconds: float = 10, utc: bool = True, bad: float = 99
+) -> Path:
+    """Write a log of vehicle 1, with boot and start in seconds after EPOCH; after `bad` seconds xy is invalid."""
+    writer = UlogWriter()
+    if utc:
+        key = b"uint64_t boot_time_utc_us"
+        writer.put("I", bytes([len(key)]) + key + struct.pack("<Q", EPOCH + round(boot * 1e6)))
+    writer.define([VLP, OTHER])
+    for tenth in range(round(seconds * 10)):
+        fields = VALID | {"x": float(tenth), "xy_valid": tenth < bad * 10, "v_xy_valid": tenth < bad * 10}
+        for topic in (VLP, OTHER):
+            writer.add(topic, message(round((start - boot) * 1e6) + tenth * 100_000, **fields))
+    return writer.write(path)
+
+
+@pytest.fixture
+def swarm(tmp_path: Path) -> list[str]:
+    """Write three logs of one time, with other boots; the third ends earlier, and the second has a fault."""
+    return [
+        str(write_flight(tmp_path / "a 1.ulg", boot=0, start=60)),
+        str(write_flight(tmp_path / "b.ulg", boot=30, start=60, bad=5)),
+        str(write_flight(tmp_path / "c.ulg", boot=45, start=58, seconds=4)),
+    ]
+
+
+def test_events_of_several_files_are_on_one_axis(swarm: list[str]) -> None:
+    """Events have the UTC and the name of their vehicle, and a vehicle whose file ends first is not silent."""
+    shown = run_command("events", "--json", *swarm)
+    assert shown.exit_code == 0, shown.err
+    for path, name in zip(swarm, ("a_1", "b", "c"), strict=True):
+        assert f"{path}: vehicle 1 is {name} here, as several files have a vehicle 1" in shown.err.splitlines()
+    found = [json.loads(line) for line in shown.out.splitlines()]
+    assert {(each["vehicle"], each["time"]) for each in found} == {("b", "2025-10-09T08:54:25.000+00:00")}
+    assert run_command("events", "-v", "a_1", *swarm).out == ""
+    why = run_command("why", "-v", "b", "--at", "08:54:26", *swarm)
+    assert "b: xy and vxy not valid from 08:54:25.0" in why.out, why.err
+
+
+def test_commands_of_the_page_run(swarm: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The commands of docs/recordings.md are those of this swarm."""
+    monkeypatch.chdir(tmp_path)
+    for path, name in zip(swarm, "ab", strict=False):
+        Path(path).rename(f"swarm_{name}.ulg")
+    page = (Path(__file__).parents[3] / "docs/recordings.md").read_text()
+    for line in re.findall(r"^nedbus (\w+ swarm_a.*)$", page, re.MULTILINE):
+        ended = run_command(*line.split())
+        assert ended.exit_code == 0, ended.err
+
+
+def test_flights_of_one_vehicle_years_apart_are_read_at_once(tmp_path: Path) -> None:
+    """The time between two files costs nothing."""
+    first = write_flight(tmp_path / "a.ulg", boot=0, start=60, bad=2)
+    second = write_flight(tmp_path / "b.ulg", boot=0, start=3e8, bad=3)
+    account = read_account(first, second)
+    assert [event.vehicle for event in account.account.events_since(0)[0]] == ["a", "a", "b", "b"]
+    assert math.isclose(account.end, 3e8 - 60 + 9.9, abs_tol=0.01)
+
+
+def test_file_without_utc_has_no_place_among_others(tmp_path: Path, swarm: list[str]) -> None:
+    """It is named; alone it can be read."""
+    path = write_flight(tmp_path / "d.ulg", boot=0, start=60, utc=False)
+    ended = run_command("events", *swarm, str(path))
+    assert ended.exit_code == 1
+    assert f"nedbus: {path}: no message gives UTC" in ended.err
+    with pytest.raises(SourceError, match=r"d\.ulg: no message gives UTC"):
+        nedbus.read([*swarm, path], [VLP])
+    assert run_command("events", str(path)).exit_code == 0
+
+
+def test_several_files_are_read_and_aligned_in_utc(swarm: list[str]) -> None:
+    """Streams are named by vehicle, with Unix times; a row of the table has what each vehicle did at that moment."""
+    streams = nedbus.read(swarm, [VLP])
+    assert [*streams] == [f"{name}/{VLP}" for name in ("a_1", "b", "c")]
+    assert [each["timestamp"][0] - EPOCH for each in streams.values()] == [60_000_000, 60_000_000, 58_000_000]
+    table = nedbus.align(swarm, topics=[VLP], utc=True, method="nearest")
+    assert str(table["utc"][0]) == "2025-10-09T08:54:20.000000"
+    assert table[f"a_1/{VLP}.x"].tolist() == table[f"b/{VLP}.x"].tolist() == list(range(100))
+    assert table[f"c/{VLP}.x"][:20].tolist() == list(range(20, 40))
+    one = nedbus.align(swarm, on=f"c/{VLP}", topics=[OTHER])
+    assert len(one) == 40
+    assert f"b/{OTHER}/0.x" in (one.dtype.names or ())
+    np.testing.assert_array_equal(
+        nedbus.align(swarm, on=10.0, topics=[f"b/{VLP}"])["timestamp"][:1], [EPOCH + 60_000_000]
+    )
+    assert [*nedbus.read(swarm, ["*"], vehicle="b")] == [f"b/{OTHER}/0", f"b/{VLP}"]
+
+
+def test_page_shows_several_files(swarm: list[str]) -> None:
+    """A playback has the vehicles of all files, each at its time."""
+    recording = Recording(*map(Path, swarm))
+    wait_for(lambda: recording.is_read, what="the files")
+    assert recording.name == "a 1.ulg, b.ulg, c.ulg"
+    assert recording.chronicle.start is not None
+    assert math.isclose(recording.chronicle.start, EPOCH / 1e6 + 58, abs_tol=0.01)
+    assert {address.vehicle for address, _ in recording.entries} == {"a_1", "b", "c"}
+    assert math.isclose(recording.length, 11.9, abs_tol=0.01)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
+def test_swarm_of_users_flies_at_one_time() -> None:
+    """All three fly from 08:54:20 to 08:54:30 UTC; their boots differ, and two have the same system id."""
+    paths = [CASES / f"swarm_{name}.ulg" for name in "abc"]
+    streams = nedbus.read(paths, [VLP])
+    assert [*streams] == [f"{name}/{VLP}" for name in ("swarm_a", "swarm_b", "3")]
+    assert {int(each["timestamp"][0]) for each in streams.values()} == {EPOCH + 60_000_000}
+    assert 9.9 < read_account(*paths).end < 10.1

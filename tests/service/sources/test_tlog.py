@@ -1,0 +1,102 @@
+"""Telemetry logs (.tlog) of QGroundControl and MAVProxy: converted as live messages, at the times in the file."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+import nedbus
+from nedbus.errors import SourceError
+from tests.flights.messages import VLP
+from tests.flights.replays import open_replay
+from tests.peers.command_line import run_command
+
+EPOCH = 1_760_000_000_000_000  # us; 2025-10-09 08:53:20 UTC
+FLAGS = 0x3F  # ESTIMATOR_STATUS: all valid
+
+
+def frames(system: int, count: int, *, signed: bool = False, version: int = 2) -> Iterable[bytes]:
+    """Yield records of a vehicle that booted at EPOCH: attitude, status and position ten times a second."""
+    sender = mavlink.MAVLink(None, system, 1)
+    if signed:
+        sender.signing.secret_key, sender.signing.sign_outgoing = bytes(32), True
+    station = mavlink.MAVLink(None, 255, 190)
+    beat: Any = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    for number in range(count):
+        ms = 1000 + 100 * number
+        messages: list[Any] = [
+            mavlink.MAVLink_attitude_message(ms, 0, 0, 0.5, 0, 0, 0),
+            mavlink.MAVLink_estimator_status_message(ms * 1000, FLAGS, 0, 0, 0, 0, 0, 0, 0.5, 0.5),
+            mavlink.MAVLink_local_position_ned_message(ms, number, 2, -3, 1, 0, 0),
+        ]
+        for each in messages:
+            sender.seq = (sender.seq + 1) % 256
+            packed = each.pack(sender, force_mavlink1=version == 1)
+            yield struct.pack(">Q", EPOCH + ms * 1000) + packed
+        yield struct.pack(">Q", EPOCH + ms * 1000) + beat.pack(station)
+
+
+@pytest.mark.parametrize("form", [{}, {"signed": True}, {"version": 1}])
+def test_tlog_is_read_by_every_command(tmp_path: Path, form: dict[str, Any]) -> None:
+    """Arrays, a replay, events and a recording have all positions of the vehicle, at the host's UTC."""
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"".join(frames(7, 100, **form)))
+    positions = nedbus.read(path)
+    assert positions["x"].tolist() == list(range(100))
+    assert positions["xy_valid"].all()
+    assert math.isclose(positions["heading"][5], 0.5, rel_tol=1e-6)
+    assert "delta_z" in nedbus.missing_of(positions)
+    utc = nedbus.utc_of(path)
+    assert utc is not None
+    assert utc.offset_us == EPOCH
+    run = open_replay(f"tlog:{path}?vehicle=a")
+    replayed = [each for each in run.messages if each.address.topic == VLP]
+    assert [(each.address.vehicle, each.fields["x"]) for each in replayed] == [("a", x) for x in range(100)]
+    np.testing.assert_allclose([each.due for each in replayed], [number / 10 for number in range(100)])
+    assert not run.warnings
+    assert run_command("events", str(path)).exit_code == 0
+    assert run_command("convert", str(path), str(tmp_path / "a.mcap")).exit_code == 0
+    assert nedbus.read(tmp_path / "a.mcap")["x"].tolist() == list(range(100))
+    assert nedbus.missing_of(nedbus.read(tmp_path / "a.mcap")) == nedbus.missing_of(positions)
+
+
+def test_several_vehicles_of_a_tlog_are_told_apart(tmp_path: Path) -> None:
+    """Each autopilot is a vehicle, named by its system id; the ground station is none."""
+    path = tmp_path / "flight.tlog"
+    pairs = zip(frames(1, 10), frames(2, 10), strict=True)
+    path.write_bytes(b"".join(one + two for one, two in pairs))
+    assert {address.vehicle for address in nedbus.addresses_of(path)} == {"1", "2"}
+    assert len(nedbus.read(path, vehicle=2)) == 10
+    assert run_command("why", "-v", "1", str(path)).exit_code == 0
+
+
+def test_damage_of_a_tlog_costs_only_what_it_hits(tmp_path: Path) -> None:
+    """Bytes that are not MAVLink are skipped and reported; a file that ends within a frame is read up to it."""
+    path = tmp_path / "flight.tlog"
+    records = list(frames(1, 50))
+    damaged = bytearray(records[42])  # a position
+    damaged[12] ^= 0xFF
+    path.write_bytes(b"".join([*records[:42], damaged, *records[43:90], bytes(50), *records[90:]])[:-3])
+    positions = nedbus.read(path)
+    assert positions["x"].tolist() == [x for x in range(50) if x != 10]
+    run = open_replay(f"tlog:{path}")
+    list(run.messages)
+    assert run.damage is not None
+    assert "bytes that are not MAVLink" in run.damage
+
+
+@pytest.mark.parametrize("content", [b"hello", bytes(5000), b"".join(frames(255, 0))])
+def test_file_without_mavlink_is_refused(tmp_path: Path, content: bytes) -> None:
+    """It is named, as an array and as a replay."""
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(content)
+    for read in (nedbus.read, lambda path: open_replay(f"tlog:{path}")):
+        with pytest.raises(SourceError, match=r"no message of an autopilot|an empty file"):
+            read(path)
