@@ -83,7 +83,7 @@ def keys_page() -> str:
         [code(one.key()), "messages; a `get` returns the last one"],
         [code(other.key()), "the same, for each EKF or sensor instance"],
         [code(one.rate_key(5)), "the same, downsampled by its publisher to 5 messages a second"],
-        [code(one.alive_key()), "liveliness token"],
+        [code(one.alive_key("<publisher>")), "liveliness token"],
         [
             code(f"{one.key()}/@ack"),
             (

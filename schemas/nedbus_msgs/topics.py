@@ -63,9 +63,9 @@ class Address:
         """Return the Zenoh key expression of this address."""
         return f"{prefix}/{self.vehicle}/{self.stream}"
 
-    def alive_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
-        """Return the key expression of this address's liveliness token."""
-        return f"{prefix}/{self.vehicle}/@alive/{self.stream}"
+    def alive_key(self, publisher: str, *, prefix: str = DEFAULT_PREFIX) -> str:
+        """Return the key of the liveliness token of one publisher of this address; `publisher`: its Zenoh id."""
+        return f"{prefix}/{self.vehicle}/@alive/{publisher}/{self.stream}"
 
     def rejected_key(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of reports on rejected messages of this address."""
@@ -138,7 +138,7 @@ class Selection:
 
     def alive_key_expr(self, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression that matches the liveliness tokens of these addresses."""
-        return f"{prefix}/{self.vehicle}/@alive/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
+        return f"{prefix}/{self.vehicle}/@alive/*/{self.key_expr(prefix='').removeprefix(f'/{self.vehicle}/')}"
 
     def rate_key_expr(self, rate: int | str, *, prefix: str = DEFAULT_PREFIX) -> str:
         """Return the key expression of these streams downsampled to `rate` messages per second; "*" is any rate."""
@@ -147,9 +147,10 @@ class Selection:
 
 def address_of_alive_key(key: str, *, prefix: str = DEFAULT_PREFIX) -> Address:
     """Parse the key of a liveliness token; raise AddressError for any other key."""
-    vehicle, alive, stream = key.removeprefix(prefix + "/").partition("/@alive/")
-    if not alive:
-        raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<topic>[/<instance>]")
+    vehicle, alive, token = key.removeprefix(prefix + "/").partition("/@alive/")
+    publisher, _, stream = token.partition("/")
+    if not (alive and publisher):
+        raise AddressError("key", key, f"{prefix}/<vehicle>/@alive/<publisher>/<topic>[/<instance>]")
     return Address.from_key(f"{prefix}/{vehicle}/{stream}", prefix=prefix)
 
 

@@ -62,7 +62,7 @@ def test_nothing_invalid_reaches_a_script(make_stack: StartStack, record: Record
             for key in (f"nedbus/*/{VLP}", "nedbus/1/*", "nedbus/**", "nedbus/1/no_such_topic", f"nedbus/1/{VLP}/0"):
                 session.put(key, encode(message(1)), congestion_control=BLOCK)
             session.delete(f"nedbus/1/{VLP}", congestion_control=BLOCK)
-            token = session.liveliness().declare_token("nedbus/no vehicle/@alive/nothing")
+            token = session.liveliness().declare_token("nedbus/no vehicle/@alive/1a/nothing")
             wait_for(lambda: reader.subscription.counts.invalid == 1006, what="1,006 refusals")
             assert list(bus.vehicles()) == ["1"]
             token.undeclare()

@@ -50,7 +50,7 @@ def test_keys_are_as_documented() -> None:
     estimator = Address("7", "estimator_local_position", 2)
     assert estimator.key() == "nedbus/7/estimator_local_position/2"
     assert estimator.key(prefix="fleet/a") == "fleet/a/7/estimator_local_position/2"
-    assert estimator.alive_key() == "nedbus/7/@alive/estimator_local_position/2"
+    assert estimator.alive_key("1a") == "nedbus/7/@alive/1a/estimator_local_position/2"
     assert estimator.rejected_key() == "nedbus/@rejected/7/estimator_local_position/2"
     assert Selection("estimator_local_position", instance=1).key_expr() == "nedbus/*/estimator_local_position/1"
     assert Selection("estimator_local_position", vehicle="7").key_expr() == "nedbus/7/estimator_local_position/*"
@@ -76,7 +76,7 @@ def test_address_and_key_round_trip(address: Address, prefix: str) -> None:
     """Every address has a valid key, and the key parses to the same address."""
     zenoh.KeyExpr(address.key(prefix=prefix))
     assert Address.from_key(address.key(prefix=prefix), prefix=prefix) == address
-    assert address_of_alive_key(address.alive_key(prefix=prefix), prefix=prefix) == address
+    assert address_of_alive_key(address.alive_key("1a", prefix=prefix), prefix=prefix) == address
     with pytest.raises(AddressError):
         address_of_alive_key(address.key(prefix=prefix), prefix=prefix)
 
@@ -114,9 +114,9 @@ def test_selection_matches_what_its_key_expression_includes(address: Address, pr
 @given(addresses(), PREFIXES)
 def test_selection_does_not_include_other_keys(address: Address, prefix: str) -> None:
     """The liveliness tokens, rejections and acknowledgements of an address are not messages."""
-    assert zenoh.KeyExpr(Selection().alive_key_expr(prefix=prefix)).includes(address.alive_key(prefix=prefix))
+    assert zenoh.KeyExpr(Selection().alive_key_expr(prefix=prefix)).includes(address.alive_key("1a", prefix=prefix))
     key_expr = zenoh.KeyExpr(Selection().key_expr(prefix=prefix))
-    assert not key_expr.intersects(address.alive_key(prefix=prefix))
+    assert not key_expr.intersects(address.alive_key("1a", prefix=prefix))
     assert not key_expr.intersects(address.rejected_key(prefix=prefix))
     assert not key_expr.intersects(ack_key(address.key(prefix=prefix)))
 

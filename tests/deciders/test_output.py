@@ -21,7 +21,7 @@ class Sky:
 
     def __init__(self) -> None:
         self.now, self.published = 0.0, list[tuple[Address, int]]()
-        registry = SimpleNamespace(is_alive=lambda _: False, publisher=self._open)
+        registry = SimpleNamespace(publisher=self._open)
         self.output = SourceOutput(
             "px4", "px4-zenoh:", cast("PublisherRegistry", registry), lambda: self.now, Account()
         )

@@ -79,8 +79,6 @@ class FakeRegistry:
     def is_published(self, address: Address) -> bool:
         return address in self.open
 
-    is_alive = is_published
-
     def is_read(self, _: object) -> bool:
         return self.clock.seconds >= self.readers_at
 

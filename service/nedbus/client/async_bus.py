@@ -95,6 +95,7 @@ class AsyncBus:
 
     latest = last_async(_awaited(Bus.latest))
     vehicles = _awaited(Bus.vehicles)
+    publishers = _awaited(Bus.publishers)
     services = _awaited(Bus.services)
     accounts = _awaited(Bus.accounts)
     rejections = _awaited(Bus.rejections)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -125,6 +126,13 @@ class Bus:
         """
         return self._directory.vehicles(self._session, timeout=timeout)
 
+    def publishers(self, *, timeout: float = 2.0) -> Counter[Address]:
+        """Return the number of publishers of each address; readers of one with several receive a mixture.
+
+        `timeout`: as in `vehicles`.
+        """
+        return self._directory.publishers(self._session, timeout=timeout)
+
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:
         """Query the status of all nedbus services on this network."""
         return find_services(self._session, prefix=self.prefix, timeout=timeout)
@@ -159,7 +167,7 @@ class Bus:
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
         publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
-        self._publishers.is_alive(address)  # a round trip: the router has processed all earlier declarations
+        self._publishers.confirm(address)
         return publisher
 
     def open_session(self, endpoint: str | None = None, *, timeout: float | None = 3.0) -> Session:

@@ -6,6 +6,7 @@ import json
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -48,30 +49,39 @@ _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
 _SCHEMA_TIMEOUT: Final = 2.0  # s for a busy publisher to reply
 _POLL: Final = 0.002  # s between polls for tokens
+_ALL: Final = Selection()
 
 
 class VehicleDirectory:
-    """The published addresses, by their liveliness tokens; it subscribes to them at the first call."""
+    """The published addresses and the number of their publishers, by liveliness tokens: the only source of both.
 
-    def __init__(self, *, prefix: str) -> None:
-        self._prefix = prefix
+    It subscribes to the tokens of a selection at the first call.
+    """
+
+    def __init__(self, *, prefix: str, selection: Selection = _ALL) -> None:
+        self._prefix, self._selection = prefix, selection
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
 
     def vehicles(self, session: Session, *, timeout: float) -> dict[str, list[Address]]:
         """Return the addresses by vehicle, both sorted; the first call waits up to `timeout` seconds."""
+        addresses = sorted(self.publishers(session, timeout=timeout))
+        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
+
+    def publishers(self, session: Session, *, timeout: float) -> Counter[Address]:
+        """Return the number of publishers of each address; the first call waits up to `timeout` seconds, if not 0."""
         with self._lock:
             if self._tokens is None:
-                self._tokens = AliveTokens(session, Selection().alive_key_expr(prefix=self._prefix))
-                self._tokens.ask()
+                self._tokens = AliveTokens(session, self._selection.alive_key_expr(prefix=self._prefix))
+                if timeout:
+                    self._tokens.ask()
             self._poll(self._tokens, timeout)
             while self._tokens.is_asking:
                 time.sleep(_POLL)
                 self._poll(self._tokens, timeout)
             self._poll(self._tokens, timeout)  # changes that the subscriber received before the last reply
-            addresses = sorted(self._addresses.values())
-        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
+            return Counter(self._addresses.values())
 
     def _poll(self, tokens: AliveTokens, timeout: float) -> None:
         for key, alive in tokens.take(timeout=timeout):

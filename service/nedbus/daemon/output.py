@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final, cast
@@ -21,7 +21,6 @@ from nedbus_msgs import Address, Definition, get_topic, upgrade_fields
 _log = logging.getLogger(__name__)
 
 _STALE: Final = 3.0  # s without a message after which a live address is no longer published
-_MANY: Final = 10  # addresses from which the router is asked for all of them at once
 _MAX_ADDRESSES: Final = 1000  # of one live source
 _MAX_WARNINGS: Final = 50  # rejections kept and logged, one for each `where`
 _MAX_TEXT: Final = 300  # logged characters of a rejection, which any peer may have sent
@@ -96,34 +95,19 @@ class SourceOutput:
 
         Raises AddressInUseError if another source of this service publishes one of them.
         """
-        new = run.addresses.keys() - set(self.addresses)
-        for address in new:
+        for address in run.addresses.keys() - set(self.addresses):
             if self._registry.is_published(address):
                 raise AddressInUseError(address)
-        alive = self._registry.alive_among(new) if len(new) > _MANY else None
         for address, definition in run.addresses.items():
-            self.claim(address, definition, lossless=lossless, alive=alive)
+            self.claim(address, definition, lossless=lossless)
 
-    def claim(
-        self,
-        address: Address,
-        definition: Definition[Any] | None = None,
-        *,
-        lossless: bool = False,
-        alive: Collection[Address] | None = None,
-    ) -> None:
-        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one.
-
-        `alive`: the addresses that were published before, if the caller has asked.
-        """
+    def claim(self, address: Address, definition: Definition[Any] | None = None, *, lossless: bool = False) -> None:
+        """Open a publisher for an address if it has none; raise AddressInUseError if another source has one."""
         stream = self._streams.get(address)
         if stream is None:
             stream = self._streams[address] = _Stream(StreamHealth(address.topic))
         if stream.publisher is not None:
             return
-        if self._registry.is_alive(address) if alive is None else address in alive:
-            text = f"{address} is also published by another process: readers receive both"
-            _log.warning("%s: %s", self._name, text, extra=about("duplicate", address, source=self._name))
         stream.publisher = self._registry.publisher(address, definition, lossless=lossless, source=self._kind)
 
     def release(self, *, keep: Iterable[Address] = ()) -> None:

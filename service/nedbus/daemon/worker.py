@@ -49,7 +49,10 @@ class SourceMeasures:
         if self.status.ended:
             return {stream.address: "ok" for stream in self.streams}
         published = frozenset(self.status.addresses)
-        return {each.address: stream_state(each.health, alive=each.address in published).name for each in self.streams}
+        return {
+            each.address: stream_state(each.health, publishers=int(each.address in published)).name
+            for each in self.streams
+        }
 
 
 class Clock:

@@ -182,9 +182,9 @@ def _check_address(seen: Observation, address: Address, *, flows: bool) -> Itera
     if stream is not None and stream.error:
         advice = "check that the publisher of this key is nedbus; a newer layout needs a newer nedbus here"
         yield Finding("vehicle", name, "wrong", f"cannot decode a payload: {stream.error[:_MAX_TEXT]}", advice)
-    if stream is not None and len(stream.publishers) > 1:
+    if (publishers := seen.alive[address]) > 1:
         advice = "readers receive a mixture of both: give one of them another --vehicle, or stop it"
-        yield Finding("vehicle", name, "wrong", f"{len(stream.publishers)} publishers of this address", advice)
+        yield Finding("vehicle", name, "wrong", f"{publishers} publishers of this address", advice)
 
 
 def check_clocks(seen: Observation) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -22,8 +23,6 @@ from nedbus.transport import (
     Verdict,
     alive_keys,
     ask_routers,
-    entity_name,
-    follow_heartbeats,
     px4_publishers_key_expr,
     query,
     while_open,
@@ -39,7 +38,6 @@ _MAX_TIME: Final = 1e11  # s since the epoch accepted from a service
 _MAX_SERVICES: Final = 20  # any peer may claim to be a service
 _MAX_KEYS: Final = 2000
 _MAX_KEY_LENGTH: Final = 1024
-_MAX_PUBLISHERS: Final = 8  # of each key
 _RING: Final = 16_384  # samples buffered per subscription
 
 
@@ -54,27 +52,24 @@ class Service:
 
 @dataclass(slots=True)
 class Stream:
-    """Messages and heartbeats on one key; `address` is None for a key that is not a nedbus key.
+    """Messages on one key; `address` is None for a key that is not a nedbus key.
 
     `flows`: True once a message has arrived.
     `delay`: minimum time from sent to received, by the clocks of both hosts [s]; None without timestamps.
-    `publishers`: names from messages and heartbeats. `error`: the last decoding error.
+    `error`: the last decoding error.
     """
 
     address: Address | None
     flows: bool = False
     delay: float | None = None
-    publishers: set[str] = field(default_factory=set)
     error: str = ""
 
     def add(self, sample: RawSample) -> None:
         """Add a received message."""
         self.flows = True
-        age, info = _age_of(sample), sample.source_info
+        age = _age_of(sample)
         if age is not None:
             self.delay = age if self.delay is None else min(age, self.delay)
-        if info is not None:
-            self.add_publisher(entity_name(info.source_id))
         definition = BY_TOPIC.get(self.address.topic) if self.address is not None else None
         if definition is not None and sample.kind == zenoh.SampleKind.PUT:
             try:
@@ -82,19 +77,14 @@ class Stream:
             except DecodeError as exc:
                 self.error = str(exc)
 
-    def add_publisher(self, name: str) -> None:
-        """Add the publisher of a message or heartbeat."""
-        if len(self.publishers) < _MAX_PUBLISHERS:
-            self.publishers.add(name)
-
 
 @dataclass(slots=True)
 class Observation:
     """A network as seen by this client, and the scope of the examination.
 
     `version`: of this nedbus; `vehicle`: the one to examine, None for all; `verdict`: its write permission.
-    `alive`: addresses with a liveliness token; `ages`: age of the last message returned by a publisher [s].
-    `streams`: messages and heartbeats by key; `listened`: duration of the observation [s].
+    `alive`: number of publishers of each address, by tokens; `ages`: age of the last message returned by one [s].
+    `streams`: messages by key; `listened`: duration of the observation [s].
     `elsewhere`: nedbus keys under other prefixes; `ros2`: publishers of ROS 2 topics.
     `routers`: routers that disclose their sessions; `accounts`: histories of vehicles kept by services.
     """
@@ -105,7 +95,7 @@ class Observation:
     verdict: Verdict | None = None
     services: list[Service] = field(default_factory=list)
     accounts: list[AccountReport] = field(default_factory=list)
-    alive: list[Address] = field(default_factory=list)
+    alive: Counter[Address] = field(default_factory=Counter)
     ages: dict[Address, float | None] = field(default_factory=dict)
     streams: dict[str, Stream] = field(default_factory=dict)
     elsewhere: set[str] = field(default_factory=set)
@@ -128,12 +118,11 @@ class Observation:
         prefix, start = self.prefix, time.monotonic()
         take_messages = _subscribe(session, f"{prefix}/*/**")
         take_others = _subscribe(session, f"**/{DEFAULT_TOPIC}/**")
-        take_heartbeats, _ = follow_heartbeats(session, f"{prefix}/*/**")
         self.routers = ask_routers(session, timeout=_QUERY_TIMEOUT)
         self.services = _ask_services(session, prefix)
         self.accounts = find_accounts(session, prefix=prefix, within=0.0, timeout=_QUERY_TIMEOUT)
         tokens = alive_keys(session, Selection().alive_key_expr(prefix=prefix), timeout=_QUERY_TIMEOUT)
-        self.alive = _parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens)
+        self.alive = Counter(_parse_each(lambda key: address_of_alive_key(key, prefix=prefix), tokens))
         tokens = alive_keys(session, px4_publishers_key_expr(None), timeout=_QUERY_TIMEOUT)
         publishers = _parse_each(PublisherToken.parse, tokens)
         self.ros2 = [token for token in publishers if not token.node.startswith("nedbus_")]  # not our bridge
@@ -151,9 +140,6 @@ class Observation:
             self._add_messages(take_messages())
             keys = (key for sample in take_others() if (key := str(sample.key_expr)).endswith(f"/{DEFAULT_TOPIC}"))
             others.update(islice((key for key in keys if len(key) < _MAX_KEY_LENGTH), max(0, _MAX_KEYS - len(others))))
-            for key, publisher in take_heartbeats():
-                if (beating := self._stream(key)) is not None:
-                    beating.add_publisher(publisher)
         self.listened = time.monotonic() - start
         self.elsewhere = {key for key in others if not key.startswith(f"{prefix}/")}
 

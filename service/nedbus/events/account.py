@@ -79,8 +79,9 @@ class Account:
     ) -> None:
         """Update the conditions of the link, of this reader, and of all vehicles.
 
-        `states`: stream states by address ("stale", "gone" or another), None if unknown. `link`: the fault of the link,
-        "" if it is up. `dropped`: messages dropped by this reader since it started. `is_behind`: it has a backlog.
+        `states`: stream states by address ("stale", "gone", "duplicate" or another), None if unknown.
+        `link`: the fault of the link, "" if it is up. `dropped`: messages dropped by this reader since it started.
+        `is_behind`: it has a backlog.
         An overloaded reader reports no silent vehicles: their messages may be in its backlog.
         """
         with self._lock:

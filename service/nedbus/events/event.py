@@ -111,7 +111,8 @@ def state_of(conditions: Iterable[Condition]) -> State:
 
 
 _PRIORITY: Final = (
-    "gone", "silent", "failsafe", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "battery", "dead_reckoning",
+    "duplicate", "gone", "silent", "failsafe", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "battery",
+    "dead_reckoning",
 )  # fmt: skip
 _SENSING: Final = (
     "gps_fix_lost", "gps_fix", "few_satellites", "jamming", "spoofing", "not_fused", "not_aided", "innovation_rejected",
@@ -126,7 +127,7 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "heading_not_good": (*_SENSING, "reset", "landed"),
     "dist_bottom_invalid": ("not_fused", "estimator_fault"),
     "reset": (*_SENSING, *_ESTIMATE, "origin_set", "origin_moved"),
-    "jump": (*_SENSING, *_ESTIMATE),
+    "jump": ("duplicate", *_SENSING, *_ESTIMATE),
     "origin_set": _SENSING,
     "origin_moved": (*_SENSING, "reset"),
     "gps_fix_lost": ("jamming", "spoofing", "few_satellites"),
@@ -147,8 +148,9 @@ KINDS: Final[Mapping[str, tuple[str, ...]]] = {
     "takeoff": (),
     "gcs_lost": (),
     "battery": (),
-    "reboot": ("battery", "gone", "silent"),
+    "reboot": ("duplicate", "battery", "gone", "silent"),
     "silent": ("link_down", "battery", "overload"),
+    "duplicate": (),
     "gone": ("link_down", "battery", "silent"),
     "lost": ("link_down", "overload"),
     "rejected": (),

@@ -151,7 +151,7 @@ SMALL_RESET: Final = 0.5  # m or m/s; the severity of a smaller reset is info
 FLAPPING_CHANGES: Final = 4  # of a condition within WINDOW; further changes are suppressed, except for the last
 PAUSE: Final = 5.0  # s without a further one after which flapping, losses, rejections or an overload have ended
 MAX_BURST: Final = 20.0  # s after which losses are reported even if they continue
-KEPT_ON_REBOOT: Final = ("silent", "gone", "rejected")  # conditions that a reboot does not end
+KEPT_ON_REBOOT: Final = ("silent", "gone", "duplicate", "rejected")  # conditions that a reboot does not end
 ARMED: Final = 2  # arming_state
 
 MODES: Final[Mapping[int, str]] = {

@@ -12,7 +12,8 @@ from .rules import KEPT_ON_REBOOT, RECENT, flags_of
 
 _TOGETHER: Final = 1.0  # s between the begins of conditions that belong to one story
 _MAIN_FAULTS: Final = (
-    "gone", "silent", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "failsafe", "battery", "reboot",
+    "duplicate", "gone", "silent", "xy_invalid", "z_invalid", "v_xy_invalid", "v_z_invalid", "failsafe", "battery",
+    "reboot",
 )  # fmt: skip
 _INVALID: Final = " not valid"
 _GPS: Final = "vehicle_gps_position"
@@ -126,7 +127,7 @@ def spans_of(events: Sequence[Event], conditions: Iterable[Condition] = ()) -> l
             spans.append(Span(step.kind, step.severity, step.text, step.time, step, until=step.time))
             if step.kind == "reboot":
                 end([key for key in active if key[0] not in KEPT_ON_REBOOT], step)
-        else:
+        elif step.kind != "duplicate" or keys[0] not in active:  # each of its services reports a duplicate
             end([*keys, *([("silent", "")] if step.kind == "gone" else [])], step)
             since = step.time - (step.numbers.get("age", 0.0) if step.kind in ("silent", "gone") else 0.0)
             active |= dict.fromkeys(keys, Span(step.kind, step.severity, step.text, since, step))

@@ -140,8 +140,15 @@ class Vehicle:
                 del self._changes[key]
 
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
-        """Update from the state of the position's stream: "stale", "gone" or another, None if unknown."""
+        """Update from the state of the position's stream: "stale", "gone", "duplicate" or another, None if unknown."""
         self.settle(time)
+        if self.main is not None and state not in (None, "unknown"):
+            stream, is_known = self.main.stream, ("duplicate", "") in self.conditions
+            if state == "duplicate" and not is_known:
+                text = f"several publishers of {stream}: readers receive a mixture"
+                self.emit(Finding("duplicate", "begin", "bad", text), stream, time)
+            elif is_known and state != "duplicate":
+                self.emit(Finding("duplicate", "end", "info", f"{stream} is no longer a mixture"), stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
             silent = "silent"
@@ -245,7 +252,7 @@ class Vehicle:
         self.conditions = {key: each for key, each in self.conditions.items() if key[0] in KEPT_ON_REBOOT}
         self.armed = None
         last, self._rebooted = self._rebooted, time
-        if time - last >= PAUSE:
+        if time - last >= PAUSE and ("duplicate", "") not in self.conditions:
             text = f"rebooted: time since boot {self.boot or 0.0:.1f} s, was {before / 1e6:.1f} s"
             self.emit(Finding("reboot", "once", "bad", text, numbers={"before": before / 1e6}), "", time)
 

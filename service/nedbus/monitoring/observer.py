@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -23,12 +24,12 @@ _MAX_AGE: Final = 3.0  # s of the first sample of a stream; an older one belongs
 class Snapshot:
     """Snapshot of the streams, new rejections and the link.
 
-    `time`: by the steady clock [s], as the times of `rejected`; `alive`: the published addresses.
+    `time`: by the steady clock [s], as the times of `rejected`; `alive`: the number of publishers of each address.
     `link`, `behind`: the fault of the link and of this reader, "" if there is none.
     """
 
     time: float
-    alive: Collection[Address]
+    alive: Counter[Address]
     rejected: list[RejectionReport]
     link: str
     healths: Mapping[Address, Health]
@@ -77,11 +78,11 @@ class Observer:
         rejected = [replace(report, received=round(now * 1e9)) for report in taken]
         for report in rejected:
             self.account.reject(report.address, report.reason, now)
-        alive = {address for addresses in self._bus.vehicles(timeout=0.2).values() for address in addresses}
+        alive = self._bus.publishers(timeout=0.2)
         self._disconnected = self._disconnected if connected else now
         settled = now - self._disconnected > _SETTLING_TIME
         states = {
-            main: stream_state(healths[main], alive=main in alive).name if settled else "unknown"
+            main: stream_state(healths[main], publishers=alive[main]).name if settled else "unknown"
             for main in [vehicle.main for vehicle in list(self.account.vehicles.values())]
             if main is not None and (main in healths or not settled)
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
@@ -183,20 +183,20 @@ class Fleet:
 
     def update(
         self, time: float, healths: Mapping[Address, Health], states: Mapping[str, State], *,
-        alive: Collection[Address] | None = None, link: str = "", own: str = "",
+        alive: Counter[Address] | None = None, link: str = "", own: str = "",
         logs: Mapping[str, LogStreamStatus] = MappingProxyType({}),
     ) -> Picture:  # fmt: skip
         """Take a picture at `time` [s], keep it in `picture` and return it.
 
-        `states`, `logs`: states and ULog streams by vehicle; `alive`: the currently published addresses, None if
-        unknown.
+        `states`, `logs`: states and ULog streams by vehicle; `alive`: the number of publishers of each address, None
+        if unknown.
         """
         lines: dict[str, list[Line]] = {}
         for address, stream in sorted([*self.streams.items()]):  # a copy: another thread adds streams
             if stream.last is None:
                 continue
             health = healths.get(address) or replace(health_of_last(stream.last), age=time - stream.time)
-            state = stream_state(health, alive=None if alive is None else address in alive, connected=not link)
+            state = stream_state(health, publishers=None if alive is None else alive[address], connected=not link)
             line = Line(address, stream, health, state, self._rejected[address])
             lines.setdefault(address.vehicle, []).append(line)
         rows = [self._row(name, each, states.get(name), own, logs.get(name)) for name, each in lines.items()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from types import SimpleNamespace
@@ -43,7 +44,6 @@ class World:
         self.daemon = Daemon(load_settings(source=("sim:",)), version="0")
         publisher = SimpleNamespace(publish=lambda _: None, close=lambda: None, relabel=lambda _: None)
         registry = SimpleNamespace(
-            is_alive=lambda _: False,
             reject=lambda *_: None,
             publisher=lambda address, *_, **__: SimpleNamespace(definition=BY_TOPIC[address.topic], **vars(publisher)),
         )
@@ -55,7 +55,7 @@ class World:
             routers=("tcp/127.0.0.1:7447",),
             subscribe_to=lambda *_, **__: SimpleNamespace(counts=Counts(), waiting=0),
             rejections=lambda: SimpleNamespace(take=list),
-            vehicles=lambda **_: {each.vehicle: [each] for each in (*ADDRESSES, GPS)},
+            publishers=lambda **_: Counter((*ADDRESSES, GPS)),
         )
         self.reader = Observer(cast("Bus", bus), Selection("*"))
 

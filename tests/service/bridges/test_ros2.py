@@ -255,7 +255,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
         stamp = zenoh.Timestamp(sent, bytes(raw.new_timestamp().get_id()))
         raw.put(address.key(), encode(message(timestamp)), timestamp=stamp)
 
-    token = raw.liveliness().declare_token(address.alive_key())
+    token = raw.liveliness().declare_token(address.alive_key("1a"))
     run_bridge()
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 1, what="the bridge")
     first = raw.new_timestamp().get_time()
@@ -263,7 +263,7 @@ def test_vehicle_that_is_back_brings_nothing_late(
     assert subscriber.handler.recv().payload
     token.undeclare()
     wait_for(lambda: "is no longer on the bus" in caplog.text, what="the vehicle to go")
-    token = raw.liveliness().declare_token(address.alive_key())
+    token = raw.liveliness().declare_token(address.alive_key("1a"))
     wait_for(lambda: caplog.text.count("-> /fmu/out/") == 2, what="the vehicle to be back")
     late = first + dt.timedelta(milliseconds=1)
     wait_for(lambda: raw.new_timestamp().get_time() - late > dt.timedelta(seconds=0.2), what="it to be late")

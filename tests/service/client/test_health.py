@@ -6,6 +6,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import pytest
 
@@ -237,17 +238,19 @@ def test_states_have_reasons() -> None:
     fresh, late = (follow(*second, latency=latency).snapshot(3 * SECOND) for latency in (0.01, 4.4))
     stream = follow(*(index * 0.01 for index in range(3000)), *(30.0 + index * 0.2 for index in range(15)))
     silent, longer = (stream.snapshot(seconds * SECOND) for seconds in (40, 3 * 3600))
-    for health, known, text in (
+    cases: tuple[tuple[Health, dict[str, Any], str], ...] = (
         (fresh, {}, "ok"),
-        (fresh, {"alive": True}, "ok"),
-        (fresh, {"alive": False}, "ok"),  # other languages publish without tokens
+        (fresh, {"publishers": 1}, "ok"),
+        (fresh, {"publishers": 0}, "ok"),  # other languages publish without tokens
+        (fresh, {"publishers": 2}, "duplicate: 2 publishers: stop one, or give it another vehicle"),
         (late, {}, "slow: 4.4 s late, or clocks differ"),
-        (silent, {"alive": True}, "stale: nothing for 7.2 s"),
+        (silent, {"publishers": 1}, "stale: nothing for 7.2 s"),
         (silent, {}, "stale: nothing for 7.2 s"),
-        (silent, {"alive": False}, "gone: last message 7.2 s ago"),
+        (silent, {"publishers": 0}, "gone: last message 7.2 s ago"),
         (longer, {}, "stale: nothing for 3 h"),
-        (silent, {"alive": False, "connected": False}, "disconnected: no link"),
-    ):
+        (silent, {"publishers": 0, "connected": False}, "disconnected: no link"),
+    )
+    for health, known, text in cases:
         assert str(stream_state(health, **known)) == text
     assert str(stream_state(stream.snapshot(33 * SECOND))).startswith("slow: 5.0 Hz, usually ")
     assert stream_state(fresh).severity > stream_state(late).severity > stream_state(silent).severity
@@ -259,3 +262,5 @@ def test_description_has_state_flags_and_events() -> None:
     assert describe_stream(health, stream_state(health)) == "ok"
     doubtful = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0, fields=VALID | {"xy_valid": False}).snapshot(4 * SECOND)
     assert describe_stream(doubtful, stream_state(doubtful)) == "stale: nothing for 4.0 s, xy invalid, 2 reboots"
+    mixed = follow(0.0, 0.01, 0.02, every=-2.0, boot=9.0).snapshot(SECOND // 10)
+    assert "reboots" not in describe_stream(mixed, stream_state(mixed, publishers=2)), "each message of the other one"

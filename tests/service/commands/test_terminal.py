@@ -350,7 +350,9 @@ def test_hostile_status_is_shown_harmless(endpoint: str, raw: Session) -> None:
 
 def test_hostile_keys_are_shown_harmless(endpoint: str, raw: Session) -> None:
     """Keys and tokens with escape sequences reach neither the output nor the log."""
-    tokens = [raw.liveliness().declare_token(f"nedbus/{name}/@alive/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)]
+    tokens = [
+        raw.liveliness().declare_token(f"nedbus/{name}/@alive/1a/{VLP}") for name in ("\x1b[2J", "a\nb", "x" * 5000)
+    ]
 
     def put() -> None:
         raw.put("nedbus/\x1b[2J/vehicle_local_position", b"garbage")

@@ -19,7 +19,7 @@ import zenoh
 
 import nedbus
 from nedbus.transport import Session, Uplinks, open_client, open_router
-from nedbus_msgs import Provenance, VehicleLocalPosition
+from nedbus_msgs import Address, Provenance, VehicleLocalPosition
 from tests.flights.first_message import ENCODING, FIELD_TYPES, LAYOUTS, provenance_of, upgrade
 from tests.flights.messages import VLP, message
 from tests.flights.replays import open_replay
@@ -486,14 +486,33 @@ def test_status_schema_and_last_values_are_on_the_network(run_nedbus: Start, raw
 
 
 def test_second_service_of_a_vehicle_is_warned_of(run_nedbus: Start, endpoint: str, bus: nedbus.Bus) -> None:
-    """Two services of one vehicle mix two flights: the second says so. One is healthy, and without one none is."""
+    """Two services of one vehicle mix two flights: both log it once, and every command reports it while it lasts."""
     none = run_command("health", "-c", endpoint)
     assert none.exit_code == 1
     assert "no service of" in none.err
-    run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
+    first = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
     wait_for(bus.latest, what="the first service")
     healthy = run_command("health", NEDBUS_CONNECT=endpoint)
     assert healthy.exit_code == 0, healthy.err
     assert healthy.out.startswith("1 service, 1 source, ")
     second = run_nedbus("serve", "--connect", endpoint, "-s", "sim:")
-    wait_for(lambda: "is also published by another process" in second.err, what="the warning")
+    warning = "vehicle 1 is also published by another process: stop one, or give it another --vehicle"
+    for service in (first, second):
+        wait_for(partial(lambda each: warning in each.err, service), what="the warning")
+    assert bus.publishers()[Address("1", VLP)] == 2
+    unhealthy = run_command("health", NEDBUS_CONNECT=endpoint)
+    assert unhealthy.exit_code == 1
+    assert "vehicle 1 has several publishers: stop one, or give it another vehicle" in unhealthy.err
+    measured = run_command("hz", "--duration", "2", "--json", VLP, NEDBUS_CONNECT=endpoint)
+    assert '"state": "duplicate", "reason": "2 publishers: ' in measured.out
+    assert f"1/{VLP}" in (listed := run_command("list", NEDBUS_CONNECT=endpoint).out)
+    assert "duplicate: 2 publishers" in listed
+    wait_for(lambda: [each.vehicles["1"].kinds[0] for each in bus.accounts()] == ["duplicate"] * 2, what="accounts")
+    explained = run_command("why", NEDBUS_CONNECT=endpoint).out
+    assert explained.startswith(f"1: several publishers of {VLP}"), "and once, though both services report it"
+    assert "\n1: " not in explained
+    assert "2 publishers of this address" in run_command("doctor", NEDBUS_CONNECT=endpoint).out
+    second.signal(signal.SIGTERM)
+    wait_for(lambda: bus.publishers()[Address("1", VLP)] == 1, what="the second one to end")
+    wait_for(lambda: run_command("health", NEDBUS_CONNECT=endpoint).exit_code == 0, what="health")
+    assert [service.err.count(warning) for service in (first, second)] == [1, 1]

@@ -297,9 +297,9 @@ def test_rate_keys() -> None:
     assert Address.from_rate_key("nedbus/7/estimator_local_position/1/@rate/5") == address
     assert Selection().rate_key_expr(5) == "nedbus/*/**/@rate/5"
     assert Selection(VLP, "7").rate_key_expr("*", prefix="a/b") == f"a/b/7/{VLP}/@rate/*"
-    assert Selection(VLP, "7").alive_key_expr(prefix="a/b") == f"a/b/7/@alive/{VLP}"
-    assert Selection().alive_key_expr() == "nedbus/*/@alive/**"
-    assert Selection("estimator_local_position").alive_key_expr() == "nedbus/*/@alive/estimator_local_position/*"
+    assert Selection(VLP, "7").alive_key_expr(prefix="a/b") == f"a/b/7/@alive/*/{VLP}"
+    assert Selection().alive_key_expr() == "nedbus/*/@alive/*/**"
+    assert Selection("estimator_local_position").alive_key_expr() == "nedbus/*/@alive/*/estimator_local_position/*"
     assert not zenoh.KeyExpr("nedbus/**").intersects(address.rate_key(5))
     assert zenoh.KeyExpr(Selection().rate_key_expr(5)).intersects(address.rate_key(5))
     with pytest.raises(AddressError):

@@ -153,7 +153,7 @@ def test_nobody_else_writes_a_vehicles_keys(join: Join, intruder: str) -> None:
 def test_strangers_cannot_announce_vehicles(join: Join, open_as: Open, name: str) -> None:
     """Only a vehicle's own certificate declares its liveliness tokens: false ones would cost every reader."""
     vehicle, reader, own, stranger = join("vehicle-1"), join("reader"), open_as("vehicle-1"), open_as(name)
-    keys = [f"nedbus/{each}/@alive/{VLP}" for each in (1, 2, "x")]
+    keys = [f"nedbus/{each}/@alive/1a/{VLP}" for each in (1, 2, "x")]
     tokens = [stranger.liveliness().declare_token(key) for key in keys]
     tokens += [own.liveliness().declare_token(key) for key in keys[1:]]
     with vehicle.publisher(VLP, vehicle="1"):

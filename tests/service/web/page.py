@@ -6,6 +6,7 @@ import json
 import queue
 import re
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from html import unescape
@@ -88,13 +89,16 @@ class Sky:
     ) -> Picture:
         """Look at all vehicles now, as the page does twice a second."""
         healths = self.monitor.snapshot(round(self.time * 1e9))
+        publishers = None if alive is None else Counter(alive)
         arrival = {
-            address: stream_state(health, alive=None if alive is None else address in alive, connected=not link).name
+            address: stream_state(
+                health, publishers=None if publishers is None else publishers[address], connected=not link
+            ).name
             for address, health in healths.items()
         }
         self.account.update(self.time, arrival, link=link, is_behind=is_behind)
         states = {name: self.account.state(name, self.time) for name in self.account.vehicles}
-        return self.fleet.update(self.time, healths, states, alive=alive, link=link, own=own, logs=logs)
+        return self.fleet.update(self.time, healths, states, alive=publishers, link=link, own=own, logs=logs)
 
     def row(self, vehicle: str = "wing", **known: Any) -> Row:
         row = self.look(**known).row(vehicle)

@@ -91,6 +91,7 @@ class _Check:
         self.ages = _ages(self.sources)
         self._reports = bus.accounts(within=expected.within or 0.0)
         self._known = {name for report in self._reports for name in report.vehicles}
+        self._publishers = bus.publishers()
         self._answers: list[Sample[Message]] = []
         if vehicle is not None or expected.vehicles is not None or set(expected.expect) - self._known:
             only = expected.expect[0] if len(expected.expect) == 1 and expected.vehicles is None else ANY
@@ -133,6 +134,10 @@ class _Check:
             for sample in self._answers
             if sample.vehicle not in self._known and (sample.latency is None or sample.latency <= self._max_age)
         ]
+        shared = {address.vehicle for address, count in self._publishers.items() if count > 1}
+        for name in sorted(shared.intersection(self.ages if self._is_local or self._vehicle else shared)):
+            if not expected.expect or name in expected.expect:
+                yield f"vehicle {name} has several publishers: stop one, or give it another vehicle"
         heard = {sample.vehicle for sample in others}
         for fault in faults_of(self._reports, expected, heard=heard, only=_HOST if self._is_local else None):
             if self._vehicle is None or not fault.startswith(f"vehicle {self._vehicle} is missing"):  # reported above

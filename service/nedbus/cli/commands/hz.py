@@ -63,9 +63,9 @@ def hz(
 
 def _states(bus: Bus, monitor: Monitor) -> Iterator[Stream]:
     """Yield all streams with their states; forget those that have been gone for more than a minute."""
-    alive = {each for addresses in bus.vehicles(timeout=0.5).values() for each in addresses}
+    publishers = bus.publishers(timeout=0.5)
     for address, health in monitor.snapshot().items():
-        state = stream_state(health, alive=address in alive, connected=bus.connected)
+        state = stream_state(health, publishers=publishers[address], connected=bus.connected)
         if state.name == "gone" and (health.age or 0.0) > _FORGET_AFTER:
             monitor.forget(address)
         else:

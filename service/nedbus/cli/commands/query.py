@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -53,13 +54,13 @@ _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List published streams, the age of their last message and state."""
     selection = Selection(ANY, vehicle)
-    published = {each for addresses in bus.vehicles().values() for each in addresses if selection.matches(each)}
+    published = Counter({each: count for each, count in bus.publishers().items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
     for address in sorted(published | newest.keys()):
         sample = newest.get(address)
         health = health_of_last(sample) if sample else None
-        state = stream_state(health, alive=address in published) if health else None
+        state = stream_state(health, publishers=published[address]) if health else None
         age = health.age if health else None
         is_stored = sample is not None and sample.stored
         if json_output:
@@ -179,7 +180,7 @@ def _source_row(source: SourceStatus) -> list[str]:
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:
     address, health = stream.address, stream.health
-    alive = address in source.addresses
+    alive = int(address in source.addresses)
     is_refused = address.partition("/")[0] in refused
     suffix = ", by PX4's definition" if TOPICS.keys().isdisjoint(address.split("/")) else ""
     return [
@@ -188,5 +189,7 @@ def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStat
         f"{health.nominal:g}" if health.nominal else "-",
         "-" if health.age is None else to_age(health.age),
         str(health.messages),
-        "refused by the router" if is_refused else describe_stream(health, stream_state(health, alive=alive)) + suffix,
+        "refused by the router"
+        if is_refused
+        else describe_stream(health, stream_state(health, publishers=alive)) + suffix,
     ]

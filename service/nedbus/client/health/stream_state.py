@@ -12,7 +12,7 @@ from nedbus_msgs import Message, describe_flags
 
 from .stream_health import Health, StreamHealth
 
-StateName = Literal["disconnected", "gone", "stale", "slow", "ok"]  # worst first
+StateName = Literal["disconnected", "gone", "stale", "duplicate", "slow", "ok"]  # worst first
 
 _LATE: Final = 1.0  # s; a higher latency makes a stream slow
 _SLOW: Final = 0.5  # share of the usual rate; a lower rate makes a stream slow
@@ -35,19 +35,21 @@ class StreamState:
         return f"{self.name}: {self.reason}" if self.reason else self.name
 
 
-def stream_state(health: Health, *, alive: bool | None = None, connected: bool = True) -> StreamState:
+def stream_state(health: Health, *, publishers: int | None = None, connected: bool = True) -> StreamState:
     """Return the state of a stream with the given health.
 
-    `alive`: True if the publisher's liveliness token is present; None if unknown.
+    `publishers`: the number of publishers with a liveliness token; None if unknown.
     `connected`: True if there is a link to the router.
     """
     if not connected:
         return StreamState("disconnected", "no link")
     age = health.age
-    if age is not None and age > _ABSENT and alive is False:
+    if age is not None and age > _ABSENT and publishers == 0:
         return StreamState("gone", f"last message {to_age(age)} ago")
     if age is not None and age > health.stale_after:
         return StreamState("stale", f"nothing for {to_age(age)}")
+    if publishers is not None and publishers > 1:
+        return StreamState("duplicate", f"{publishers} publishers: stop one, or give it another vehicle")
     reasons = []
     usual = None if health.on_change else health.usual_rate
     if health.rate is not None and usual is not None and health.rate < _SLOW * usual:
@@ -58,10 +60,13 @@ def stream_state(health: Health, *, alive: bool | None = None, connected: bool =
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
-    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
+    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none.
+
+    Gaps, order and reboots mean nothing in a mixture of several publishers.
+    """
     doubts = "ok" if health.flags is None else describe_flags(health.flags)
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
-    events = [f"{count} {name}" for count, name in counts if count]
+    events = [f"{count} {name}" for count, name in counts if count and state.name != "duplicate"]
     return ", ".join([*(text for text in (str(state), doubts) if text != "ok"), *events]) or "ok"
 
 

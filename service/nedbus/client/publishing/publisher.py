@@ -61,7 +61,8 @@ class Publisher:
         self._partial: tuple[Set[str], str] = self._all, self._encoding  # fields of the last message with missing ones
         topic = get_topic(address.topic)
         with while_open():
-            self._token = heartbeats.session.liveliness().declare_token(address.alive_key(prefix=prefix))
+            token = address.alive_key(str(heartbeats.session.zid()), prefix=prefix)
+            self._token = heartbeats.session.liveliness().declare_token(token)
         cache = CACHE if lossless else topic.kept
         self._writer = Writer(heartbeats, self.key, priority=priority_of(topic), cache=cache, encoding=self._encoding)
         self._flow_control = FlowControl(self._writer, registry.window, needs_router=registry.is_client)

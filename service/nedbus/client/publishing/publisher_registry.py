@@ -6,13 +6,14 @@ import logging
 import threading
 import time
 import weakref
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from typing import Any, Final, cast
 
 import zenoh
 from pydantic_core import to_json
 
+from nedbus.client.discovery import VehicleDirectory
 from nedbus.client.housekeeping import Housekeeping
 from nedbus.client.protocol import LIVE
 from nedbus.errors import AddressInUseError
@@ -47,6 +48,7 @@ class PublisherRegistry:
         self._publishers: dict[Address, Publisher] = {}
         self._answered: set[str] = set()  # key expressions of schemas and of vehicles with a queryable
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
+        self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
         self._lock = threading.Lock()
 
     @property
@@ -78,7 +80,9 @@ class PublisherRegistry:
                 raise AddressInUseError(address)
             vehicle = address.vehicle
             if vehicle not in self._matched:
-                key_expr = Selection(vehicle=vehicle).rate_key_expr(ANY, prefix=self.prefix)
+                selection = Selection(vehicle=vehicle)
+                self._directories[vehicle] = VehicleDirectory(prefix=self.prefix, selection=selection)
+                key_expr = selection.rate_key_expr(ANY, prefix=self.prefix)
                 self._matched[vehicle] = MatchingListener(self._session, key_expr)
             matched = self._matched[vehicle]
             publisher = self._publishers[address] = Publisher(
@@ -104,15 +108,18 @@ class PublisherRegistry:
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
-    def is_alive(self, address: Address) -> bool:
-        """Return True if an address is published, by this or another process."""
-        return bool(alive_keys(self._session, address.alive_key(prefix=self.prefix), timeout=_TOKENS_TIMEOUT))
+    def shared_vehicles(self) -> list[str]:
+        """Return the vehicles that another process publishes as well, sorted."""
+        with self._lock:
+            directories = sorted(self._directories.items())
+        return [
+            name for name, each in directories if max(each.publishers(self._session, timeout=0).values(), default=0) > 1
+        ]
 
-    def alive_among(self, addresses: Collection[Address]) -> set[Address]:
-        """Return those that are published, as `is_alive` does, with one question to the router for each vehicle."""
-        asked = {Selection(ANY, each.vehicle).alive_key_expr(prefix=self.prefix) for each in addresses}
-        found = {key for each in asked for key in alive_keys(self._session, each, timeout=_TOKENS_TIMEOUT)}
-        return {address for address in addresses if address.alive_key(prefix=self.prefix) in found}
+    def confirm(self, address: Address) -> None:
+        """Wait until the router has processed all declarations of an address, by a query for its own token."""
+        own = address.alive_key(str(self._session.zid()), prefix=self.prefix)
+        alive_keys(self._session, own, timeout=_TOKENS_TIMEOUT)
 
     def is_read(self, addresses: Iterable[Address]) -> bool:
         """Return True if any of these addresses has a subscriber."""
@@ -142,6 +149,7 @@ class PublisherRegistry:
             self._publishers.pop(address, None)
             if not any(each.vehicle == address.vehicle for each in self._publishers):
                 self._matched.pop(address.vehicle).close()
+                del self._directories[address.vehicle]
 
     def _reply(self, vehicle: str, query: zenoh.Query) -> None:
         """Reply with the last messages of a vehicle."""
