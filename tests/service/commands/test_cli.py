@@ -81,9 +81,10 @@ def test_list_of_one_vehicle(endpoint: str, bus: nedbus.Bus) -> None:
     bus.publisher(VLP, vehicle="silent")
     for vehicle, count in (("1", 2), ("2", 1), ("silent", 1), ("3", 0)):
         listed = run_command("list", "-c", endpoint, "--vehicle", vehicle, "--json")
-        assert listed.exit_code == 0, listed.err
+        assert listed.exit_code == (vehicle == "3"), listed.err
         assert [json.loads(line)["vehicle"] for line in listed.out.splitlines()] == [vehicle] * count
         assert ("no vehicle 3 is published at" in listed.err) == (vehicle == "3")
+        assert listed.err.endswith(": choose one of 1, 2, silent\n") == (vehicle == "3"), "nothing of permissions"
 
 
 def test_hz_measures(run_nedbus: Start, flying: str) -> None:

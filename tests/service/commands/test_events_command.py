@@ -254,14 +254,18 @@ def start_service(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, *sources: s
 
 
 def test_why_live(run_nedbus: Start, bus: nedbus.Bus, endpoint: str, log: Path, tmp_path: Path) -> None:
-    """A service in another process tells what it saw since it began, of a vehicle that is named where there are two."""
+    """A service in another process tells what it saw of all vehicles or of one, but not of one of a script."""
     good = write_flight(tmp_path / "good.ulg", fault=False)
     start_service(run_nedbus, bus, endpoint, f"ulog:{log}?speed=20", f"ulog:{good}?vehicle=2&speed=20")
     shown = run_command("why", "-c", endpoint)
-    assert (shown.exit_code, shown.err) == (
-        2,
-        "nedbus: --vehicle: several vehicles in the network: choose one of 1, 2\n",
-    )
+    assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n")
+    assert shown.out.startswith("1: xy and vxy not valid from ")
+    assert shown.out.endswith("\n\n2: no faults in the history of the services\n")
+    bus.publisher(VLP, vehicle="mocap1").publish(message(1))
+    shown = run_command("why", "-c", endpoint, "-v", "mocap1")
+    reason = "vehicle mocap1 is published, but no nedbus service keeps its history"
+    hint = "follow it with 'nedbus events --vehicle mocap1'"
+    assert (shown.exit_code, shown.err) == (1, f"nedbus: {reason}: {hint}\n")
     assert run_command("why", "-c", endpoint, "-v", "2").out == "2: no faults in the history of the services\n"
     shown = run_command("why", "-c", endpoint, "-v", "1")
     assert (shown.exit_code, shown.err) == (0, "times: UTC, from the clocks of the hosts\n")

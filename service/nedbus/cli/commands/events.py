@@ -73,8 +73,7 @@ def events(
     if within is not None or duration is not None:
         raise ConfigError("--within" if within is not None else "--duration", "needs live vehicles, not a file")
     read, found = _read(files)
-    if vehicle != ANY:
-        _choose_vehicle(_name(files), read.account.vehicles, vehicle)
+    _choose_vehicles(_name(files), read.account.vehicles, vehicle)
     found = [event for event in found if event.severity in severities and vehicle in (ANY, event.vehicle)]
     if csv_output:
         write(csv_line(_HEAD))
@@ -95,57 +94,70 @@ def why(
     open_bus: Callable[[], Bus],
     files: FilesArgument = None,
     *,
-    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="Needed if there are several")] = None,
+    vehicle: VehicleOption = ANY,
     at: Annotated[str | None, typer.Option(metavar="TIME", help="14:05:12 (UTC) or seconds since boot")] = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Explain the faults of a vehicle, live or from a file.
+    """Explain the faults of vehicles, live or from a file.
 
     Shows begin, duration and possible causes of each fault: events of the ten seconds before it, and conditions that
     were active already. Names topics that would help but are missing, with a hint. Live data is the history kept by
     nedbus services. Exits with 0, with and without faults.
     """
-    if vehicle is not None:
-        check_vehicle(vehicle)
     if files:
         read, found = _read(files)
-        name = _choose_vehicle(_name(files), read.account.vehicles, vehicle)
-        followed = read.account.vehicles[name]
-        found = [event for event in found if event.vehicle == name]
-        conditions = [each for each in followed.conditions.values() if each.severity != "info"]
-        topics, times = list(followed.topics), read.times
+        names = _choose_vehicles(_name(files), read.account.vehicles, vehicle)
+        held = {
+            name: [each for each in read.account.vehicles[name].conditions.values() if each.severity != "info"]
+            for name in names
+        }
+        topics, times = {name: list(read.account.vehicles[name].topics) for name in names}, read.times
         until, advice = "until the end", _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
         nothing = f"no faults in {read.end:.0f} s"
     else:
         with open_bus() as bus:
             reports = bus.accounts(within=_DAY)
+            published = bus.vehicles()
             where = " or ".join(bus.routers)
-        reporting = by_vehicle(reports)
+        reporting, found = by_vehicle(reports), _merge(reports)
+        if vehicle in published and vehicle not in reporting:
+            hint = f"follow it with 'nedbus events --vehicle {vehicle}'"
+            raise NedbusError(f"vehicle {vehicle} is published, but no nedbus service keeps its history: {hint}")
         if not reporting:
             raise NedbusError(f"no nedbus service at {where} has data of a vehicle: start one with 'nedbus serve'")
-        name = _choose_vehicle("the network", reporting, vehicle)
-        found = [event for event in _merge(reports) if event.vehicle in (name, ANY)]
-        state = reporting[name].vehicles[name]
-        conditions, topics, times = list(state.held), list(state.topics), Times(is_live=True)
+        names = _choose_vehicles("the network", reporting, vehicle)
+        states = {name: reporting[name].vehicles[name] for name in names}
+        held = {name: list(state.held) for name, state in states.items()}
+        topics, times = {name: list(state.topics) for name, state in states.items()}, Times(is_live=True)
         until, advice, nothing = "until now", _LIVE_ADVICE, "no faults in the history of the services"
-    moment = None
-    if at is not None:
-        try:
-            moment = times.find(at, found[-1]) if found else None
-        except ValueError as exc:
-            raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
-    stories = stories_of(found, conditions, topics=topics, at=moment)
-    if json_output:
-        for story in stories:
-            write(_story_json(story, times))
-        return
-    if not stories:
-        write(f"{name}: {nothing}")
-        return
-    _write_clock(found, times)
-    if moment is not None and not any(each.since <= moment <= (each.until or moment) for each in stories):
-        write(f"{name}: no fault at {at}; the nearest one:")
-    write("\n\n".join("\n".join(_describe(name, story, times, advice, until)) for story in stories))
+    texts: list[str] = []
+    shown: list[Event] = []
+    for name in names:
+        events = [event for event in found if event.vehicle in (name, ANY)]
+        moment = _find_moment(at, times, events)
+        stories = stories_of(events, held[name], topics=topics[name], at=moment)
+        if json_output:
+            for story in stories:
+                write(json.dumps({"vehicle": name} | _story_fields(story, times)))
+        elif not stories:
+            texts.append(f"{name}: {nothing}")
+        else:
+            shown += events
+            if moment is not None and not any(each.since <= moment <= (each.until or moment) for each in stories):
+                texts.append(f"{name}: no fault at {at}; the nearest one:")
+            texts += ["\n".join(_describe(name, story, times, advice, until)) for story in stories]
+    if texts:
+        _write_clock(shown, times)
+        write("\n\n".join(texts))
+
+
+def _find_moment(at: str | None, times: Times, events: Sequence[Event]) -> float | None:
+    if at is None or not events:
+        return None
+    try:
+        return times.find(at, events[-1])
+    except ValueError as exc:
+        raise ConfigError("--at", f"{at!r}: {exc}: expected 14:05:12 (UTC), or seconds since boot") from exc
 
 
 def _describe(vehicle: str, story: Story, times: Times, advice: str, until: str) -> Iterator[str]:
@@ -274,23 +286,21 @@ def _to_csv(event: Event, times: Times) -> str:
     return csv_line([fields[name] for name in _HEAD])
 
 
-def _story_json(story: Story, times: Times) -> str:
+def _story_fields(story: Story, times: Times) -> dict[str, object]:
     events = {name: getattr(story, name) for name in ("before", "meanwhile", "after")}
-    fields = {
+    return {
         "what": story.what,
         "begin": None if story.begin is None else _to_fields(story.begin, times),
         "lasted": None if story.until is None else story.until - story.since,
         **{name: [_to_fields(event, times) for event in each] for name, each in events.items()},
         "lacking": story.lacking,
     }
-    return json.dumps(fields)
 
 
-def _choose_vehicle(where: object, names: Collection[str], vehicle: str | None) -> str:
-    if vehicle is None and len(names) == 1:
-        return next(iter(names))
-    if vehicle is not None and vehicle in names:
-        return vehicle
+def _choose_vehicles(where: object, names: Collection[str], vehicle: str) -> list[str]:
+    """Return the vehicle, or all for "*"; raise ConfigError if it is not among them."""
+    if vehicle == ANY or vehicle in names:
+        return sorted(names) if vehicle == ANY else [vehicle]
+    check_vehicle(vehicle)
     shown = to_text(", ".join(sorted(names)[:20]), _MAX_TEXT) or "none"
-    problem = "several vehicles" if vehicle is None else f"no vehicle {to_text(vehicle, 64)}"
-    raise ConfigError("--vehicle", f"{problem} in {where}: choose one of {shown}")
+    raise ConfigError("--vehicle", f"no vehicle {vehicle} in {where}: choose one of {shown}")

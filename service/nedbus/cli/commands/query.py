@@ -54,7 +54,8 @@ _MAX_VEHICLES: Final = 2000  # characters of a list of vehicles or topics
 def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = False) -> None:
     """List published streams, the age of their last message and state."""
     selection = Selection(ANY, vehicle)
-    published = Counter({each: count for each, count in bus.publishers().items() if selection.matches(each)})
+    everything = bus.publishers()
+    published = Counter({each: count for each, count in everything.items() if selection.matches(each)})
     newest = {sample.address: sample for sample in bus.latest(ANY, vehicle=vehicle)}
     rows = []
     for address in sorted(published | newest.keys()):
@@ -73,12 +74,16 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         write(to_table(["VEHICLE/TOPIC", "AGE", "STATE"], rows))
     if not rows:
         hint = "start a source with 'nedbus serve'"
-        if bus.services():
+        if others := sorted({address.vehicle for address in everything}):
+            hint = f"choose one of {to_text(', '.join(others[:20]))}"
+        elif bus.services():
             hint = (
                 "a service answers: see 'nedbus info', and check its and this client's permissions (docs/security.md)"
             )
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
+        if vehicle != ANY:
+            raise typer.Exit(1)
 
 
 @command
