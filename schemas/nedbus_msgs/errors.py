@@ -26,8 +26,8 @@ def _rebuild(kind: type[NedbusError], arguments: tuple[object, ...], facts: dict
 class AddressError(NedbusError, ValueError):
     """Raised when a vehicle, topic, instance or key expression cannot name a stream."""
 
-    def __init__(self, what: str, given: object, expected: str) -> None:
-        super().__init__(f"{what} {given!r:.{_MAX_SHOWN}} is not valid: expected {expected}")
+    def __init__(self, what: str, given: object, expected: str, *, problem: str = "is not valid") -> None:
+        super().__init__(f"{what} {given!r:.{_MAX_SHOWN}} {problem}: expected {expected}")
         self.given = given
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, TypeVar, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +20,11 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
+T = TypeVar("T")
+
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
+_MAX_NAMED: Final = 20  # columns in an error
 _MAX_ROWS: Final = 10_000_000  # rows of a table resampled at a rate; a damaged timestamp must not exhaust memory
 _STALE: Final = 1_000_000  # us; a message that is older than the start of recording by more was sent before it
 _STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
@@ -37,6 +40,7 @@ _Flights = FlightPath | Sequence[FlightPath] | Mapping[str, MessageArray]
 
 class _AlignOptions(TypedDict, total=False):
     topics: Sequence[str] | None
+    fields: Sequence[str] | None
     on: str | float | Sequence[int] | npt.NDArray[np.int64]
     method: Literal["last", "nearest", "linear"]
     vehicle: str | int
@@ -53,6 +57,7 @@ def align(
     flight: _Flights,
     *,
     topics: Sequence[str] | None = None,
+    fields: Sequence[str] | None = None,
     on: str | float | Sequence[int] | npt.NDArray[np.int64] = DEFAULT_TOPIC,
     method: Literal["last", "nearest", "linear"] = "last",
     vehicle: str | int = ANY,
@@ -62,6 +67,7 @@ def align(
     """Return several streams of one or several files, or arrays from `read`, as one table, aligned in time.
 
     `topics`: as in `read`; by default all topics, for a log all topics known to nedbus.
+    `fields`: the columns besides `timestamp` and `utc`, such as "x" (of each stream) or "battery_status/0.age".
     `on`: the rows of the table: the messages of a stream, a rate [Hz], or times on the clock of PX4's `timestamp` [us].
     Columns are `timestamp` [us], and for each stream `<stream>.<field>` and `<stream>.age` [s], the time since the
     message with these values. Before the first message the age is NaN, floats are NaN, and other values 0 or false.
@@ -87,7 +93,7 @@ def align(
     if not isinstance(flight, Mapping):
         streams, start = read_streams(flight, names if topics else None, vehicle=vehicle)
     elif unknown := [name for name in topics or () if name not in (ANY, *flight)]:
-        raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}")
+        raise AddressError("topic", unknown[0], f"one of {', '.join(flight)}", problem="is not among these arrays")
     else:
         everything = not topics or ANY in topics
         streams = {name: (array, {}) for name, array in flight.items() if everything or name in names}
@@ -118,7 +124,9 @@ def align(
         for field, _ in _fields(messages):
             columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
-    missing = tuple(f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
+    columns = columns if fields is None else _choose(columns, fields)
+    lacked = (f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
+    missing = tuple(each for each in lacked if each in columns)
     types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
     table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
     for name, column in columns.items():
@@ -131,7 +139,20 @@ def _find_stream(on: str, streams: Streams) -> str:
     for name in streams:
         if f"/{name}".endswith(f"/{on}"):
             return name
-    raise AddressError("on", on, f"one of {', '.join(streams)}, a rate [Hz], or times [us]")
+    expected = f"one of {', '.join(streams)}, a rate [Hz], or times [us]"
+    raise AddressError("on", on, expected, problem="is not in this flight")
+
+
+def _choose(columns: Mapping[str, T], fields: Sequence[str]) -> dict[str, T]:
+    """Return the columns that these fields select, and the times; raise ConfigError for a field that no stream has."""
+    chosen = {"timestamp", "utc"}
+    for field in fields:
+        named = {column for column in columns if field in (column, column.rpartition(".")[2])}
+        if not named:
+            expected = ", ".join([*columns][:_MAX_NAMED])
+            raise ConfigError("fields", f"no stream has {field!r}: expected some of {expected}, ...")
+        chosen |= named
+    return {name: column for name, column in columns.items() if name in chosen}
 
 
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:

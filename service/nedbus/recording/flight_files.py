@@ -108,8 +108,9 @@ def matching(path: Path, addresses: Sequence[Address], selection: Selection) -> 
     steps = {"vehicle": Selection(vehicle=vehicle), "topic": Selection(topic, vehicle), "instance": selection}
     for part, step in steps.items():
         if not any(map(step.matches, addresses)):
-            expected = f"one in {path}, which has {_list(addresses)}"
-            raise AddressError(part, getattr(selection, part), expected)
+            raise AddressError(
+                part, getattr(selection, part), f"one of {_list(addresses)}", problem=f"is not in {path}"
+            )
     return list(filter(selection.matches, addresses))
 
 

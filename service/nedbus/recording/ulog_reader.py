@@ -17,6 +17,7 @@ from .flight_files import open_flight
 
 _CHUNK: Final = 2**17  # bytes read at a time
 _MAX_NAMED: Final = 5  # damaged places in the warnings
+_MAX_TOPICS: Final = 10  # in an error
 
 
 @dataclass(slots=True, eq=False)
@@ -109,7 +110,11 @@ class UlogReader:
         if not self.streams:
             topics = self._topics
             wanted = "any topic" if topics is None else "these topics" if len(topics) < len(TOPICS) else "a known topic"
-            raise SourceError(str(self._path), "; ".join([f"this log has no message of {wanted}", *self.warnings[:3]]))
+            reason = f"this log has no message of {wanted}"
+            if topics is not None and self._subscribed:
+                names = ", ".join(sorted(self._subscribed)[:_MAX_TOPICS])
+                reason += f", but of {names}: choose them by name, or all with topics=* or read(path, ['*'])"
+            raise SourceError(str(self._path), "; ".join([reason, *self.warnings[:3]]))
 
     def _records(self) -> Iterator[list[ulog.Record]]:
         try:

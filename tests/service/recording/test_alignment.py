@@ -129,6 +129,16 @@ def test_nothing_is_interpolated_over_a_reset() -> None:
     assert table[f"{VLP}.x"].tolist() == [0, 0, 0, 50]
 
 
+def test_fields_choose_the_columns() -> None:
+    """A field names a column, or those of all streams; the times stay, and an unknown field raises."""
+    flight = {VLP: POSITIONS, "home_position": HOME}
+    table = nedbus.align(flight, fields=["z", "home_position.age"], utc=True)
+    assert table.dtype.names == ("timestamp", "utc", f"{VLP}.z", "home_position.age", "home_position.z")
+    assert np.array_equal(table[f"{VLP}.z"], nedbus.align(flight)[f"{VLP}.z"], equal_nan=True)
+    with pytest.raises(ConfigError, match=f"fields: no stream has 'zz': expected some of timestamp, {VLP}.age, "):
+        nedbus.align(flight, fields=["zz"])
+
+
 def test_rate_covers_the_flight() -> None:
     """A rate gives even times from the first message of all to the last one; too many rows are an error."""
     table = nedbus.align({VLP: POSITIONS, "home_position": HOME}, on=20)
@@ -188,7 +198,7 @@ def test_odd_streams_are_aligned(tmp_path: Path) -> None:
         nedbus.align({VLP: again})
     with pytest.raises(ConfigError, match="'spline' is not one of last, nearest, linear"):
         nedbus.align({VLP: POSITIONS}, method="spline")  # type: ignore[call-overload] # that is the mistake
-    with pytest.raises(AddressError, match=f"topic 'home_position' is not valid: expected one of {VLP}"):
+    with pytest.raises(AddressError, match=f"topic 'home_position' is not among these arrays: expected one of {VLP}"):
         nedbus.align({VLP: POSITIONS}, topics=["home_position"])
     with pytest.raises(ConfigError, match="neither pandas nor polars"):
         nedbus.align({VLP: POSITIONS}, dataframe="foo")  # type: ignore[call-overload] # that is the mistake

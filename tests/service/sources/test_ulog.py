@@ -190,7 +190,10 @@ def test_second_writer_of_one_stream_is_left_out_with_a_warning(tmp_path: Path) 
         (lambda path: path.write_bytes(b""), "an empty file"),
         (lambda path: path.write_bytes(b"hello"), "not a readable ULog file"),
         (lambda path: path.write_bytes(b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8)), NOTHING),
-        (lambda path: write_log(path, [1], topic="something_else"), NOTHING),
+        (
+            lambda path: write_log(path, [1], topic="something_else"),
+            f"{NOTHING}, but of something_else: choose .* topics=\\*",
+        ),
     ],
 )
 def test_unreadable_file_is_a_clear_error(tmp_path: Path, write: Callable[[Path], object], reason: str) -> None:
