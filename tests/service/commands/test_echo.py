@@ -13,6 +13,7 @@ import termios
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +23,7 @@ import pytest
 import nedbus
 from nedbus.transport import Session
 from nedbus_msgs import BY_TOPIC, VehicleLocalPosition
-from tests.flights.messages import VLP, message
+from tests.flights.messages import VALID, VLP, message
 from tests.flights.replays import open_replay
 from tests.peers.command_line import Ended, fork_command, run_command
 from tests.peers.processes import Forked, Start, Zygote
@@ -152,7 +153,7 @@ def test_echo_counts_losses_and_junk(run_nedbus: Start, endpoint: str, bus: nedb
     wait_for(lambda: "not a VehicleLocalPosition" in process.err, what="the warning")
     publisher.publish(message(2))
     assert process.wait() == 0
-    assert "2 received, 0 lost, 0 dropped, 1 invalid" in process.err
+    assert "2 received, 0 lost, 0 skipped (--every prints all), 1 invalid" in process.err
 
 
 def test_last_value_of_ended_stream_is_marked(endpoint: str, bus: nedbus.Bus, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -203,14 +204,25 @@ def test_echo_csv_of_two_vehicles(endpoint: str, bus: nedbus.Bus) -> None:
     with standing(bus, "1", "2"):
         lines = echo(endpoint, "--csv", "--field", "x,y,delta_xy,xy_valid", "-n", "10").out.splitlines()
         head, row = csv.reader(echo(endpoint, "--csv", "--once").out.splitlines())
-    assert len(head) == len(row) == 4 + len(VehicleLocalPosition.model_fields) + 2
+    assert len(head) == len(row) == 5 + len(VehicleLocalPosition.model_fields) + 2 + 1
     rows = list(csv.DictReader(lines))
-    names = ["vehicle", "topic", "instance", "sent", "timestamp", "x", "y", "delta_xy[0]", "delta_xy[1]", "xy_valid"]
-    assert list(rows[0]) == names
+    fields = ["x", "y", "delta_xy[0]", "delta_xy[1]", "xy_valid"]
+    assert list(rows[0]) == ["vehicle", "topic", "instance", "utc", "sent", "timestamp", *fields, "state"]
     assert len(rows) == 10
     assert {each["vehicle"] for each in rows} == {"1", "2"}
     assert all(int(each["sent"]) > 10**18 and each["timestamp"] == "1" for each in rows)
     assert all(math.isfinite(float(each["x"])) and each["xy_valid"] == "True" for each in rows)
+    for each in rows:
+        assert datetime.fromisoformat(each["utc"]).timestamp() == pytest.approx(int(each["sent"]) / 1e9, abs=1e-5)
+
+
+def test_echo_csv_marks_invalid_positions_and_ends_with_counts(endpoint: str, bus: nedbus.Bus) -> None:
+    """A position has its state whatever fields are chosen, and the end of a CSV tells what is not in it."""
+    bus.publisher(VLP, vehicle="1").publish(message(1, **VALID | {"xy_valid": False}))
+    shown = echo(endpoint, "--csv", "--field", "x", "--duration", "0.5")
+    [row] = csv.DictReader(shown.out.splitlines())
+    assert row["state"] == "xy invalid"
+    assert shown.err == "1 received, 0 lost, 0 skipped (--every prints all), 0 invalid\n"
 
 
 def test_echo_shows_chosen_fields(flying: str) -> None:

@@ -74,12 +74,13 @@ def echo(
             follow(bus, subscription, print_one, count=1 if once else count, duration=duration)
         finally:
             if not isinstance(sys.exception(), BrokenPipeError):  # `| head` has got its lines
-                _write_counts(subscription)
+                _write_counts(subscription, every=every, always=csv_output)
 
 
-def _write_counts(subscription: Subscription[Any]) -> None:
+def _write_counts(subscription: Subscription[Any], *, every: bool, always: bool) -> None:
     counts = subscription.counts
-    if counts.lost or counts.dropped or counts.invalid or counts.discarded:
+    if always or counts.lost or counts.dropped or counts.invalid or counts.discarded:
         discarded = f", {counts.discarded} discarded" if counts.discarded else ""
-        text = f"{counts.received} received, {counts.lost} lost, {counts.dropped} dropped, {counts.invalid} invalid"
+        unread = f"{counts.dropped} {'dropped' if every else 'skipped (--every prints all)'}"
+        text = f"{counts.received} received, {counts.lost} lost, {unread}, {counts.invalid} invalid"
         write_stderr(f"{text}{discarded}")

@@ -177,14 +177,16 @@ class CsvLines:
 
 
 def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, object]]:
-    """Return names and cells of a CSV row: address, time of sending [ns], PX4's time [us], these fields.
+    """Return names and cells of a CSV row: address, time of sending (UTC, and [ns]), PX4's time [us], these fields.
 
     An array has one cell per element; the cell of a field that this message does not have is empty.
+    A position ends with its state, "ok" or the doubts about it.
     """
     address, message = sample.address, sample.message
     row: list[tuple[str, object]] = [
         ("vehicle", address.vehicle), ("topic", address.topic), ("instance", address.instance),
-        ("sent", sample.sent), ("timestamp", message.timestamp),
+        ("utc", sample.stamp and sample.stamp.get_time().isoformat()), ("sent", sample.sent),
+        ("timestamp", message.timestamp),
     ]  # fmt: skip
     types = message.DEFINITION.types
     for name in fields or types:
@@ -196,7 +198,7 @@ def _to_row(sample: Sample[Any], fields: Sequence[str] = ()) -> list[tuple[str, 
             row += [(f"{name}[{index}]", _to_number(each, digits)) for index, each in enumerate(value)]
         else:
             row.append((name, _to_number(value, digits)))
-    return row
+    return [*row, ("state", message_doubts(message, sample.missing))] if _is_position(message) else row
 
 
 def _to_value(sample: Sample[Any], name: str) -> str:
