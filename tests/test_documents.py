@@ -30,7 +30,7 @@ from nedbus.monitoring.metrics import METRICS
 from nedbus.settings import Settings
 from nedbus.sources import SOURCE_KINDS, parse_source
 from nedbus.transport import open_router
-from nedbus_msgs import MESSAGES, TOPICS
+from nedbus_msgs import MESSAGES, TOPICS, VehicleLocalPosition
 from tests.documents import BLOCKS, PAGES, ROOT, Block, check_options, nedbus_commands, parse_command, shape_of
 from tests.flights.replays import convert_replay
 from tests.peers.command_line import run_command
@@ -207,10 +207,28 @@ def test_what_is_not_run_has_a_reason(block: Block) -> None:
 def test_each_language_is_known() -> None:
     """No snippet escapes: what is in no language of these is a text, and a fence has one."""
     languages = {block.language for block in BLOCKS} - {"{toctree}"}
-    assert languages <= {"bash", "sh", "python", "toml", "json", "ini", "text"}
+    assert languages <= {"bash", "sh", "python", "toml", "json", "ini", "text", "javascript", "rust", "cpp"}
     assert {block.marker for block in BLOCKS} <= {"", "not run", "run by", "continues", "output"}
     assert not [str(block) for block in SHELLS if block.language == "sh" and block.is_run]
     assert sum(text.count("```") for text in TEXTS.values()) == 2 * len(BLOCKS)
+
+
+def test_positions_in_a_payload_are_right_in_each_language() -> None:
+    """Element 0 of a payload is the layout, and the fields follow in their order: what a page reads is what it says."""
+    text = TEXTS[ROOT / "docs" / "other-languages.md"]
+    names = ["layout", *VehicleLocalPosition.model_fields]
+    by_index = re.findall(r"let \((.*)\) = \((.*)\);", text)
+    [(rust, indices)] = by_index
+    assert [names[int(each)] for each in re.findall(r"\[(\d+)\]", indices)] == rust.split(", ")
+    [pattern] = re.findall(r"const \[(.*)\] = decode", text)
+    camel = {"xyValid": "xy_valid", "zValid": "z_valid"}
+    for index, name in enumerate(pattern.split(",")):
+        assert camel.get(name.strip(), name.strip()) in ("", names[index])
+    for name, position in re.findall(r'" (\w) " << message.at\((\d+)\)', text):
+        assert names[int(position)] == name
+    written = {name: max(each.wire or 0 for each in known.layouts.values()) for name, known in MESSAGES.items()}
+    assert {name for name, number in written.items() if number} == {"VehicleLocalPosition"}, "1, and 0 for all others"
+    assert written["VehicleLocalPosition"] == 1
 
 
 @pytest.mark.process
