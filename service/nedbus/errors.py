@@ -82,18 +82,19 @@ class ConnectError(NedbusError, ConnectionError):
     def __init__(self, endpoints: Sequence[str], seconds: float, reason: str = "") -> None:
         self.endpoints = tuple(endpoints)
         tried = f"tried for {seconds:.3g} s" + (f", {reason}" if reason else "")
-        text = (
-            f"nothing answers at {' or '.join(endpoints)} ({tried}): start 'nedbus serve' or a Zenoh router there, or"
-            " name another endpoint with --connect or NEDBUS_CONNECT; a router with no room for more sessions does not"
-            " answer either: 'nedbus doctor' finds the cause"
-        )
+        where = " or ".join(endpoints)
         if any(endpoint.startswith(("tls/", "quic/")) for endpoint in endpoints):
-            text += (
-                ". Over TLS, check that tls_ca is the router's authority, that it signed tls_certificate (a router may"
-                " ask for one), that neither has expired, and that the host in the endpoint is one of the router"
-                " certificate's"
+            advice = reason or (
+                "check that tls_ca is the router's authority and signed tls_certificate, that neither has expired, and"
+                " that the router's certificate names this host"
             )
-        super().__init__(text)
+            super().__init__(f"no TLS connection to {where}: {advice}; 'nedbus doctor' finds the cause")
+        else:
+            super().__init__(
+                f"nothing answers at {where} ({tried}): start 'nedbus serve' or a Zenoh router there, or name another"
+                " endpoint with --connect or NEDBUS_CONNECT; a router with no room for more sessions does not answer"
+                " either: 'nedbus doctor' finds the cause"
+            )
 
 
 class ListenError(NedbusError, OSError):

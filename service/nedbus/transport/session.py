@@ -116,6 +116,8 @@ def open_client(
                 break
     # For most failures Zenoh reports only "Unable to connect".
     known = explain_endpoints(endpoints) or (tls.explain() if tls is not None else None)
+    if not known and (tls is None or tls.certificate is None) and endpoints[0].startswith(("tls/", "quic/")):
+        known = "no certificate given: routers of a fleet ask for one (tls_certificate, tls_key)"
     raise ConnectError(endpoints, timeout, known or ("" if "Unable to connect" in reason else reason))
 
 
