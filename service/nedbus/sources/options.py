@@ -58,6 +58,10 @@ def _topics_of(name: str) -> Set[str]:
     return MESSAGES[name].topics.keys() if name in MESSAGES else {name}
 
 
+_Origin = tuple[
+    Annotated[float, Field(ge=-90, le=90)], Annotated[float, Field(ge=-180, le=180)],
+    Annotated[float, Field(ge=-500, le=1e4)],
+]  # fmt: skip
 Vehicle = Annotated[str, AfterValidator(_check_vehicle)]
 Vehicles = Annotated[Mapping[str, str], BeforeValidator(_parse_vehicles)]
 
@@ -106,6 +110,9 @@ class SimulatorOptions(ReplayOptions):
     seed: int = Field(0, description="an integer; the same seed gives the same flight")
     duration: Annotated[float, Field(ge=0.01, le=1e8)] | None = Field(
         None, description="seconds, 0.01 to 1e8 (default: endless)"
+    )
+    origin: Annotated[_Origin | None, BeforeValidator(lambda text: text and text.split(","))] = Field(
+        None, description="LATITUDE,LONGITUDE,ALTITUDE of the take-off, degrees and metres (default: Zurich, as in PX4)"
     )
 
 

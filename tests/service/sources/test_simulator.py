@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from nedbus.errors import SourceError
+from nedbus.errors import ConfigError, SourceError
 from nedbus.sources import SourceMessage
 from nedbus_msgs import (
     BY_TOPIC,
@@ -52,6 +52,26 @@ def others() -> dict[str, list[Any]]:
         assert each.fields.keys() == newest.types.keys()
         by_stream[each.address.stream].append(upgrade_with(definition, each.fields))
     return dict(by_stream)
+
+
+def test_origin_moves_the_flight() -> None:
+    """Vehicles with other origins fly elsewhere: only global positions move; an impossible one raises."""
+    moved, standard = (
+        {each.address.stream: each.fields for each in simulate(f"?duration=3{options}")}
+        for options in ("&origin=10.5,-20.25,100", "")
+    )
+    assert moved[VLP]["x"] == standard[VLP]["x"]
+    assert (moved[VLP]["ref_lat"], moved[VLP]["ref_lon"], moved[VLP]["ref_alt"]) == (10.5, -20.25, 100.0)
+    for topic, latitude in (
+        ("sensor_gps/0", "latitude_deg"),
+        ("vehicle_global_position", "lat"),
+        ("home_position", "lat"),
+    ):
+        assert moved[topic][latitude] == pytest.approx(10.5, abs=1e-3)
+        assert standard[topic][latitude] == pytest.approx(47.397742, abs=1e-3)
+    for wrong in ("95,0,0", "1,2", "a,b,c"):
+        with pytest.raises(ConfigError, match="origin"):
+            simulate(f"?origin={wrong}")
 
 
 def encoded(options: str) -> list[tuple[float, str, bytes]]:

@@ -24,7 +24,6 @@ OUTAGE: Final = (60.0, 75.0)  # s into a lap, without GPS
 ORIGIN_SET: Final = 2.0  # s after the start, when the global origin becomes known
 REFERENCE: Final = (47.397742, 8.545594, 488.0)  # latitude, longitude [deg], altitude [m]: PX4's default home
 BOOT: Final = 10_000_000  # us since boot at the start
-PROJECTION: Final = MapProjection(*REFERENCE[:2])
 
 _HEADING_RESET: Final = 15.0  # s into a lap
 _MAX_DEAD_RECKONING: Final = 10.0  # s until the position becomes invalid
@@ -45,15 +44,23 @@ Vector = tuple[float, ...]  # north, east, down
 
 
 class Truth(NamedTuple):
-    """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad]."""
+    """The true state: position [m], velocity [m/s], acceleration [m/s^2] in local NED, heading [rad].
+
+    `origin`: latitude, longitude [deg] and altitude [m] of the local frame.
+    """
 
     position: Vector
     velocity: Vector
     acceleration: Vector
     heading: float
+    origin: tuple[float, float, float] = REFERENCE
+
+    def reproject(self, north: float, east: float) -> tuple[float, float]:
+        """Return latitude and longitude [deg] of a place in the local frame."""
+        return MapProjection(*self.origin[:2]).reproject(north, east)
 
 
-def truth_at(time: float, direction: float) -> Truth:
+def truth_at(time: float, direction: float, origin: tuple[float, float, float] = REFERENCE) -> Truth:
     """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
     positions = [_position(time + offset, direction) for offset in (-_STEP, 0.0, _STEP)]
     axes = list(zip(*positions, strict=True))
@@ -61,7 +68,7 @@ def truth_at(time: float, direction: float) -> Truth:
     acceleration = tuple((after - 2 * now + before) / _STEP**2 for before, now, after in axes)
     moving = math.hypot(velocity[0], velocity[1]) > 0.5
     heading = math.atan2(velocity[1], velocity[0]) if moving else wrap(direction + math.pi / 4)
-    return Truth(positions[1], velocity, acceleration, heading)
+    return Truth(positions[1], velocity, acceleration, heading, origin)
 
 
 def _position(time: float, direction: float) -> Vector:
@@ -120,7 +127,7 @@ class Estimator:
         position = [value + error for value, error in zip(truth.position, state.position, strict=True)]
         velocity = [value + error for value, error in zip(truth.velocity, state.velocity, strict=True)]
         return {
-            **_motion(time, position, velocity, truth.acceleration, origin=time >= ORIGIN_SET),
+            **_motion(time, position, velocity, truth, has_origin=time >= ORIGIN_SET),
             **dict.fromkeys(("xy_valid", "v_xy_valid"), state.xy_valid), "z_valid": True, "v_z_valid": True,
             **{f"delta_{name}": delta for name, delta in state.deltas.items()},
             **{f"{name}_reset_counter": count for name, count in state.counters.items()},
@@ -146,7 +153,7 @@ class Estimator:
         """Return the global position, which exists once the origin is known."""
         state = self._at(time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
-        (latitude, longitude), altitude = PROJECTION.reproject(x, y), REFERENCE[2]
+        (latitude, longitude), altitude = truth.reproject(x, y), truth.origin[2]
         return {
             **_timestamps(time),
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,
@@ -192,7 +199,7 @@ def truth_fields(time: float, truth: Truth) -> dict[str, object]:
     """Return the groundtruth message: variances and limits are 0, as simulators send them."""
     return {
         **{name: 0.0 if kind.is_float else 0 for name, kind in VehicleLocalPosition.DEFINITION.types.items()},
-        **_motion(time, truth.position, truth.velocity, truth.acceleration, origin=True),
+        **_motion(time, truth.position, truth.velocity, truth, has_origin=True),
         **dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid", "heading_good_for_control"), True),
         "dead_reckoning": False, "delta_xy": (0.0, 0.0), "delta_vxy": (0.0, 0.0),
         "heading": truth.heading, "unaided_heading": truth.heading,
@@ -205,16 +212,17 @@ def _timestamps(time: float) -> dict[str, object]:
 
 
 def _motion(
-    time: float, position: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float], *, origin: bool
+    time: float, position: Sequence[float], velocity: Sequence[float], truth: Truth, *, has_origin: bool
 ) -> dict[str, object]:
     """Return the fields common to estimate and truth, with a distance sensor above flat ground."""
-    latitude, longitude, altitude = REFERENCE if origin else (math.nan,) * 3
+    latitude, longitude, altitude = truth.origin if has_origin else (math.nan,) * 3
     names, distance = ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az"), max(0.1, -position[2])
     in_range = distance < _SENSOR_RANGE
     return {
         **_timestamps(time),
-        **dict(zip(names, (*position, *velocity, *acceleration), strict=True)), "z_deriv": velocity[2],
-        "xy_global": origin, "z_global": origin, "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if origin else 0,
+        **dict(zip(names, (*position, *velocity, *truth.acceleration), strict=True)), "z_deriv": velocity[2],
+        "xy_global": has_origin, "z_global": has_origin,
+        "ref_timestamp": BOOT + round(ORIGIN_SET * 1e6) if has_origin else 0,
         "ref_lat": latitude, "ref_lon": longitude, "ref_alt": altitude,
         "dist_bottom_valid": in_range, "dist_bottom": distance, "dist_bottom_var": 0.01,
         "delta_dist_bottom": 0.0, "dist_bottom_reset_counter": 0,

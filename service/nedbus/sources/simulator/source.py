@@ -14,7 +14,7 @@ from nedbus.sources.options import SimulatorOptions
 from nedbus.sources.source import ReplayRun, SourceContext, SourceMessage
 from nedbus_msgs import BY_TOPIC, DEFAULT_TOPIC, Address
 
-from .flight import ORIGIN_SET, TICK, Estimator, Truth, truth_at, truth_fields
+from .flight import ORIGIN_SET, REFERENCE, TICK, Estimator, Truth, truth_at, truth_fields
 from .vehicle import battery, gps, home, land_detected, status
 
 Fields = Callable[[float, Truth], dict[str, object]]  # of a message, given time since start and truth
@@ -27,7 +27,7 @@ class SimulatorSource:
 
     def __init__(self, _: str, options: SimulatorOptions, context: SourceContext) -> None:
         self._vehicle = options.vehicle or context.vehicle
-        self._seed = options.seed
+        self._seed, self._origin = options.seed, options.origin or REFERENCE
         self._topics = options.chosen_topics
         self._ticks = None if options.duration is None else round(options.duration / TICK)
         self.finite = options.duration is not None
@@ -80,7 +80,7 @@ class SimulatorSource:
         absent = {address: _absent(address.topic) for address in chosen}
         for tick in count() if self._ticks is None else range(self._ticks):
             time = tick * TICK
-            now = truth_at(time, direction)
+            now = truth_at(time, direction, self._origin)
             for address, (ticks, fields) in chosen.items():
                 if tick in ticks:
                     yield SourceMessage(time, address, absent[address] | fields(time, now))

@@ -7,7 +7,7 @@ from typing import Final
 
 from nedbus_msgs import MESSAGES
 
-from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, PROJECTION, REFERENCE, Estimator, Truth
+from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, Estimator, Truth
 
 _Status: Final = MESSAGES["VehicleStatus"].model
 _Gps: Final = MESSAGES["SensorGps"].model
@@ -46,7 +46,7 @@ def land_detected(time: float, truth: Truth) -> dict[str, object]:
 def home(time: float, truth: Truth) -> dict[str, object]:
     """Return the place of take-off, with global coordinates once the origin is known."""
     known = time >= ORIGIN_SET
-    latitude, longitude, altitude = REFERENCE if known else (math.nan,) * 3
+    latitude, longitude, altitude = truth.origin if known else (math.nan,) * 3
     return {
         "timestamp": BOOT + round(time * 1e6), "lat": latitude, "lon": longitude, "alt": altitude,
         "x": 0.0, "y": 0.0, "z": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": truth.heading,
@@ -74,8 +74,8 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
     north, east, down = (
         value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
     )
-    latitude, longitude = PROJECTION.reproject(north, east) if fix else (math.nan, math.nan)
-    altitude = REFERENCE[2] - down if fix else math.nan
+    latitude, longitude = truth.reproject(north, east) if fix else (math.nan, math.nan)
+    altitude = truth.origin[2] - down if fix else math.nan
     vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
     return {
         "timestamp": now, "device_id": 1, "fix_type": _Gps.FIX_TYPE_3D if fix else _Gps.FIX_TYPE_NONE,
