@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import socket
@@ -301,12 +302,12 @@ EXPOSURE = 2.0  # of 10: what systemd calls OK
 with_systemd = pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing")
 
 
-@pytest.fixture(params=["nedbus.service", "nedbus@.service"])
+@pytest.fixture(params=["nedbus.service", "nedbus@.service", "nedbus-reader@.service"])
 def unit(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """Copy a unit, with a program that is here in place of the one that gets installed."""
     copy = tmp_path / str(request.param)
     text = (UNITS / copy.name).read_text()
-    assert f"ExecStart={EXECUTABLE} serve" in text
+    assert EXECUTABLE in text
     copy.write_text(text.replace(EXECUTABLE, "/bin/true"))
     return copy
 
@@ -333,3 +334,22 @@ def test_units_differ_in_their_file_only() -> None:
     plain, template = ((UNITS / name).read_text().split("\n", 1)[1] for name in ("nedbus.service", "nedbus@.service"))
     description = "Description=PX4 local position over Zenoh"
     assert template == plain.replace("/nedbus.toml", "/%i.toml").replace(description, f"{description} (%i)")
+
+
+@pytest.mark.process
+def test_unit_of_readers_takes_options_as_a_shell_does(tmp_path: Path) -> None:
+    """OPTIONS of its file may compute the name of a recording; the rest is as hardened as the service."""
+    text = (UNITS / "nedbus-reader@.service").read_text()
+    assert text.partition("# Who: ")[2] == (UNITS / "nedbus.service").read_text().partition("# Who: ")[2]
+    [command] = re.findall(r"^ExecStart=/bin/sh -c '(.*)'$", text, re.MULTILINE)
+    script = command.replace(EXECUTABLE, "echo nedbus").replace("exec echo", "echo").replace("%i", "record")
+    options = {"OPTIONS": "--output $(printf 7).mcap -t '*'"}
+    done = subprocess.run(
+        ["/bin/sh", "-c", script.replace("$$", "$")],
+        env=options,
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=tmp_path,
+    )
+    assert done.stdout == "nedbus record --wait --output 7.mcap -t *\n"
