@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         Topic,
         Vector,
         VehicleLocalPosition,
+        define_msg,
         enu_to_ned,
         flu_to_frd,
         frd_to_flu,
@@ -105,10 +106,10 @@ __all__ = [
     "Provenance", "Publisher", "Quantity", "ReceiveError", "RejectionReport", "Rejections", "ResetTracker", "Row",
     "Sample", "Selection", "ServiceStatus", "Session", "SourceError", "SourceStatus", "StreamHealth", "StreamStatus",
     "Subscription", "Tls", "Topic", "UnknownLayoutError", "UtcOffset", "Vector", "VehicleLocalPosition",
-    "VehicleReport", "addresses_of", "align", "connect", "connect_async", "dtype_of", "enu_to_ned", "flu_to_frd",
-    "frd_to_flu", "missing_of", "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "read", "to_array",
-    "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned", "variances_ned_to_enu", "yaw_enu_to_ned",
-    "yaw_ned_to_enu",
+    "VehicleReport", "addresses_of", "align", "connect", "connect_async", "define_msg", "dtype_of", "enu_to_ned",
+    "flu_to_frd", "frd_to_flu", "missing_of", "ned_to_enu", "quaternion_enu_to_ned", "quaternion_ned_to_enu", "read",
+    "to_array", "to_global", "to_local", "to_message", "utc_of", "variances_enu_to_ned", "variances_ned_to_enu",
+    "yaw_enu_to_ned", "yaw_ned_to_enu",
 ]  # fmt: skip
 
 # Imported on first use of a name: `nedbus --version` needs none of them, and only the last two load NumPy.

@@ -13,7 +13,7 @@ from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
 from nedbus.errors import ClosedError
 from nedbus.settings import load_settings
 from nedbus.transport import Tls
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Selection, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Definition, Selection, vehicle_name
 
 from .bus import Bus, connect_with
 from .by_topic import by_topic_async, last_async
@@ -108,9 +108,10 @@ class AsyncBus:
         instance: int | None = None,
         lossless: bool = False,
         source: str | None = None,
+        definition: Definition[Any] | None = None,
     ) -> AsyncPublisher:
         """Return a publisher with awaitable methods; see `Bus.publisher`."""
-        call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance)
+        call = partial(self._blocking.publisher, topic, vehicle=vehicle, instance=instance, definition=definition)
         return AsyncPublisher(await asyncio.to_thread(call, lossless=lossless, source=source))
 
     async def close(self) -> None:

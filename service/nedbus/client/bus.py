@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,7 +17,7 @@ from nedbus.errors import ClosedError, NedbusError
 from nedbus.events import AccountReport
 from nedbus.settings import Settings, load_settings
 from nedbus.transport import Session, Tls, open_client, query, require_unforked
-from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Selection, vehicle_name
+from nedbus_msgs import ANY, DEFAULT_TOPIC, Address, Definition, Selection, vehicle_name
 
 from .by_topic import by_topic, last
 from .closing import Finalizer
@@ -124,7 +126,8 @@ class Bus:
         The first call queries the router and waits up to `timeout` seconds; later calls use the liveliness tokens that
         the bus has subscribed to.
         """
-        return self._directory.vehicles(self._session, timeout=timeout)
+        addresses = sorted(self.publishers(timeout=timeout))
+        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
 
     def publishers(self, *, timeout: float = 2.0) -> Counter[Address]:
         """Return the number of publishers of each address; readers of one with several receive a mixture.
@@ -153,6 +156,7 @@ class Bus:
         instance: int | None = None,
         lossless: bool = False,
         source: str | None = None,
+        definition: Definition[Any] | None = None,
     ) -> Publisher:
         """Return a publisher for one address.
 
@@ -161,12 +165,13 @@ class Bus:
         has more than 2,000 unread messages, and sends 10 messages per second meanwhile; `close` waits until the readers
         have all messages.
         `source`: the origin of the messages, for `sample.source`: 1 to 32 characters of a-z 0-9 _ -.
+        `definition`: of a message of your own, from `define_msg`; readers query it from the publisher.
 
         Raises AddressInUseError if this bus already has a publisher for the address.
         """
         self._require_open()
         address = Address(vehicle_name(vehicle), topic, instance)
-        publisher = self._publishers.publisher(address, lossless=lossless, source=source, owner=self)
+        publisher = self._publishers.publisher(address, definition, lossless=lossless, source=source, owner=self)
         self._publishers.confirm(address)
         return publisher
 

@@ -10,8 +10,6 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import groupby
-from operator import attrgetter
 from typing import Annotated, Final
 
 import zenoh
@@ -63,11 +61,6 @@ class VehicleDirectory:
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key
         self._tokens: AliveTokens | None = None
-
-    def vehicles(self, session: Session, *, timeout: float) -> dict[str, list[Address]]:
-        """Return the addresses by vehicle, both sorted; the first call waits up to `timeout` seconds."""
-        addresses = sorted(self.publishers(session, timeout=timeout))
-        return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
 
     def publishers(self, session: Session, *, timeout: float) -> Counter[Address]:
         """Return the number of publishers of each address; the first call waits up to `timeout` seconds, if not 0."""

@@ -113,12 +113,9 @@ class Daemon:
         for source in self.measures if measures is None else measures:
             measured |= source.states
         mains = [vehicle.main for vehicle in list(self.account.vehicles.values()) if vehicle.main is not None]
-        shared = [] if self._registry is None else self._registry.shared_vehicles()
-        states = {
-            main: "duplicate" if main.vehicle in shared else measured[str(main)]
-            for main in mains
-            if str(main) in measured
-        }
+        shared = set() if self._registry is None else self._registry.shared_vehicles()
+        states = {main: measured[str(main)] for main in mains if str(main) in measured}
+        states |= {main: "duplicate" for main in states if main.vehicle in shared}
         is_cut = self.role == "client" and self._session is not None and not self.sessions
         link = f"no link to {' or '.join(self.endpoints)}" if is_cut else ""
         self.account.update(clock.steady(), states, link=link)
@@ -239,7 +236,6 @@ class Daemon:
 
     def _wait(self, registry: PublisherRegistry, uplinks: Uplinks) -> None:
         """Wait for `stop`, or until all finite sources have ended and their messages are acknowledged."""
-        shared: list[str] = []
         while not self._stop.is_set():
             if self._settings.until_done:
                 finite = [worker for worker in self._workers if is_finite(worker.source)]
@@ -251,10 +247,6 @@ class Daemon:
             self._changed.wait(_POLL)
             self._changed.clear()
             self.look()
-            shared, known = registry.shared_vehicles(), shared
-            for vehicle in set(shared).difference(known):
-                text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
-                _log.warning(text, vehicle, extra=about("duplicate"))
             uplinks.check()
 
 

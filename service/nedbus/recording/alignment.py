@@ -24,7 +24,6 @@ T = TypeVar("T")
 
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
-_MAX_NAMED: Final = 20  # columns in an error
 _MAX_ROWS: Final = 10_000_000  # rows of a table resampled at a rate; a damaged timestamp must not exhaust memory
 _STALE: Final = 1_000_000  # us; a message that is older than the start of recording by more was sent before it
 _STRAY: Final = 0.01  # fraction of messages that may be out of order; more indicate several boots
@@ -125,8 +124,8 @@ def align(
             columns[f"{name}.{field}"] = values[field]
             absent[f"{name}.{field}"] = np.append(lacking[field], True)[rows] if field in lacking else rows < 0
     columns = columns if fields is None else _choose(columns, fields)
-    lacked = (f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages))
-    missing = tuple(each for each in lacked if each in columns)
+    lacked = {f"{name}.{field}" for name, (messages, _) in streams.items() for field in missing_of(messages)}
+    missing = tuple(each for each in columns if each in lacked)
     types = [(name, column.dtype, column.shape[1:]) for name, column in columns.items()]
     table = np.zeros(len(times), np.dtype(types, metadata={"missing": missing}))
     for name, column in columns.items():
@@ -145,14 +144,13 @@ def _find_stream(on: str, streams: Streams) -> str:
 
 def _choose(columns: Mapping[str, T], fields: Sequence[str]) -> dict[str, T]:
     """Return the columns that these fields select, and the times; raise ConfigError for a field that no stream has."""
-    chosen = {"timestamp", "utc"}
-    for field in fields:
-        named = {column for column in columns if field in (column, column.rpartition(".")[2])}
-        if not named:
-            expected = ", ".join([*columns][:_MAX_NAMED])
-            raise ConfigError("fields", f"no stream has {field!r}: expected some of {expected}, ...")
-        chosen |= named
-    return {name: column for name, column in columns.items() if name in chosen}
+    known = {name: {name, name.rpartition(".")[2]} for name in columns}
+    if unknown := set(fields).difference(*known.values()):
+        raise ConfigError(
+            "fields", f"no stream has {', '.join(sorted(unknown))}: expected some of {', '.join(columns)}"
+        )
+    times = {"timestamp", "utc"}
+    return {name: column for name, column in columns.items() if name in times or known[name] & {*fields}}
 
 
 def _fields(messages: MessageArray) -> list[tuple[str, np.dtype[Any]]]:

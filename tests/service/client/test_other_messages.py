@@ -209,6 +209,21 @@ def test_schema_of_a_topic_without_a_file_is_its_publishers(endpoint: str, bus: 
         assert "and no such topic is published: known messages are VehicleLocalPosition, " in ended.err
 
 
+def test_script_publishes_a_message_of_its_own(client: nedbus.Bus, endpoint: str) -> None:
+    """A .msg text defines it, with its ranges; any reader learns it from its publisher. Without one it is refused."""
+    text = "uint64 timestamp\nfloat32 range # [m] [@range 0, 100]\nuint8 beacon\n"
+    definition = nedbus.define_msg("RangeBeacon", text)
+    with nedbus.connect(endpoint) as reader, reader.subscribe("range_beacon", vehicle="mine") as subscription:
+        publisher = client.publisher("range_beacon", vehicle="mine", definition=definition)
+        publisher.publish({"timestamp": 5, "range": 2.5, "beacon": 3})
+        [received] = [subscription.receive(DEADLINE).message]
+        assert (received.timestamp, received.range, received.beacon) == (5, 2.5, 3)
+        with pytest.raises(nedbus.InvalidMessageError, match="range"):
+            publisher.publish({"timestamp": 6, "range": 200.0, "beacon": 3})
+    with pytest.raises(nedbus.AddressError, match=r"expected a definition from nedbus\.define_msg, or one of "):
+        client.publisher("other_beacon", vehicle="mine")
+
+
 def test_line_says_what_was_lost_before_what_has_no_room() -> None:
     """A terminal cuts long lines at the end, so the status of a sample comes before its fields."""
     sample = nedbus.Sample(make(FLAGS, 2), FLAGS, received=1, lost=3)

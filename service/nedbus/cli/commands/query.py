@@ -77,9 +77,7 @@ def list_(bus: Bus, *, vehicle: VehicleOption = ANY, json_output: JsonOption = F
         if others := sorted({address.vehicle for address in everything}):
             hint = f"choose one of {to_text(', '.join(others[:20]))}"
         elif bus.services():
-            hint = (
-                "a service answers: see 'nedbus info', and check its and this client's permissions (docs/security.md)"
-            )
+            hint = "a service answers: see 'nedbus info', and check its and your permissions (docs/security.md)"
         what = "no vehicle" if vehicle == ANY else f"no vehicle {vehicle}"
         write_stderr(f"{what} is published at {' or '.join(bus.routers)}: {hint}")
         if vehicle != ANY:

@@ -49,6 +49,7 @@ class PublisherRegistry:
         self._answered: set[str] = set()  # key expressions of schemas and of vehicles with a queryable
         self._matched: dict[str, MatchingListener] = {}  # by vehicle, for all its downsampled streams
         self._directories: dict[str, VehicleDirectory] = {}  # by vehicle
+        self._shared: set[str] = set()
         self._lock = threading.Lock()
 
     @property
@@ -73,7 +74,7 @@ class PublisherRegistry:
         """
         definition = definition or BY_TOPIC.get(address.topic)
         if definition is None:
-            expected = f"a topic with a known message: {', '.join(BY_TOPIC)}"
+            expected = f"a definition from nedbus.define_msg, or one of {', '.join(BY_TOPIC)}"
             raise AddressError("topic", address.topic, expected)
         with self._lock:
             if address in self._publishers:
@@ -108,13 +109,18 @@ class PublisherRegistry:
         with while_open():
             self._session.put(address.rejected_key(prefix=self.prefix), payload, encoding=JSON)
 
-    def shared_vehicles(self) -> list[str]:
-        """Return the vehicles that another process publishes as well, sorted."""
+    def shared_vehicles(self) -> set[str]:
+        """Return the vehicles that another process publishes as well; log new ones."""
         with self._lock:
-            directories = sorted(self._directories.items())
-        return [
-            name for name, each in directories if max(each.publishers(self._session, timeout=0).values(), default=0) > 1
-        ]
+            directories = list(self._directories.items())
+        counts = {name: each.publishers(self._session, timeout=0).values() for name, each in directories}
+        shared = {name for name, numbers in counts.items() if max(numbers, default=0) > 1}
+        with self._lock:  # several threads ask
+            known, self._shared = self._shared, shared
+        for name in shared - known:
+            text = "vehicle %s is also published by another process: stop one, or give it another --vehicle"
+            _log.warning(text, name, extra=about("duplicate"))
+        return shared
 
     def confirm(self, address: Address) -> None:
         """Wait until the router has processed all declarations of an address, by a query for its own token."""
