@@ -49,7 +49,7 @@ class Bus:
         self._housekeeping = Housekeeping()
         self._queries = QueryServer(session)
         self._publishers = PublisherRegistry(session, self._queries, self._housekeeping, prefix=prefix, is_client=True)
-        self._directory = VehicleDirectory(prefix=prefix)
+        self._directory = VehicleDirectory(Selection(), prefix=prefix)
         self._layouts = LayoutLookup(partial(find_schemas, session=session, prefix=prefix))
         self._receivers: weakref.WeakSet[Receiver] = weakref.WeakSet()
         closing = ExitStack()  # in reverse order; closing the session ends an open query for layouts
@@ -130,10 +130,7 @@ class Bus:
         return {vehicle: list(group) for vehicle, group in groupby(addresses, key=attrgetter("vehicle"))}
 
     def publishers(self, *, timeout: float = 2.0) -> Counter[Address]:
-        """Return the number of publishers of each address; readers of one with several receive a mixture.
-
-        `timeout`: as in `vehicles`.
-        """
+        """Return the number of publishers of each address, like `vehicles`; readers of several get a mixture."""
         return self._directory.publishers(self._session, timeout=timeout)
 
     def services(self, *, timeout: float = 2.0) -> list[ServiceStatus]:

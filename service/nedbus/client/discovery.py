@@ -47,16 +47,12 @@ _MAX_MEMORY: Final = 2**28  # bytes of all parsed replies, estimated: JSON takes
 _MAX_REPORTS: Final = 1000  # in the queue; beyond that the oldest are dropped
 _SCHEMA_TIMEOUT: Final = 2.0  # s for a busy publisher to reply
 _POLL: Final = 0.002  # s between polls for tokens
-_ALL: Final = Selection()
 
 
 class VehicleDirectory:
-    """The published addresses and the number of their publishers, by liveliness tokens: the only source of both.
+    """The addresses and their publishers, by the liveliness tokens that it subscribes to at the first call."""
 
-    It subscribes to the tokens of a selection at the first call.
-    """
-
-    def __init__(self, *, prefix: str, selection: Selection = _ALL) -> None:
+    def __init__(self, selection: Selection, *, prefix: str) -> None:
         self._prefix, self._selection = prefix, selection
         self._lock = threading.Lock()
         self._addresses: dict[str, Address] = {}  # by token key

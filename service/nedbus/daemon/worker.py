@@ -48,11 +48,8 @@ class SourceMeasures:
         """State of each stream by address; silence after the end of the source is ok."""
         if self.status.ended:
             return {stream.address: "ok" for stream in self.streams}
-        published = frozenset(self.status.addresses)
-        return {
-            each.address: stream_state(each.health, publishers=int(each.address in published)).name
-            for each in self.streams
-        }
+        alive = frozenset(self.status.addresses)
+        return {each.address: stream_state(each.health, publishers=each.address in alive).name for each in self.streams}
 
 
 class Clock:

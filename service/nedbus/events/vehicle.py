@@ -142,13 +142,12 @@ class Vehicle:
     def update(self, time: float, state: str | None, *, is_connected: bool) -> None:
         """Update from the state of the position's stream: "stale", "gone", "duplicate" or another, None if unknown."""
         self.settle(time)
-        if self.main is not None and state not in (None, "unknown"):
-            stream, is_known = self.main.stream, ("duplicate", "") in self.conditions
-            if state == "duplicate" and not is_known:
-                text = f"several publishers of {stream}: readers receive a mixture"
-                self.emit(Finding("duplicate", "begin", "bad", text), stream, time)
-            elif is_known and state != "duplicate":
-                self.emit(Finding("duplicate", "end", "info", f"{stream} is no longer a mixture"), stream, time)
+        is_mixed, was_mixed = state == "duplicate", ("duplicate", "") in self.conditions
+        if self.main is not None and is_mixed != was_mixed and state not in (None, "unknown"):
+            stream = self.main.stream
+            begin = Finding("duplicate", "begin", "bad", f"several publishers of {stream}: readers receive a mixture")
+            end = Finding("duplicate", "end", "info", f"one publisher of {stream} is left")
+            self.emit(begin if is_mixed else end, stream, time)
         silent = {"stale": "silent", "gone": "gone"}.get(state or "")
         if state is None and is_connected and time - self._main_time > MAX_SILENCE:
             silent = "silent"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, TypeVar, Unpack, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, Unpack, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,6 @@ from .utc import utc_of
 if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
-
-T = TypeVar("T")
 
 _METHODS: Final = ("last", "nearest", "linear")
 _PERIODS: Final = {"[rad]": 2 * np.pi, "[deg]": 360.0}  # period of an angle, by unit
@@ -142,7 +140,7 @@ def _find_stream(on: str, streams: Streams) -> str:
     raise AddressError("on", on, expected, problem="is not in this flight")
 
 
-def _choose(columns: Mapping[str, T], fields: Sequence[str]) -> dict[str, T]:
+def _choose(columns: Mapping[str, npt.NDArray[Any]], fields: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     """Return the columns that these fields select, and the times; raise ConfigError for a field that no stream has."""
     known = {name: {name, name.rpartition(".")[2]} for name in columns}
     if unknown := set(fields).difference(*known.values()):

@@ -106,12 +106,12 @@ def why(
     """
     if files:
         read, found = _read(files)
-        names = _choose_vehicles(_name(files), read.account.vehicles, vehicle)
+        followed = read.account.vehicles
+        names = _choose_vehicles(_name(files), followed, vehicle)
         held = {
-            name: [each for each in read.account.vehicles[name].conditions.values() if each.severity != "info"]
-            for name in names
+            name: [each for each in followed[name].conditions.values() if each.severity != "info"] for name in names
         }
-        topics, times = {name: list(read.account.vehicles[name].topics) for name in names}, read.times
+        topics, times = {name: sorted(followed[name].topics) for name in names}, read.times
         until, advice = "until the end", _ADVICE.get(files[0].suffix.lower(), _LIVE_ADVICE)
         nothing = f"no faults in {read.end:.0f} s"
     else:
@@ -126,9 +126,8 @@ def why(
         if not reporting:
             raise NedbusError(f"no nedbus service at {where} has data of a vehicle: start one with 'nedbus serve'")
         names = _choose_vehicles("the network", reporting, vehicle)
-        states = {name: reporting[name].vehicles[name] for name in names}
-        held = {name: list(state.held) for name, state in states.items()}
-        topics, times = {name: list(state.topics) for name, state in states.items()}, Times(is_live=True)
+        held = {name: list(reporting[name].vehicles[name].held) for name in names}
+        topics, times = {name: list(reporting[name].vehicles[name].topics) for name in names}, Times(is_live=True)
         until, advice, nothing = "until now", _LIVE_ADVICE, "no faults in the history of the services"
     texts: list[str] = []
     shown: list[Event] = []

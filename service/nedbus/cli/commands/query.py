@@ -183,7 +183,7 @@ def _source_row(source: SourceStatus) -> list[str]:
 
 def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStatus) -> list[str]:
     address, health = stream.address, stream.health
-    alive = int(address in source.addresses)
+    state = stream_state(health, publishers=int(address in source.addresses))
     is_refused = address.partition("/")[0] in refused
     suffix = ", by PX4's definition" if TOPICS.keys().isdisjoint(address.split("/")) else ""
     return [
@@ -192,7 +192,5 @@ def _stream_row(source: SourceStatus, refused: Sequence[str], stream: StreamStat
         f"{health.nominal:g}" if health.nominal else "-",
         "-" if health.age is None else to_age(health.age),
         str(health.messages),
-        "refused by the router"
-        if is_refused
-        else describe_stream(health, stream_state(health, publishers=alive)) + suffix,
+        "refused by the router" if is_refused else describe_stream(health, state) + suffix,
     ]

@@ -60,10 +60,7 @@ def stream_state(health: Health, *, publishers: int | None = None, connected: bo
 
 
 def describe_stream(health: Health, state: StreamState) -> str:
-    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none.
-
-    Gaps, order and reboots mean nothing in a mixture of several publishers.
-    """
+    """Describe the faults of a stream (state, flags, gaps, order and reboots) in one line; "ok" if there are none."""
     doubts = "ok" if health.flags is None else describe_flags(health.flags)
     counts = (health.gaps, "gaps"), (health.out_of_order, "out of order"), (health.reboots, "reboots")
     events = [f"{count} {name}" for count, name in counts if count and state.name != "duplicate"]

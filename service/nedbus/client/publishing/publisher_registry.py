@@ -82,7 +82,7 @@ class PublisherRegistry:
             vehicle = address.vehicle
             if vehicle not in self._matched:
                 selection = Selection(vehicle=vehicle)
-                self._directories[vehicle] = VehicleDirectory(prefix=self.prefix, selection=selection)
+                self._directories[vehicle] = VehicleDirectory(selection, prefix=self.prefix)
                 key_expr = selection.rate_key_expr(ANY, prefix=self.prefix)
                 self._matched[vehicle] = MatchingListener(self._session, key_expr)
             matched = self._matched[vehicle]

@@ -55,10 +55,6 @@ class Truth(NamedTuple):
     heading: float
     origin: tuple[float, float, float] = REFERENCE
 
-    def reproject(self, north: float, east: float) -> tuple[float, float]:
-        """Return latitude and longitude [deg] of a place in the local frame."""
-        return MapProjection(*self.origin[:2]).reproject(north, east)
-
 
 def truth_at(time: float, direction: float, origin: tuple[float, float, float] = REFERENCE) -> Truth:
     """Return the truth at a time [s] since the start; `direction` [rad] rotates the figures."""
@@ -153,7 +149,7 @@ class Estimator:
         """Return the global position, which exists once the origin is known."""
         state = self._at(time)
         x, y, z = (value + error for value, error in zip(truth.position, state.position, strict=True))
-        (latitude, longitude), altitude = truth.reproject(x, y), truth.origin[2]
+        (latitude, longitude), altitude = MapProjection(*truth.origin[:2]).reproject(x, y), truth.origin[2]
         return {
             **_timestamps(time),
             "lat": latitude, "lon": longitude, "alt": altitude - z, "alt_ellipsoid": altitude - z,

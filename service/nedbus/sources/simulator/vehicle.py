@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from nedbus_msgs import MESSAGES
+from nedbus_msgs import MESSAGES, MapProjection
 
 from .flight import BOOT, CLIMB, LAP, ORIGIN_SET, OUTAGE, Estimator, Truth
 
@@ -74,7 +74,7 @@ def gps(time: float, truth: Truth) -> dict[str, object]:
     north, east, down = (
         value + 0.3 * math.sin(time * rate) for value, rate in zip(truth.position, (1.7, 2.3, 3.1), strict=True)
     )
-    latitude, longitude = truth.reproject(north, east) if fix else (math.nan, math.nan)
+    latitude, longitude = MapProjection(*truth.origin[:2]).reproject(north, east) if fix else (math.nan, math.nan)
     altitude = truth.origin[2] - down if fix else math.nan
     vx, vy, vz = truth.velocity if fix else (math.nan,) * 3
     return {
